@@ -1,0 +1,1 @@
+"""The harness: trains methods on captures, measures them, and writes the reports."""

@@ -1,0 +1,1 @@
+"""Ground truth: synthetic humans whose body, cloth, motion, light and cameras are known exactly."""
