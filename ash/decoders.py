@@ -1,0 +1,118 @@
+"""Stg.3: from motion-aware textures to the canonical texel Gaussians' raw parameters (ASH Eq. 6 and 7)."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ash.config import ModelConfig
+
+GEOMETRY_CHANNELS = 11  # offset 3, log-scale 3, quaternion 4, opacity logit 1
+GLOBAL_FEATURES = 16
+OCTAVES = 6
+
+
+class ConvBlock(nn.Sequential):
+    """Two 3x3 convolutions with norm and ReLU (Ronneberger et al. 2015, with padding)."""
+
+    def __init__(self, inputs: int, outputs: int, norm: str) -> None:
+        layers: list[nn.Module] = []
+        for channels in (inputs, outputs):
+            layers.append(nn.Conv2d(channels, outputs, 3, padding=1, bias=norm == "none"))
+            if norm == "instance":
+                layers.append(nn.InstanceNorm2d(outputs, affine=True))
+            layers.append(nn.ReLU(inplace=True))
+        super().__init__(*layers)
+
+
+class UNet(nn.Module):
+    """The image-to-image network of ASH: `levels` halvings, skips by concatenation, a 1x1 head.
+
+    The head starts at zero, so that an untrained decoder returns the initial Gaussians exactly.
+    """
+
+    def __init__(
+        self, inputs: int, outputs: int, *, width: int, levels: int, norm: str, bottleneck_features: int = 0
+    ) -> None:
+        super().__init__()
+        widths = [width * 2**level for level in range(levels + 1)]
+        self.first = ConvBlock(inputs, width, norm)
+        self.down = nn.ModuleList(ConvBlock(a, b, norm) for a, b in zip(widths, widths[1:], strict=False))
+        up_inputs = [widths[-1] + bottleneck_features, *widths[-2:0:-1]]
+        pairs = list(zip(up_inputs, widths[-2::-1], strict=True))
+        self.up = nn.ModuleList(nn.ConvTranspose2d(a, b, 2, stride=2) for a, b in pairs)
+        self.merge = nn.ModuleList(ConvBlock(2 * b, b, norm) for _, b in pairs)
+        self.head = nn.Conv2d(width, outputs, 1)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
+
+    def forward(
+        self, texture: Float[Tensor, "b c h w"], features: Float[Tensor, " p"] | None = None
+    ) -> Float[Tensor, "b o h w"]:
+        """Map a texture to a texture; `features` are broadcast over the bottleneck."""
+        skips = [self.first(texture)]
+        for block in self.down:
+            skips.append(block(nn.functional.max_pool2d(skips[-1], 2)))
+        x = skips.pop()
+        if features is not None:
+            x = torch.cat([x, features[None, :, None, None].expand(len(x), -1, *x.shape[2:])], 1)
+        for up, merge in zip(self.up, self.merge, strict=True):
+            x = merge(torch.cat([up(x), skips.pop()], 1))
+        return self.head(x)
+
+
+class GlobalFeatures(nn.Module):
+    """Phi: the root translation, positionally encoded, through a 3-layer MLP of width 32 (ASH appendix A)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.mlp = nn.Sequential(
+            nn.Linear(3 + 6 * OCTAVES, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU(), nn.Linear(32, GLOBAL_FEATURES)
+        )
+
+    def forward(self, translation: Float[Tensor, " 3"]) -> Float[Tensor, " 16"]:
+        """Features of a root translation in metres."""
+        angles = translation[:, None] * 2.0 ** torch.arange(OCTAVES, device=translation.device)
+        return self.mlp(torch.cat([translation, angles.sin().flatten(), angles.cos().flatten()]))
+
+
+class Decoders(nn.Module):
+    """E_geo and E_app: motion-aware textures and Phi to a texture of raw Gaussian parameters.
+
+    Output channels: `GEOMETRY_CHANNELS`, then 3 per spherical harmonic (coefficient-major, rgb inside).
+    """
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.half_resolution = config.half_resolution
+        appearance = 3 * (config.sh_degree + 1) ** 2
+        features = GLOBAL_FEATURES if config.global_features else 0
+        shuffle = 4 if config.half_resolution else 1
+        outputs = [GEOMETRY_CHANNELS, appearance]
+        if config.shared_trunk:
+            outputs = [sum(outputs)]
+        phi_inputs = [0] * (len(outputs) - 1) + [features]  # E_geo does not see Phi, unless the trunk is shared.
+        self.nets = nn.ModuleList(
+            UNet(
+                6 * config.window,
+                count * shuffle,
+                width=config.width,
+                levels=config.levels,
+                norm=config.norm,
+                bottleneck_features=phi,
+            )
+            for count, phi in zip(outputs, phi_inputs, strict=True)
+        )
+        self.phi = GlobalFeatures() if config.global_features else None
+
+    def forward(
+        self, textures: Float[Tensor, "c r r"], root_translation: Float[Tensor, " 3"]
+    ) -> Float[Tensor, "o r r"]:
+        """Decode one frame."""
+        x = textures[None].contiguous(memory_format=torch.channels_last)
+        if self.half_resolution:
+            x = nn.functional.avg_pool2d(x, 2)
+        phi = self.phi(root_translation) if self.phi is not None else None
+        decoded = [net(x) for net in self.nets[:-1]] + [self.nets[-1](x, phi)]
+        if self.half_resolution:
+            decoded = [nn.functional.pixel_shuffle(part, 2) for part in decoded]
+        return torch.cat(decoded, 1)[0]

@@ -1,0 +1,149 @@
+"""ASH as a method of the suite: builds the model from a capture, warms it up, trains it, renders with it."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from ash.avatar import AshModel, Conditions
+from ash.config import AshConfig
+from ash.dataset import Camera, Capture, Motion, read_template_truth
+from ash.files import write_atomic
+from ash.initialising import blank_gaussians, initial_gaussians, texel_pitch
+from ash.protocol import StageClock
+from ash.template import Template, exact_template, skinned_template
+from ash.textures import build_lattice
+from ash.training import TrainingImages, draw_batch, fit, load_module, load_training_images, read_safetensors, view_loss
+
+WARMUP_OPACITY_WEIGHT = 0.1  # As in the release.
+FITTED_FRAMES = 4
+FITTED_STEPS = 100
+
+
+class AshAvatar:
+    """The Avatar protocol (see `ash.protocol`) for ASH and for every ablation that is a configuration of it."""
+
+    def __init__(self, config: AshConfig, capture: Capture) -> None:
+        torch.manual_seed(config.seed)
+        self.config = config
+        self.template = template_of(config.template, capture)
+        self.lattice = build_lattice(capture.template, config.model.texels)
+        self.analytic = initial_gaussians(config.model, capture, self.template, self.lattice)
+        self.module = AshModel(config.model, self.template, self.lattice, self._start(capture))
+        self._conditions: dict[int, Conditions] = {}
+        self._motion = capture.motion
+
+    def _start(self, capture: Capture) -> Tensor:
+        if self.config.model.base:
+            return self.analytic
+        posed = self.template.pose(capture.motion, capture.splits["train"].frames[0])
+        pitch = float(texel_pitch(self.lattice, posed.canonical).median())
+        return blank_gaussians(self.config.model, len(self.lattice.texels), pitch)
+
+    def fit(self, capture: Capture, *, folder: Path) -> None:
+        """Warm up and train; see `ash.training.fit`."""
+        images = load_training_images(capture)
+        fit(
+            self,
+            images,
+            self.config.training,
+            seed=self.config.seed,
+            folder=folder,
+            before_start=lambda: self._warm_up(images),
+        )
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """The decoders, the base and the light, each with its own learning rate."""
+        training, module = self.config.training, self.module
+        groups: list[dict[str, Any]] = []
+        if module.decoders is not None:
+            groups.append({"params": list(module.decoders.parameters()), "lr": training.learning_rate})
+        if module.base.requires_grad:
+            groups.append({"params": [module.base], "lr": training.base_learning_rate})
+        if module.light is not None:
+            groups.append({"params": [module.light], "lr": training.base_learning_rate})
+        return groups
+
+    def draw_training_views(self, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
+        """Stages 3 and 4 on cached conditions; the base alone while the static warm-up lasts."""
+        static = self.config.training.warmup == "static" and step < self.config.training.warmup_steps
+        conditions = self._conditions_of(frame)
+        raw = self.module.decode(conditions, static=static)
+        return self.module.draw(self.module.pose(raw, conditions), cameras, background).rgb
+
+    def _conditions_of(self, frame: int) -> Conditions:
+        """The template is frozen while ASH learns, so each training frame is posed once."""
+        if frame not in self._conditions:
+            with torch.no_grad():
+                self._conditions[frame] = self.module.conditions(self._motion, frame)
+        return self._conditions[frame]
+
+    def _warm_up(self, images: TrainingImages) -> None:
+        """ASH Eq. 8: regress the decoders to known Gaussians before anything is rendered through them."""
+        training = self.config.training
+        if training.warmup == "analytic":
+            self._regress({frame: self.analytic for frame in images.frames})
+        elif training.warmup == "fitted":
+            chosen = images.frames[:: max(1, len(images.frames) // FITTED_FRAMES)]
+            self._regress({frame: self._fit_frame(images, frame) for frame in chosen})
+
+    def _fit_frame(self, images: TrainingImages, frame: int) -> Tensor:
+        """Pseudo ground truth of one frame: positions stay on the template, everything else is fitted to its views."""
+        alone = replace(images, frames=(frame,))
+        raw = self.analytic.clone().requires_grad_()
+        optimiser = torch.optim.Adam([raw], lr=self.config.training.base_learning_rate, fused=True)
+        conditions = self._conditions_of(frame)
+        for step in range(FITTED_STEPS):
+            batch = draw_batch(alone, self.config.training, self.config.seed, step)
+            fixed = torch.cat([torch.zeros_like(raw[:, :3]), raw[:, 3:]], 1)
+            drawn = self.module.draw(self.module.pose(fixed, conditions), batch.cameras, batch.background).rgb
+            optimiser.zero_grad()
+            view_loss(drawn, batch, self.config.training).backward()  # type: ignore[no-untyped-call]
+            optimiser.step()
+        return torch.cat([torch.zeros_like(raw[:, :3]), raw[:, 3:]], 1).detach()
+
+    def _regress(self, targets: dict[int, Tensor]) -> None:
+        assert self.module.decoders is not None
+        training = self.config.training
+        optimiser = torch.optim.Adam(self.module.decoders.parameters(), lr=training.learning_rate, fused=True)
+        weights = torch.ones(self.analytic.shape[1])
+        weights[10] = WARMUP_OPACITY_WEIGHT
+        frames = list(targets)
+        for step in range(training.warmup_steps):
+            frame = frames[step % len(frames)]
+            raw = self.module.decode(self._conditions_of(frame))
+            loss = (weights * (raw - targets[frame]) ** 2).mean()
+            optimiser.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            optimiser.step()
+
+    @torch.no_grad()
+    def render(self, motion: Motion, frame: int, camera: Camera, *, clock: StageClock) -> np.ndarray:
+        """Premultiplied RGBA, float32 `[h, w, 4]`."""
+        drawn = self.module(motion, frame, camera, clock)
+        return torch.cat([drawn.rgb[0], drawn.alpha[0, ..., None]], -1).clamp(0, 1).numpy()
+
+    def parameter_count(self) -> int:
+        """Numbers that training may change."""
+        return sum(p.numel() for p in self.module.parameters() if p.requires_grad)
+
+    def gaussian_count(self) -> int:
+        """One per covered texel."""
+        return len(self.lattice.texels)
+
+    def save(self, path: Path) -> None:
+        """Write the weights."""
+        write_atomic(path, safetensors.torch.save({n: t.contiguous() for n, t in self.module.state_dict().items()}))
+
+    def load(self, path: Path) -> None:
+        """Read the weights that `save` wrote."""
+        load_module(self.module, read_safetensors(path)[0], path)
+
+
+def template_of(kind: str, capture: Capture) -> Template:
+    """The template that a configuration names; "exact" reads the truth and is for oracles."""
+    return exact_template(capture, read_template_truth(capture)) if kind == "exact" else skinned_template(capture)

@@ -1,0 +1,81 @@
+"""Whole configurations by name: a preset is a function that returns one. An ablation replaces the one field it is about."""
+
+from dataclasses import replace
+
+from ash.config import AshConfig, ModelConfig, TrainingConfig
+from ash.dataset import Capture
+from ash.files import InputError
+from ash.method import AshAvatar
+
+
+def ci() -> AshConfig:
+    """Seconds on one core: the mannequin at 128x128."""
+    model = ModelConfig(
+        texels=64,
+        window=3,
+        yaw_normalise=True,
+        width=8,
+        levels=3,
+        norm="none",
+        shared_trunk=True,
+        half_resolution=True,
+        sh_degree=0,
+        base=True,
+        light=True,
+        dilation=0.05,
+    )
+    training = TrainingConfig(
+        steps=250,
+        views_per_step=2,
+        warmup="static",
+        warmup_steps=60,
+        l1_weight=0.8,
+        ssim_weight=0.2,
+        learning_rate=2e-3,
+    )
+    return AshConfig(model=model, training=training)
+
+
+def cpu() -> AshConfig:
+    """Minutes on one core: the tables' default, at 256x256."""
+    base = ci()
+    return replace(
+        base,
+        model=replace(base.model, texels=128, width=16, levels=4),
+        training=replace(base.training, steps=1500, warmup_steps=300),
+    )
+
+
+PRESETS = {"ci": ci, "cpu": cpu}
+
+
+def named(name: str) -> AshConfig:
+    """The configuration of a preset, or an InputError that lists the names."""
+    if name not in PRESETS:
+        raise InputError(f"preset: expected one of {', '.join(PRESETS)}, got {name!r}")
+    return PRESETS[name]()
+
+
+def ash(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
+    """ASH as the preset says."""
+    return AshAvatar(replace(named(preset), seed=seed), capture)
+
+
+def ash_truth(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
+    """ASH on the exact surface: an oracle, to see what the template's error costs."""
+    return AshAvatar(replace(named(preset), seed=seed, template="exact"), capture)
+
+
+def wo_disp(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
+    """The paper's ablation w/o disp.: no learned canonical offset."""
+    config = named(preset)
+    return AshAvatar(replace(config, seed=seed, model=replace(config.model, offset=False)), capture)
+
+
+def wo_mot(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
+    """The paper's ablation w/o mot.: one set of Gaussians, skinned only."""
+    config = named(preset)
+    model = replace(config.model, motion=False, base=True)
+    training = replace(config.training, warmup="none", warmup_steps=0)
+    return AshAvatar(replace(config, seed=seed, model=model, training=training), capture)
+

@@ -1,0 +1,114 @@
+"""Stg.2: the texel lattice and the motion-aware textures (ASH Sec. 3.2, Eq. 4)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ash.dataset import Motion, TemplateMesh
+from ash.files import InputError
+from ash.rasterizing import rasterize_mesh
+from ash.skinning import RigidTransforms, root_yaw, rotate, rotvec_to_unitquat
+from ash.template import PosedTemplate, Template
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TexelLattice:
+    """The texels that a triangle covers, in row-major order; each is one Gaussian.
+
+    Texel (row, column) samples the atlas at u = (column + 0.5) / resolution, v = 1 - (row + 0.5) / resolution, like an image
+    whose first row is the top. (The release samples texel corners of the transposed array.)
+    """
+
+    resolution: int
+    texels: Int[Tensor, " n"]  # row * resolution + column
+    corners: Int[Tensor, "n 3"]  # vertices of the covering triangle
+    barycentric: Float[Tensor, "n 3"]  # weights (w_a, w_b, w_c) of Eq. 4
+
+    def interpolate(self, values: Float[Tensor, "v c"]) -> Float[Tensor, "n c"]:
+        """Eq. 4 for any per-vertex quantity."""
+        return (values[self.corners] * self.barycentric[..., None]).sum(1)
+
+    def interpolate_transforms(self, transforms: RigidTransforms) -> RigidTransforms:
+        """Per-texel transform T of Eq. 5: the dual quaternions of the three corners, blended.
+
+        Signs are aligned with the corner of the largest weight, as in skinning.
+        """
+        quats = transforms.quats[self.corners]
+        strongest = self.barycentric.argmax(1)[:, None, None].expand(-1, 1, 4)
+        aligned = torch.where((quats * quats.gather(1, strongest)).sum(-1) < 0, -self.barycentric, self.barycentric)
+        blended = (quats * aligned[..., None]).sum(1)
+        # The dual part of (q, t) is t q / 2; blending it and multiplying by the conjugate of the blend gives the translation.
+        moments = _dual_parts(quats, transforms.translations[self.corners])
+        moment = (moments * aligned[..., None]).sum(1)
+        length = blended.norm(dim=-1, keepdim=True)
+        return RigidTransforms(quats=blended / length, translations=_translation(blended / length, moment / length))
+
+    def to_texture(self, values: Float[Tensor, "n c"]) -> Float[Tensor, "c r r"]:
+        """Scatter per-texel values into a texture that is zero elsewhere."""
+        texture = values.new_zeros(self.resolution * self.resolution, values.shape[1])
+        texture[self.texels] = values
+        return texture.T.reshape(-1, self.resolution, self.resolution)
+
+    def from_texture(self, texture: Float[Tensor, "c r r"]) -> Float[Tensor, "n c"]:
+        """Gather the covered texels."""
+        return texture.flatten(1).T[self.texels]
+
+
+def _dual_parts(quats: Float[Tensor, "n k 4"], translations: Float[Tensor, "n k 3"]) -> Float[Tensor, "n k 4"]:
+    w, u = quats[..., :1], quats[..., 1:]
+    real = -(translations * u).sum(-1, keepdim=True)
+    return 0.5 * torch.cat([real, w * translations + torch.linalg.cross(translations, u)], -1)
+
+
+def _translation(real: Float[Tensor, "n 4"], dual: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
+    w, u = real[..., :1], real[..., 1:]
+    dw, du = dual[..., :1], dual[..., 1:]
+    return 2 * (w * du - dw * u - torch.linalg.cross(du, u))
+
+
+def build_lattice(mesh: TemplateMesh, resolution: int) -> TexelLattice:
+    """Find the triangle and barycentric weights of every covered texel.
+
+    Raises:
+        InputError: the atlas covers no texel at this resolution.
+    """
+    uvs = torch.from_numpy(mesh.uvs)
+    pixels = torch.stack([uvs[:, 0] * resolution, (1 - uvs[:, 1]) * resolution, torch.ones_like(uvs[:, 0])], -1)
+    drawn = rasterize_mesh(
+        pixels.float(), torch.from_numpy(mesh.uv_faces), width=resolution, height=resolution, cull=False
+    )
+    texels = (drawn.triangle.reshape(-1) >= 0).nonzero().squeeze(1)
+    if len(texels) == 0:
+        raise InputError(f"the template's atlas covers no texel at resolution {resolution}")
+    triangles = drawn.triangle.reshape(-1)[texels].long()
+    return TexelLattice(
+        resolution=resolution,
+        texels=texels,
+        corners=torch.from_numpy(mesh.faces)[triangles],
+        barycentric=drawn.barycentric.reshape(-1, 3)[texels].float(),
+    )
+
+
+@torch.no_grad()
+def motion_aware_textures(
+    template: Template, lattice: TexelLattice, motion: Motion, frame: int, *, window: int, yaw_normalise: bool
+) -> Float[Tensor, "c r r"]:
+    """Normal and position textures of a window of frames, newest first: `c = 6 window` channels.
+
+    Positions (metres) are relative to the root of the newest frame, so the textures do not change when the whole motion is
+    moved; with `yaw_normalise` they do not change either when it is turned about the vertical axis.
+    """
+    dofs = torch.from_numpy(motion.dofs[frame]).float()
+    root = dofs[:3] + torch.from_numpy(template.skeleton.heads[0]).float()
+    yaw = root_yaw(dofs) if yaw_normalise else torch.zeros(())
+    unturn = rotvec_to_unitquat(torch.stack([torch.zeros(()), -yaw, torch.zeros(())]))
+    posed = [template.pose(motion, int(past)) for past in motion.window(frame, window)]
+    channels = torch.cat([_in_root_frame(p, root, unturn) for p in posed], dim=-1)
+    return lattice.to_texture(lattice.interpolate(channels))
+
+
+def _in_root_frame(posed: PosedTemplate, root: Tensor, unturn: Tensor) -> Float[Tensor, "v 6"]:
+    turn = unturn.expand(len(posed.vertices), 4)
+    return torch.cat([rotate(turn, posed.normals), rotate(turn, posed.vertices - root)], dim=-1)

@@ -1,0 +1,303 @@
+"""The loop: Adam over anything that draws views differentiably. ASH, its ablations and the mesh baseline all use it.
+
+Sampling is a function of (seed, step), so that a run stopped anywhere and resumed makes the same steps.
+"""
+
+import json
+import math
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import safetensors
+import safetensors.torch
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from ash.config import TrainingConfig
+from ash.dataset import Camera, Capture
+from ash.files import InputError, write_atomic
+from ash.losses import cache_target, l1_ssim_loss
+
+CROP_MARGIN = 12  # Pixels around the subject, so that a Gaussian that strays outside the mask is still seen.
+LOG_EVERY = 50
+FINAL_LEARNING_RATE = 0.05  # Of the initial one, at the end of the cosine.
+
+
+class Diverged(RuntimeError):
+    """Training produced NaN or infinity twice. That is a result, and is recorded as one."""
+
+
+class Interrupted(RuntimeError):
+    """SIGTERM came; the state was saved."""
+
+
+class Trainable(Protocol):
+    """What the loop needs of a model."""
+
+    module: torch.nn.Module
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """Adam's groups, each with its own `lr`."""
+
+    def draw_training_views(self, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
+        """Differentiable rgb `[c, h, w, 3]` over `background`, for cameras of one size."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TrainingImages:
+    """All training images in memory, with the box that the subject fills in each."""
+
+    views: dict[tuple[str, int], UInt8[np.ndarray, "h w 4"]]
+    boxes: dict[tuple[str, int], tuple[int, int, int, int]]  # x0, y0, x1, y1 in pixels, half open
+    cameras: dict[str, Camera]
+    frames: tuple[int, ...]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Batch:
+    """One step's work: several views of one frame, cropped alike."""
+
+    frame: int
+    cameras: list[Camera]
+    targets: Float[Tensor, "c h w 3"]  # over `background`
+    foreground: Float[Tensor, "c h w"]
+    background: Float[Tensor, " 3"]
+
+
+def load_training_images(capture: Capture) -> TrainingImages:
+    """Read every training image once.
+
+    Raises:
+        InputError: an image is damaged, or shows nobody.
+    """
+    views, boxes = {}, {}
+    for camera, frame in capture.splits["train"].views:
+        image = capture.image(camera, frame)
+        rows, columns = np.nonzero(image[..., 3].any(1))[0], np.nonzero(image[..., 3].any(0))[0]
+        if len(rows) == 0:
+            raise InputError(f"{capture.folder}: nobody is seen by camera {camera} in frame {frame}")
+        views[camera, frame] = image
+        boxes[camera, frame] = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
+    return TrainingImages(
+        views=views, boxes=boxes, cameras=capture.cameras, frames=tuple(capture.splits["train"].frames)
+    )
+
+
+def draw_batch(images: TrainingImages, config: TrainingConfig, seed: int, step: int) -> Batch:
+    """The batch of a step: frames in a new random order every epoch, cameras at random."""
+    epoch, position = divmod(step, len(images.frames))
+    order = np.random.default_rng([seed, 1, epoch]).permutation(len(images.frames))
+    frame = images.frames[order[position]]
+    rng = np.random.default_rng([seed, 2, step])
+    count = min(config.views_per_step, len(images.cameras))
+    names = [list(images.cameras)[i] for i in rng.choice(len(images.cameras), count, replace=False)]
+    colour = rng.random(3) if config.background == "random" else np.zeros(3)
+    return cut_batch(images, frame, names, torch.from_numpy(colour).float())
+
+
+def cut_batch(images: TrainingImages, frame: int, names: list[str], background: Tensor) -> Batch:
+    """Crop views of one frame to boxes of one size, and move the principal points along."""
+    boxes = [images.boxes[name, frame] for name in names]
+    full = images.cameras[names[0]]
+    width = min(full.width, max(x1 - x0 for x0, _, x1, _ in boxes) + 2 * CROP_MARGIN)
+    height = min(full.height, max(y1 - y0 for _, y0, _, y1 in boxes) + 2 * CROP_MARGIN)
+    cameras, targets, masks = [], [], []
+    for name, (x0, y0, x1, y1) in zip(names, boxes, strict=True):
+        left = min(max(0, (x0 + x1 - width) // 2), full.width - width)
+        top = min(max(0, (y0 + y1 - height) // 2), full.height - height)
+        cameras.append(crop_camera(images.cameras[name], left, top, width, height))
+        pixels = images.views[name, frame][top : top + height, left : left + width]
+        rgba = torch.from_numpy(pixels).float() / 255
+        targets.append(rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:]) * background)
+        masks.append(rgba[..., 3])
+    return Batch(
+        frame=frame,
+        cameras=cameras,
+        targets=torch.stack(targets),
+        foreground=torch.stack(masks),
+        background=background,
+    )
+
+
+def crop_camera(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
+    """The camera that sees a window of another's image."""
+    K = camera.K.copy()
+    K[:2, 2] -= (left, top)
+    return Camera(name=camera.name, width=width, height=height, K=K, viewmat=camera.viewmat)
+
+
+def fit(
+    learner: Trainable,
+    images: TrainingImages,
+    config: TrainingConfig,
+    *,
+    seed: int,
+    folder: Path,
+    before_start: Callable[[], None] = lambda: None,
+) -> None:
+    """Train to the end, from the checkpoint in `folder` if there is one.
+
+    `before_start` runs only when training starts afresh (warm-ups that do not render).
+
+    Raises:
+        Diverged: a loss or gradient was not finite, again after one roll-back with half the learning rate.
+        Interrupted: SIGTERM came; the checkpoint holds everything up to the last whole step.
+    """
+    run = _Run(learner, config, folder)
+    if not run.resume():
+        before_start()
+        run.save()
+    with _sigterm() as asked_to_stop:
+        while run.step < config.steps:
+            batch = draw_batch(images, config, seed, run.step)
+            run.advance(batch)
+            if asked_to_stop():
+                run.save()
+                raise Interrupted(f"stopped at step {run.step} of {config.steps}; run again to go on")
+            run.save_if_due()
+    run.save()
+
+
+def view_loss(images: Float[Tensor, "c h w 3"], batch: Batch, config: TrainingConfig) -> Tensor:
+    """ASH Eq. 9, mean over the views."""
+    losses = [
+        l1_ssim_loss(
+            image, cache_target(target), l1_weight=config.l1_weight, ssim_weight=config.ssim_weight
+        )
+        for image, target in zip(images, batch.targets, strict=True)
+    ]
+    return torch.stack(losses).mean()
+
+
+class _Run:
+    """The state of one training: model, optimiser, step and elapsed seconds."""
+
+    def __init__(self, learner: Trainable, config: TrainingConfig, folder: Path) -> None:
+        self.learner, self.config = learner, config
+        groups = learner.parameter_groups()
+        self.optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        self.initial_rates = [group["lr"] for group in self.optimiser.param_groups]
+        self.path, self.log = folder / "checkpoint.safetensors", folder / "log.jsonl"
+        self.step, self.seconds, self.rate_scale = 0, 0.0, 1.0
+        self.started = self.saved_at = time.monotonic()
+
+    def advance(self, batch: Batch) -> None:
+        """One step of Adam."""
+        fraction = self.step / self.config.steps
+        cosine = FINAL_LEARNING_RATE + (1 - FINAL_LEARNING_RATE) * 0.5 * (1 + math.cos(math.pi * fraction))
+        for group, rate in zip(self.optimiser.param_groups, self.initial_rates, strict=True):
+            group["lr"] = rate * cosine * self.rate_scale
+        self.optimiser.zero_grad(set_to_none=True)
+        drawn = self.learner.draw_training_views(batch.frame, batch.cameras, batch.background, self.step)
+        loss = view_loss(drawn, batch, self.config)
+        loss.backward()  # type: ignore[no-untyped-call]
+        if not self._finite(loss):
+            self._roll_back()
+            return
+        self.optimiser.step()
+        if self.step % LOG_EVERY == 0 or self.step + 1 == self.config.steps:
+            self._write_log(loss, drawn.detach(), batch)
+        self.step += 1
+
+    def _finite(self, loss: Tensor) -> bool:
+        gradients = [p.grad for group in self.optimiser.param_groups for p in group["params"] if p.grad is not None]
+        return all(torch.isfinite(g.sum()) for g in [loss.detach(), *gradients])
+
+    def _roll_back(self) -> None:
+        if self.rate_scale < 1:
+            raise Diverged(f"loss or gradient not finite at step {self.step}, again after a roll-back")
+        self.resume()
+        self.rate_scale = 0.5
+
+    def _write_log(self, loss: Tensor, drawn: Tensor, batch: Batch) -> None:
+        inside = batch.foreground > 0.5
+        error = ((drawn.clamp(0, 1) - batch.targets)[inside] ** 2).mean()
+        row = {
+            "step": self.step,
+            "seconds": round(self._elapsed(), 3),
+            "loss": float(loss),
+            "train_psnr": float(-10 * torch.log10(error)),
+        }
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        with self.log.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+
+    def _elapsed(self) -> float:
+        return self.seconds + time.monotonic() - self.started
+
+    def save_if_due(self) -> None:
+        """Save once per `checkpoint_seconds`."""
+        if time.monotonic() - self.saved_at > self.config.checkpoint_seconds:
+            self.save()
+
+    def save(self) -> None:
+        """Write the checkpoint atomically."""
+        tensors = {f"model.{name}": value.contiguous() for name, value in self.learner.module.state_dict().items()}
+        for index, state in self.optimiser.state_dict()["state"].items():
+            for name, value in state.items():
+                tensors[f"adam.{index}.{name}"] = value.contiguous()
+        facts = {"step": str(self.step), "seconds": repr(self._elapsed()), "rate_scale": repr(self.rate_scale)}
+        write_atomic(self.path, safetensors.torch.save(tensors, metadata=facts))
+        self.saved_at = time.monotonic()
+
+    def resume(self) -> bool:
+        """Load the checkpoint, if there is one."""
+        if not self.path.exists():
+            return False
+        tensors, facts = read_safetensors(self.path)
+        load_module(self.learner.module, {n[6:]: t for n, t in tensors.items() if n.startswith("model.")}, self.path)
+        state: dict[int, dict[str, Tensor]] = {}
+        for name, value in tensors.items():
+            if name.startswith("adam."):
+                _, index, key = name.split(".")
+                state.setdefault(int(index), {})[key] = value
+        groups = self.optimiser.state_dict()["param_groups"]
+        self.optimiser.load_state_dict({"state": state, "param_groups": groups})
+        self.step, self.seconds = int(facts["step"]), float(facts["seconds"])
+        self.rate_scale = float(facts["rate_scale"])
+        self.started = time.monotonic()
+        return True
+
+
+def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and metadata of a safetensors file, or an InputError that names it."""
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
+    except (OSError, safetensors.SafetensorError) as error:
+        raise InputError(f"{path}: expected a safetensors checkpoint ({error})") from error
+
+
+def load_module(module: torch.nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
+    """Load parameters and check that they fit and are finite."""
+    if not all(torch.isfinite(tensor).all() for tensor in tensors.values()):
+        raise InputError(f"{path}: holds NaN or infinity")
+    try:
+        module.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise InputError(f"{path}: was written by another configuration ({error})") from error
+
+
+class _sigterm:
+    """Turns SIGTERM into a question that the loop asks after each step (main thread only)."""
+
+    def __enter__(self) -> Callable[[], bool]:
+        self.asked = False
+        try:
+            self.previous = signal.signal(signal.SIGTERM, self._ask)
+        except ValueError:  # Not the main thread: signals are somebody else's business.
+            self.previous = None
+        return lambda: self.asked
+
+    def _ask(self, *_: object) -> None:
+        self.asked = True
+
+    def __exit__(self, *_: object) -> None:
+        if self.previous is not None:
+            signal.signal(signal.SIGTERM, self.previous)
