@@ -5,7 +5,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -26,11 +26,15 @@ class StageClock:
         self.ms[name] += (time.perf_counter() - start) * 1e3
 
 
+@runtime_checkable
 class Avatar(Protocol):
     """An animatable avatar: learns from a capture, then renders any motion from any camera.
 
-    A factory `make(capture: Capture, *, seed: int) -> Avatar` is registered under the entry-point group
-    `ash_bench.methods`. The capture handed to the factory and to `fit` holds training views and training motion only.
+    A factory `make(capture: Capture, *, seed: int, preset: str) -> Avatar` is registered under the entry-point group
+    `ash_bench.methods`. A preset is a budget: every method knows at least `ci` (seconds) and `cpu` (minutes), and raises
+    ValueError for one it does not know. The capture handed to the factory and to `fit` holds training views and training
+    motion only, unless the suite lists the method among its oracles. A training that diverged raises FloatingPointError.
+    `log.jsonl` holds one object per line; `seconds` with `loss` or `psnr` (dB) make the training curve of the report.
     """
 
     def fit(self, capture: Capture, *, folder: Path) -> None:
@@ -50,3 +54,14 @@ class Avatar(Protocol):
 
     def load(self, path: Path) -> None:
         """Read what `save` wrote."""
+
+
+@runtime_checkable
+class PosedGeometry(Protocol):
+    """What an avatar may offer besides, so that its geometry can be compared with the truth."""
+
+    def template_vertices(self, motion: Motion, frame: int) -> np.ndarray:
+        """The posed template in frame `frame` of `motion`, float `[v, 3]` metres, vertices ordered as the capture's."""
+
+    def gaussian_means(self, motion: Motion, frame: int) -> np.ndarray:
+        """Centres of the posed Gaussians, float `[n, 3]` metres; `[0, 3]` for a method without any."""

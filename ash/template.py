@@ -2,7 +2,7 @@
 
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -30,6 +30,7 @@ class PosedTemplate:
     normals: Float[Tensor, "v 3"]  # unit, world
 
 
+@runtime_checkable
 class Deformation(Protocol):
     """Where the vertices of the canonical template lie in a frame: the part of Stg.1 that is learned, fixed or known."""
 

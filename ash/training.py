@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import safetensors
@@ -37,6 +37,7 @@ class Interrupted(RuntimeError):
     """SIGTERM came; the state was saved."""
 
 
+@runtime_checkable
 class Trainable(Protocol):
     """What the loop needs of a model."""
 
