@@ -355,7 +355,8 @@ def _widest(array: np.ndarray) -> np.ndarray:
 
 
 def _are_indices(array: np.ndarray, count: int) -> bool:
-    return array.ndim == 2 and array.shape[1] == 3 and len(array) > 0 and 0 <= array.min() and array.max() < count
+    shaped = array.ndim == 2 and array.shape[1] == 3 and len(array) > 0
+    return shaped and bool(0 <= array.min() and array.max() < count)
 
 
 def _require(path: Path, checks: dict[str, bool]) -> None:
