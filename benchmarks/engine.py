@@ -1,0 +1,250 @@
+"""Runs cells side by side, each in a process of its own, and goes on where an earlier run stopped."""
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import psutil
+
+from ash.files import InputError
+from benchmarks.cells import Cell, CellResult, Status, failed_result, read_cell, read_result, write_config, write_result
+from benchmarks.progress import Progress
+
+AnyCell = TypeVar("AnyCell")
+
+POLL_S = 0.2
+WRONG_INPUT = 2
+
+_children: set[subprocess.Popen[bytes]] = set()
+_starting = threading.Lock()  # No child may start between the decision to stop and the end of the children.
+_stopping = threading.Event()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Limits:
+    """What one cell may use before it is ended and recorded as failed."""
+
+    seconds: float
+    memory_mb: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Failure:
+    """Why a cell was ended."""
+
+    status: Status
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Plan:
+    """Cells of a run: those to do, and those with a result. `reasons` says why a cell must run again."""
+
+    todo: tuple[Cell, ...]
+    done: tuple[Cell, ...]
+    reasons: tuple[str, ...]
+
+
+def plan_cells(cells: Sequence[Cell], *, retry_failed: bool = False) -> Plan:
+    """Split cells into those with a result and those without.
+
+    Raises:
+        InputError: a result.json is damaged; nothing is overwritten.
+    """
+    todo: list[Cell] = []
+    done: list[Cell] = []
+    reasons = []
+    for cell in cells:
+        result = read_result(cell.folder)
+        if result is not None and retry_failed and result.status != "done":
+            shutil.rmtree(cell.folder)
+            reasons.append(f"{cell.config.title}: {result.status} before, tried again")
+            result = None
+        elif result is None and (reason := _why_stale(cell)):
+            reasons.append(f"{cell.config.title}: {reason}")
+        (todo if result is None else done).append(cell)
+    return Plan(todo=tuple(todo), done=tuple(done), reasons=tuple(reasons))
+
+
+def shard_of(cells: Sequence[AnyCell], shard: str) -> tuple[AnyCell, ...]:
+    """Shard `i/n` (1-based) of the cells: every n-th, so that shards are of about equal work."""
+    try:
+        index, count = (int(part) for part in shard.split("/"))
+        if not 1 <= index <= count:
+            raise ValueError
+    except ValueError:
+        raise InputError(f"expected a shard i/n with 1 <= i <= n, got {shard!r}") from None
+    return tuple(cells[index - 1 :: count])
+
+
+def run_cells(plan: Plan, executor: Executor, limits: Limits, progress: Progress) -> None:
+    """Run the plan's cells. A failed cell leaves a result that says so; the others go on.
+
+    Raises:
+        InputError: a cell found its input wrong; cells that wait are given up, results that are there stay.
+        KeyboardInterrupt: the user's; all child processes have ended when it is seen.
+    """
+    _stopping.clear()
+    for cell in plan.todo:
+        write_config(cell)
+    futures: dict[Future[str], Cell] = {}
+    try:
+        for cell in plan.todo:
+            futures[executor.submit(run_in_process, str(cell.folder), limits)] = cell
+        pending = set(futures)
+        while pending:
+            finished, pending = wait(pending, timeout=POLL_S, return_when=FIRST_COMPLETED)
+            for future in finished:
+                progress.finish(futures[future].config.title, status=future.result())
+            progress.tick(running=[futures[f].config.title for f in pending if f.running()])
+    except BaseException:
+        for future in futures:
+            future.cancel()
+        stop_children()
+        executor.shutdown(wait=True, cancel_futures=True)
+        raise
+
+
+def run_in_process(folder: str, limits: Limits) -> str:
+    """Run one cell in its own process, watched for time and memory. Returns the status of its result.
+
+    Self-contained, so that an executor may carry it to another machine that sees the same folder.
+    """
+    cell = read_cell(Path(folder))
+    start = time.monotonic()
+    with (cell.folder / "output.log").open("ab") as log, _starting:
+        if _stopping.is_set():
+            return "interrupted"
+        child = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.run", str(cell.folder), "--follow-parent"],
+            stdin=subprocess.PIPE,
+            stdout=log,
+            stderr=log,
+            env=_environment(),
+            start_new_session=True,
+        )
+        _children.add(child)
+    try:
+        failure = _watch(child, limits, start)
+    finally:
+        _kill(child)
+        _children.discard(child)
+    if _stopping.is_set():
+        return "interrupted"
+    return _outcome(cell, child.returncode, failure).status
+
+
+def stop_children() -> None:
+    """End every child process at once; their cells stay unfinished and can be resumed."""
+    with _starting:
+        _stopping.set()
+        for child in list(_children):
+            _kill(child)
+
+
+@contextlib.contextmanager
+def make_executor(spec: str, *, workers: int) -> Iterator[Executor]:
+    """An executor: `local`, or a Dask scheduler's address such as `dask://host:8786`.
+
+    Locally, threads suffice, for each only waits for the process of its cell.
+    """
+    if spec == "local":
+        executor = ThreadPoolExecutor(workers)
+        try:
+            yield executor
+        finally:
+            executor.shutdown(wait=True, cancel_futures=True)
+        return
+    if not spec.startswith("dask://"):
+        raise InputError(f"unknown executor {spec!r}, expected local or dask://HOST:PORT")
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError("the executor dask:// needs the package distributed: pip install distributed") from None
+    try:
+        client = Client("tcp://" + spec.removeprefix("dask://"), timeout="10s", set_as_default=False)
+    except (OSError, TimeoutError) as error:
+        raise InputError(f"no Dask scheduler answers at {spec} ({error})") from error
+    with client:
+        yield client.get_executor(retries=2, pure=False)
+
+
+def _watch(child: subprocess.Popen[bytes], limits: Limits, start: float) -> Failure | None:
+    process = psutil.Process(child.pid)
+    while True:
+        try:
+            child.wait(POLL_S)
+            return None
+        except subprocess.TimeoutExpired:
+            pass
+        if time.monotonic() - start > limits.seconds:
+            return Failure(status="timeout", reason=f"not finished after the limit of {limits.seconds / 60:.0f} min")
+        with contextlib.suppress(psutil.Error):
+            if (used := process.memory_info().rss / 2**20) > limits.memory_mb:
+                return Failure(status="out of memory", reason=f"{used:.0f} MB, the limit is {limits.memory_mb} MB")
+
+
+def _outcome(cell: Cell, exit_code: int, failure: Failure | None) -> CellResult:
+    """The result that the child left, or else one that says how it failed."""
+    if failure is None:
+        if exit_code == WRONG_INPUT:
+            raise InputError(_last_line(cell.folder / "output.log"))
+        result = read_result(cell.folder)
+        if result is not None:
+            return result
+        reason = f"the process ended with {_exit_name(exit_code)}: {_last_line(cell.folder / 'output.log')}"
+        failure = Failure(status="crashed", reason=reason)
+    result = failed_result(cell.config, failure.status, failure.reason)
+    write_result(cell.folder, result)
+    return result
+
+
+def _kill(child: subprocess.Popen[bytes]) -> None:
+    """End a child with all processes that it started."""
+    if child.poll() is None:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(child.pid, signal.SIGKILL)
+    child.wait()
+    if child.stdin is not None:
+        child.stdin.close()
+
+
+def _environment() -> dict[str, str]:
+    """One thread per cell: two buy 1.35x alone and cost 6x when cells run side by side."""
+    threads = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+    return {**os.environ, **threads, "PYTHONUNBUFFERED": "1"}
+
+
+def _why_stale(cell: Cell) -> str | None:
+    """Which input changed since this method and seed were last run in this folder, if they were."""
+    fresh = asdict(cell.config)
+    same = ("scene", "size", "method", "preset", "seed", "capture_seed")
+    for path in cell.folder.parent.glob("*/config.json"):
+        old = asdict(read_cell(path.parent).config)
+        if path.parent != cell.folder and all(old[name] == fresh[name] for name in same):
+            changed = [name for name in ("code", "capture", "protocol") if old[name] != fresh[name]]
+            if (path.parent / "result.json").exists() and changed:
+                return f"the {' and the '.join(changed)} changed since its last result"
+    return None
+
+
+def _last_line(log: Path) -> str:
+    lines = log.read_text(errors="replace").strip().splitlines() if log.exists() else []
+    return lines[-1] if lines else "(it printed nothing)"
+
+
+def _exit_name(code: int) -> str:
+    try:
+        return signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    except ValueError:
+        return f"signal {-code}"

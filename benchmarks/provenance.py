@@ -1,0 +1,88 @@
+"""What must be known about a run so that someone else can repeat it: commit, machine, versions."""
+
+import os
+import platform
+import shutil
+import subprocess
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import psutil
+
+PACKAGES = (
+    "ash-bench",
+    "numpy",
+    "scipy",
+    "torch",
+    "mitsuba",
+    "drjit",
+    "scikit-image",
+    "flip-evaluator",
+    "pandas",
+    "gsplat",
+)
+
+
+def commit() -> str:
+    """The checkout's commit, with `+` where files differ from it; `unknown` outside a checkout."""
+    root = Path(__file__).parent.parent
+    if not (root / ".git").exists() or shutil.which("git") is None:
+        return "unknown"
+    revision = _output("git", "-C", str(root), "rev-parse", "--short=12", "HEAD")
+    changed = _output("git", "-C", str(root), "status", "--porcelain", "--untracked-files=no")
+    return revision + ("+" if changed else "") if revision else "unknown"
+
+
+def machine() -> dict[str, str]:
+    """Processor, cores, memory, operating system, GPU."""
+    found = {
+        "processor": processor_name(),
+        "cores": str(cores()),
+        "memory_gb": f"{psutil.virtual_memory().total / 2**30:.0f}",
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "python": platform.python_version(),
+        "gpu": gpu_name() or "none",
+    }
+    return found
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that numbers depend on."""
+    found = {}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def processor_name() -> str:
+    """The processor as the system names it."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def gpu_name() -> str | None:
+    """The first NVIDIA GPU, or None."""
+    if shutil.which("nvidia-smi") is None:
+        return None
+    return _output("nvidia-smi", "--query-gpu=name", "--format=csv,noheader").split("\n")[0] or None
+
+
+def _output(*command: str) -> str:
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""

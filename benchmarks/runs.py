@@ -1,0 +1,144 @@
+"""A run: a suite's captures, then its cells, then what they came to, all in one folder."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ash.dataset import load_capture
+from ash.files import InputError, read_json, write_json
+from benchmarks.cells import Cell, CellConfig, CellResult, read_cell, read_result
+from benchmarks.engine import Limits, make_executor, plan_cells, run_cells, shard_of
+from benchmarks.experiments import CaptureSpec, CellSpec, Suite, code_version, find_method
+from benchmarks.metrics import PROTOCOL
+from benchmarks.progress import Progress
+
+RUN_FILE = "run.json"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Run:
+    """A run on disk: what was asked, and the cells that answer it."""
+
+    folder: Path
+    suite: str
+    about: str
+    command: str
+    cells: tuple[Cell, ...]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RunOptions:
+    """How a suite is run: what does not change its results."""
+
+    out: Path
+    data: Path
+    workers: int
+    executor: str = "local"
+    shard: str | None = None
+    retry_failed: bool = False
+    command: str = ""
+
+
+def run_suite(suite: Suite, options: RunOptions) -> Run:
+    """Make the captures, run the missing cells, and return the run; finished work is never repeated."""
+    for method in suite.methods:
+        find_method(method)
+    options.out.mkdir(parents=True, exist_ok=True)
+    folders = {spec: make_capture(spec, options.data, workers=options.workers) for spec in suite.captures}
+    cells = [cell_for(spec, folders[spec.capture], options.out) for spec in suite.cells]
+    run = Run(folder=options.out, suite=suite.name, about=suite.about, command=options.command, cells=tuple(cells))
+    write_run(run)
+    plan = plan_cells(shard_of(cells, options.shard) if options.shard else cells, retry_failed=options.retry_failed)
+    limits = Limits(seconds=suite.limit_minutes * 60, memory_mb=suite.limit_mb)
+    progress = Progress("cells", len(plan.todo), expected_s=suite.cell_minutes * 60, workers=options.workers)
+    for reason in plan.reasons:
+        progress.say(reason)
+    if plan.done:
+        progress.say(f"{len(plan.done)} of {len(plan.done) + len(plan.todo)} cells are there already")
+    with make_executor(options.executor, workers=options.workers) as executor:
+        run_cells(plan, executor, limits, progress)
+    progress.close()
+    return run
+
+
+def make_capture(spec: CaptureSpec, data: Path, *, workers: int) -> Path:
+    """The folder of a finished capture under `data`, rendering what is missing of it."""
+    folder = data / spec.name
+    make_capture_in(spec, folder, workers=workers)
+    return folder
+
+
+def make_capture_in(spec: CaptureSpec, folder: Path, *, workers: int) -> None:
+    """Render into `folder` what is missing of a capture."""
+    from synth.capture import make_capture as render
+    from synth.presets import scene
+
+    progress = Progress(f"images of {spec.name}", 0, expected_s=0.0, workers=workers)
+    render(scene(spec.scene, size=spec.size, seed=spec.seed), folder, workers=workers, progress=progress.advance)
+    progress.close()
+
+
+def cell_for(spec: CellSpec, capture_folder: Path, out: Path) -> Cell:
+    """The cell of a method on a capture, in its folder under `out`."""
+    config = CellConfig(
+        scene=spec.capture.scene,
+        size=spec.capture.size,
+        capture_seed=spec.capture.seed,
+        capture=load_capture(capture_folder).identity,
+        method=spec.method,
+        preset=spec.preset,
+        seed=spec.seed,
+        code=code_version(spec.method),
+    )
+    return Cell(config=config, folder=out / "cells" / config.key, capture_folder=capture_folder)
+
+
+def write_run(run: Run) -> None:
+    """Write `run.json`: the whole matrix, also the cells that other shards will fill."""
+    content = {
+        "protocol": PROTOCOL,
+        "suite": run.suite,
+        "about": run.about,
+        "command": run.command,
+        "cells": [cell.config.key for cell in run.cells],
+    }
+    write_json(run.folder / RUN_FILE, content)
+
+
+def read_run(folder: Path) -> Run:
+    """Read a run's folder; a single cell's folder is a run of one cell.
+
+    Raises:
+        InputError: no run is there, it is of another protocol, or a cell's config is damaged.
+    """
+    if (folder / "config.json").exists():
+        cell = read_cell(folder)
+        return Run(folder=folder, suite="one cell", about=cell.config.title, command="", cells=(cell,))
+    path = folder / RUN_FILE
+    content = read_json(path)
+    try:
+        if content["protocol"] != PROTOCOL:
+            raise InputError(f"{path}: expected protocol {PROTOCOL}, got {content['protocol']}; results do not mix")
+        keys = [str(key) for key in content["cells"]]
+        names = {name: str(content[name]) for name in ("suite", "about", "command")}
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: expected the description of a run ({error})") from error
+    found = [folder / "cells" / key for key in keys if (folder / "cells" / key / "config.json").exists()]
+    return Run(folder=folder, cells=tuple(read_cell(cell) for cell in found), **names)
+
+
+def results_of(run: Run) -> list[CellResult]:
+    """The results of a run's finished cells, in the suite's order.
+
+    Raises:
+        InputError: nothing is finished yet, or a result is damaged.
+    """
+    results = [result for cell in run.cells if (result := read_result(cell.folder)) is not None]
+    if not results:
+        raise InputError(f"{run.folder}: no cell is finished, so there is nothing to report")
+    return results
+
+
+def failures(results: Sequence[CellResult]) -> list[CellResult]:
+    """The results of cells that did not come through."""
+    return [result for result in results if result.status != "done"]
