@@ -1,0 +1,202 @@
+"""The one door, tried on a tiny stand-in project: same launcher, no downloads."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+PYPROJECT = """
+[build-system]
+requires = []
+build-backend = "backend"
+backend-path = ["."]
+[project]
+name = "ash-bench"
+version = "0.0.1"
+dependencies = ["tiny"]
+[project.optional-dependencies]
+dev = []
+"""
+
+# A build backend that only installs a console script; it counts its builds, and fails or hangs when a file tells it to.
+BACKEND = """
+import pathlib, time, zipfile
+def build_editable(folder, config_settings=None, metadata_directory=None):
+    root = pathlib.Path.cwd()
+    with open(root / "builds", "a") as file:
+        file.write("x")
+    if (root / "broken").exists():
+        raise SystemExit("fatal error: no such kernel")
+    while (root / "hang").exists():
+        time.sleep(0.05)
+    info = "ash_bench-0.0.1.dist-info"
+    name = "ash_bench-0.0.1-py3-none-any.whl"
+    with zipfile.ZipFile(pathlib.Path(folder) / name, "w") as wheel:
+        wheel.writestr("ash_bench_stub.pth", str(root))
+        wheel.writestr(info + "/METADATA", "Metadata-Version: 2.1\\nName: ash-bench\\nVersion: 0.0.1\\n")
+        wheel.writestr(info + "/WHEEL", "Wheel-Version: 1.0\\nRoot-Is-Purelib: true\\nTag: py3-none-any\\n")
+        wheel.writestr(info + "/entry_points.txt", "[console_scripts]\\nash-bench = program:main\\n")
+        wheel.writestr(info + "/RECORD", "")
+    return name
+"""
+
+PROGRAM = """
+import pathlib, sys
+def main():
+    import tiny
+    print(pathlib.Path(__file__).parent, *sys.argv[1:-1])
+    return int(sys.argv[-1])
+"""
+
+
+def write_wheel(folder: Path, name: str) -> None:
+    """A wheel with one empty module."""
+    info = f"{name}-1.0.dist-info"
+    with zipfile.ZipFile(folder / f"{name}-1.0-py3-none-any.whl", "w") as wheel:
+        wheel.writestr(f"{name}.py", "")
+        wheel.writestr(f"{info}/METADATA", f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        wheel.writestr(
+            f"{info}/WHEEL", "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
+        )
+        wheel.writestr(f"{info}/RECORD", "")
+
+
+def write_program(path: Path, script: str) -> None:
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Wheels instead of an index, and neither apt nor sudo can do anything."""
+    folder = tmp_path_factory.mktemp("machine")
+    for name in ("tiny", "cmake", "ninja"):
+        write_wheel(folder, name)
+    write_program(folder / "bin" / "apt-get", f'echo "$@" >> {folder}/apt.log; exit 100')
+    write_program(folder / "bin" / "sudo", "exit 1")
+    settings = {
+        "PIP_NO_INDEX": "1",
+        "PIP_FIND_LINKS": str(folder),
+        "PIP_CONFIG_FILE": os.devnull,
+        "APT_LOG": f"{folder}/apt.log",
+    }
+    # The base interpreter, because the tests' own environment may lie in a folder that a launcher would have to remake.
+    python = Path(sys._base_executable).parent  # type: ignore[attr-defined]
+    return {**os.environ, **settings, "PATH": f"{folder / 'bin'}:{python}:{os.environ['PATH']}"}
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory, environment: dict[str, str]) -> Path:
+    """A project, set up once, in a folder whose name has a space."""
+    folder = tmp_path_factory.mktemp("some where")
+    shutil.copy(ROOT / "ash-bench", folder)
+    (folder / "pyproject.toml").write_text(PYPROJECT)
+    (folder / "constraints.txt").write_text("tiny==1.0\n")
+    (folder / "backend.py").write_text(BACKEND)
+    (folder / "program.py").write_text(PROGRAM)
+    done = launch(folder, "first", "0", env=environment)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == f"{folder} first\n"
+    assert "setting up" in done.stderr and str(folder / ".venv" / "setup.log") in done.stderr
+    return folder
+
+
+def launch(project: Path, *arguments: str, env: dict[str, str], **options: object) -> subprocess.CompletedProcess[str]:
+    command = [str(project / "ash-bench"), *arguments]
+    return subprocess.run(command, env=env, text=True, capture_output=True, timeout=100, **options)  # type: ignore[call-overload]
+
+
+def change(project: Path) -> None:
+    """Make the next use set up again."""
+    with (project / "pyproject.toml").open("a") as file:
+        file.write("# changed\n")
+
+
+def builds(project: Path) -> int:
+    return len((project / "builds").read_text())
+
+
+def test_second_use_starts_at_once_from_anywhere(project: Path, environment: dict[str, str], tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(project / "ash-bench")
+    before, started = builds(project), time.monotonic()
+    done = subprocess.run(
+        [tmp_path / "link", "a b", "3"], env=environment, cwd=tmp_path, text=True, capture_output=True
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (3, f"{project} a b\n", "")
+    assert time.monotonic() - started < 2
+    assert builds(project) == before
+
+
+def test_two_setups_at_once_make_one(project: Path, environment: dict[str, str]) -> None:
+    change(project)
+    before = builds(project)
+    command = [str(project / "ash-bench"), "x", "0"]
+    both = [subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    stderr = [process.communicate(timeout=100)[1] for process in both]
+    assert [process.returncode for process in both] == [0, 0], stderr
+    assert builds(project) == before + 1
+    assert sum("waiting for it" in text for text in stderr) <= 1
+
+
+def test_failed_step_points_at_the_log_and_is_tried_again(project: Path, environment: dict[str, str]) -> None:
+    change(project)
+    (project / "broken").touch()
+    done = launch(project, "x", "0", env=environment)
+    assert done.returncode == 1
+    assert done.stdout == ""
+    last = done.stderr.splitlines()[-1]
+    assert "no such kernel" in last and str(project / ".venv" / "setup.log") in last
+    (project / "broken").unlink()
+    assert launch(project, "x", "0", env=environment).returncode == 0
+
+
+def test_killed_setup_goes_on(project: Path, environment: dict[str, str]) -> None:
+    change(project)
+    before = builds(project)
+    (project / "hang").touch()
+    command = [str(project / "ash-bench"), "x", "0"]
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL, start_new_session=True)
+    while builds(project) == before:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    (project / "hang").unlink()
+    # A package that was cut off while pip unpacked it: its files are incomplete although its metadata is there.
+    (site,) = (project / ".venv" / "lib").glob("python*/site-packages")
+    (site / "tiny.py").unlink()
+    (site / "tiny-1.0.dist-info" / "INSTALLER").unlink()
+    done = launch(project, "x", "0", env=environment)
+    assert done.returncode == 0, done.stderr
+
+
+def test_missing_compiler_is_one_line_to_type(project: Path, environment: dict[str, str]) -> None:
+    change(project)
+    done = launch(project, "x", "0", env={**environment, "CXX": "/nowhere/c++"})
+    assert done.returncode == 1
+    assert "apt-get install -y g++" in done.stderr.splitlines()[-1]
+    if os.geteuid() == 0:
+        assert "install --no-install-recommends g++" in Path(environment["APT_LOG"]).read_text()
+
+
+def test_copied_folder_runs_its_own_code(project: Path, environment: dict[str, str], tmp_path: Path) -> None:
+    copy = shutil.copytree(project, tmp_path / "copy", symlinks=True)
+    done = launch(copy, "x", "0", env=environment)
+    assert done.stdout == f"{copy} x\n", done.stderr
+
+
+def test_old_python_is_refused(project: Path, environment: dict[str, str], tmp_path: Path) -> None:
+    for name in ("python3", "python3.11", "python3.12", "python3.13"):
+        write_program(tmp_path / "bin" / name, 'case $1 in --version) echo "Python 3.9.2"; exit 0;; esac; exit 1')
+    change(project)
+    done = launch(project, "x", "0", env={**environment, "PATH": f"{tmp_path / 'bin'}:{environment['PATH']}"})
+    assert done.returncode == 1
+    assert done.stderr == "ash-bench: Python 3.11 or newer is needed, and Python 3.9.2 was found\n"
