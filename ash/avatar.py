@@ -1,4 +1,4 @@
-"""The ASH avatar, in the paper's order: template, motion-aware textures, decoders, skinning, splatting. START READING HERE."""
+"""The ASH avatar, in the paper's order: template, textures, decoders, skinning, splatting. START READING HERE."""
 
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -18,7 +18,8 @@ from ash.splatting import Splatted, splat
 from ash.template import Template
 from ash.textures import TexelLattice, motion_aware_textures
 
-OFFSET_UNIT = 0.01  # Metres per unit of a decoder's output: offsets are centimetres, and all outputs should be of order one.
+# Metres per unit of a decoder's output: offsets are centimetres, so that all outputs are of order one.
+OFFSET_UNIT = 0.01
 LIGHT_COEFFICIENTS = 9
 
 
@@ -96,7 +97,9 @@ class AshModel(nn.Module):
             sh=sh,
         )
 
-    def draw(self, gaussians: Gaussians, cameras: list[Camera], background: Tensor | None, threads: int = 1) -> Splatted:
+    def draw(
+        self, gaussians: Gaussians, cameras: list[Camera], background: Tensor | None, threads: int = 1
+    ) -> Splatted:
         """Stg.4: splat into cameras of one size."""
         return splat(
             gaussians,
@@ -120,7 +123,7 @@ class AshModel(nn.Module):
 
 
 def split_raw(raw: Float[Tensor, "n o"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Raw parameters as offset `[n, 3]` (cm), log-scale `[n, 3]`, quaternion `[n, 4]`, opacity logit `[n]`, SH `[n, k, 3]`."""
+    """Raw parameters as offset `[n, 3]` (cm), log-scale `[n, 3]`, quaternion `[n, 4]`, logit `[n]`, SH `[n, k, 3]`."""
     offset, log_scales, quats, logits = raw[:, :GEOMETRY_CHANNELS].split([3, 3, 4, 1], dim=1)
     return offset, log_scales, quats, logits.squeeze(1), raw[:, GEOMETRY_CHANNELS:].unflatten(1, (-1, 3))
 
@@ -133,4 +136,3 @@ def _lit(sh: Float[Tensor, "n k 3"], gain: Float[Tensor, "n 3"]) -> Float[Tensor
 
 def _stage(clock: StageClock | None, name: str) -> AbstractContextManager[None]:
     return clock.stage(name) if clock is not None else nullcontext()
-

@@ -2,7 +2,7 @@
 
 A capture is a folder:
 
-    manifest.json        schema, scene and its parameters, seed, versions, splits, SHA-256 of every file, complete or not
+    manifest.json        schema, scene, its parameters, seed, versions, splits, SHA-256 of every file, complete or not
     cameras.json         width, height; per camera: name, K, viewmat (world -> camera, OpenCV axes)
     skeleton.json        joints: name, parent, rest position of its head
     template.npz         the template mesh that methods are given: rest vertices, faces, UVs, skin weights
@@ -56,7 +56,8 @@ class Camera:
 class Skeleton:
     """Joints in topological order (a parent precedes its children; the root has parent -1).
 
-    Every joint's rest frame has the world's axes. With rotation vectors r (radians, parent's frame) and root translation t,
+    Every joint's rest frame has the world's axes. With rotation vectors r (radians, parent's frame) and root
+    translation t,
         G_root = T(head_root + t) R(r_root),    G_j = G_parent T(head_j - head_parent) R(r_j),
     and the skinning transform of joint j, rest to posed, is G_j T(-head_j).
     """
@@ -188,7 +189,9 @@ def read_cameras(path: Path) -> dict[str, Camera]:
     except InputError:
         raise
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: expected a list of cameras with name, width, height, K, viewmat ({error})") from error
+        raise InputError(
+            f"{path}: expected a list of cameras with name, width, height, K, viewmat ({error})"
+        ) from error
     if not cameras:
         raise InputError(f"{path}: expected at least one camera")
     return cameras
@@ -240,7 +243,8 @@ def read_template(path: Path, *, joints: int) -> TemplateMesh:
         "vertices [v, 3]": vertices.ndim == 2 and vertices.shape[1] == 3,
         "faces [f, 3] into vertices": _are_indices(faces, len(vertices)),
         "uvs [u, 2]": template.uvs.ndim == 2 and template.uvs.shape[1] == 2,
-        "uv_faces [f, 3] into uvs": _are_indices(template.uv_faces, len(template.uvs)) and len(faces) == len(template.uv_faces),
+        "uv_faces [f, 3] into uvs": _are_indices(template.uv_faces, len(template.uvs))
+        and len(faces) == len(template.uv_faces),
         f"skin_weights [v, {joints}]": weights.shape == (len(vertices), joints),
     }
     _require(path, checks)
@@ -356,7 +360,7 @@ def _widest(array: np.ndarray) -> np.ndarray:
 
 def _are_indices(array: np.ndarray, count: int) -> bool:
     shaped = array.ndim == 2 and array.shape[1] == 3 and len(array) > 0
-    return shaped and bool(0 <= array.min() and array.max() < count)
+    return shaped and bool(array.min() >= 0 and array.max() < count)
 
 
 def _require(path: Path, checks: dict[str, bool]) -> None:

@@ -1,5 +1,7 @@
 """Stg.3: from motion-aware textures to the canonical texel Gaussians' raw parameters (ASH Eq. 6 and 7)."""
 
+from itertools import pairwise
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -36,7 +38,7 @@ class UNet(nn.Module):
         super().__init__()
         widths = [width * 2**level for level in range(levels + 1)]
         self.first = ConvBlock(inputs, width, norm)
-        self.down = nn.ModuleList(ConvBlock(a, b, norm) for a, b in zip(widths, widths[1:], strict=False))
+        self.down = nn.ModuleList(ConvBlock(a, b, norm) for a, b in pairwise(widths))
         up_inputs = [widths[-1] + bottleneck_features, *widths[-2:0:-1]]
         pairs = list(zip(up_inputs, widths[-2::-1], strict=True))
         self.up = nn.ModuleList(nn.ConvTranspose2d(a, b, 2, stride=2) for a, b in pairs)

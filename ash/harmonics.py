@@ -1,4 +1,4 @@
-"""Real spherical harmonics up to degree 3, in the order and signs that 3D Gaussian splatting uses (Kerbl et al. 2023)."""
+"""Real spherical harmonics up to degree 3, in the order and signs of 3D Gaussian splatting (Kerbl et al. 2023)."""
 
 from functools import cache
 
@@ -41,8 +41,8 @@ def sh_basis(directions: Float[Tensor, "*n 3"], degree: int) -> Float[Tensor, "*
 def rotate_sh(quats: Float[Tensor, "n 4"], sh: Float[Tensor, "n k 3"]) -> Float[Tensor, "n k 3"]:
     """Turn functions on the sphere: the result at direction d is the input at R(quats)^-1 d.
 
-    Degree by degree, each row's coefficients are fitted to its values at a few fixed directions; harmonics of one degree
-    are closed under rotation, so that the fit is exact.
+    Degree by degree, each row's coefficients are fitted to its values at a few fixed directions; harmonics of one
+    degree are closed under rotation, so that the fit is exact.
     """
     turned = [sh[:, :1]]
     for degree in range(1, _degree_of(sh.shape[1]) + 1):

@@ -50,7 +50,7 @@ def initial_gaussians(
 
 
 def texel_pitch(lattice: TexelLattice, vertices: Float[Tensor, "v 3"]) -> Float[Tensor, " n"]:
-    """Distance between neighbouring texels on the surface, metres: the square root of a texel's share of its triangle."""
+    """Distance between neighbouring texels on the surface, metres: the root of a texel's share of its triangle."""
     a, b, c = vertices[lattice.corners].unbind(1)
     area = 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=-1)
     _, triangle, count = torch.unique(lattice.corners, dim=0, return_inverse=True, return_counts=True)
@@ -60,9 +60,9 @@ def texel_pitch(lattice: TexelLattice, vertices: Float[Tensor, "v 3"]) -> Float[
 
 
 def mean_colours(capture: Capture, template: Template, lattice: TexelLattice) -> Float[Tensor, "n 3"]:
-    """Mean training pixel of every texel over a few frames and all training cameras, weighted by how squarely it is seen.
+    """Mean training pixel of every texel, over a few frames and all training cameras.
 
-    Texels that no camera sees take the mean colour of those that are seen.
+    Views count by how squarely they see the texel. Texels that no camera sees take the mean colour of those that are seen.
     """
     frames = capture.splits["train"].frames
     chosen = frames[:: max(1, len(frames) // COLOUR_FRAMES)]
@@ -97,7 +97,9 @@ def visible_pixels(
     inside = ((pixels >= 0) & (pixels < size)).all(1)
     pixels = pixels.clamp(min=torch.zeros(2, dtype=torch.long), max=size - 1)
     surface = drawn.depth[pixels[:, 1], pixels[:, 0]]
-    visible = inside & (drawn.triangle[pixels[:, 1], pixels[:, 0]] >= 0) & (projected[:, 2] < surface + VISIBLE_WITHIN_M)
+    visible = (
+        inside & (drawn.triangle[pixels[:, 1], pixels[:, 0]] >= 0) & (projected[:, 2] < surface + VISIBLE_WITHIN_M)
+    )
     towards = torch.nn.functional.normalize(torch.from_numpy(camera.position).float() - positions, dim=-1)
     return pixels, (towards * normals).sum(-1).clamp(min=0) * visible
 

@@ -1,4 +1,4 @@
-"""Whole configurations by name: a preset is a function that returns one. An ablation replaces the one field it is about."""
+"""Whole configurations by name. A preset is a function that returns one; an ablation replaces the field it is about."""
 
 from dataclasses import replace
 
@@ -78,4 +78,3 @@ def wo_mot(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
     model = replace(config.model, motion=False, base=True)
     training = replace(config.training, warmup="none", warmup_steps=0)
     return AshAvatar(replace(config, seed=seed, model=model, training=training), capture)
-

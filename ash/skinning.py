@@ -1,7 +1,7 @@
 """Quaternions, forward kinematics and skinning: from degrees of freedom to one rigid transform per vertex (ASH Eq. 5).
 
-Quaternions are wxyz. A rigid transform is kept as a unit quaternion and a translation; dual quaternions appear only where
-they are blended (Kavan et al. 2007, "Skinning with Dual Quaternions").
+Quaternions are wxyz. A rigid transform is kept as a unit quaternion and a translation; dual quaternions appear only
+where they are blended (Kavan et al. 2007, "Skinning with Dual Quaternions").
 """
 
 from dataclasses import dataclass
@@ -80,8 +80,8 @@ def unitquat_to_rotmat(q: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:
 def rotmat_to_unitquat(m: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 4"]:
     """Rotation matrix to unit quaternion with w >= 0.
 
-    Reference: Bar-Itzhack, "New method for extracting the quaternion from a rotation matrix", 2000, in the form that picks
-    the largest of the four squared components, so that no division is by a small number.
+    Reference: Bar-Itzhack, "New method for extracting the quaternion from a rotation matrix", 2000, in the form that
+    picks the largest of the four squared components, so that no division is by a small number.
     """
     d = torch.diagonal(m, dim1=-2, dim2=-1)
     trace = d.sum(-1)
@@ -128,8 +128,8 @@ def sparse_skin_weights(dense: Float[Tensor, "v j"]) -> SkinWeights:
 def dual_quaternion_skinning(joints: RigidTransforms, skin: SkinWeights) -> RigidTransforms:
     """Blend joint transforms into one rigid transform per vertex.
 
-    Kavan et al. 2007. Every quaternion is first brought to the hemisphere of the vertex's strongest joint: q and -q are the
-    same rotation, but their blend is not.
+    Kavan et al. 2007. Every quaternion is first brought to the hemisphere of the vertex's strongest joint: q and -q
+    are the same rotation, but their blend is not.
     """
     real = joints.quats[skin.joints]
     pure = torch.nn.functional.pad(joints.translations, (1, 0))
@@ -151,6 +151,6 @@ def linear_blend_skinning(
 
 
 def root_yaw(dofs: Float[Tensor, " d"]) -> Float[Tensor, ""]:
-    """Heading of the root about the vertical (y) axis, radians: where its rest forward axis (+z) points in the floor plane."""
+    """Heading of the root about the vertical (y) axis, radians: where its forward axis (+z) points in the floor plane."""
     forward = rotate(rotvec_to_unitquat(dofs[3:6]), dofs.new_tensor([0.0, 0.0, 1.0]))
     return torch.atan2(forward[0], forward[2])

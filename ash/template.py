@@ -1,4 +1,4 @@
-"""Stg.1: the animatable template. Motion in, deformed canonical and posed template mesh out (ASH Sec. 3.2, appendix A)."""
+"""Stg.1: the animatable template. Motion in, deformed and posed template mesh out (ASH Sec. 3.2, appendix A)."""
 
 from collections import OrderedDict
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class PosedTemplate:
 
 @runtime_checkable
 class Deformation(Protocol):
-    """Where the vertices of the canonical template lie in a frame: the part of Stg.1 that is learned, fixed or known."""
+    """Where the canonical vertices lie in a frame: the part of Stg.1 that is learned, fixed or known."""
 
     def canonical(self, motion: Motion, frame: int, transforms: RigidTransforms) -> Float[Tensor, "v 3"]:
         """Canonical vertices, metres, for this frame of this motion."""
@@ -69,7 +69,10 @@ class KnownDeformation:
 
 
 class Template:
-    """Poses the template mesh. The last few frames are kept, because a motion window asks for each frame several times."""
+    """Poses the template mesh.
+
+    The last few frames are kept, because a motion window asks for each frame several times.
+    """
 
     KEPT_FRAMES = 256
 

@@ -17,8 +17,8 @@ from ash.template import PosedTemplate, Template
 class TexelLattice:
     """The texels that a triangle covers, in row-major order; each is one Gaussian.
 
-    Texel (row, column) samples the atlas at u = (column + 0.5) / resolution, v = 1 - (row + 0.5) / resolution, like an image
-    whose first row is the top. (The release samples texel corners of the transposed array.)
+    Texel (row, column) samples the atlas at u = (column + 0.5) / resolution, v = 1 - (row + 0.5) / resolution, like
+    an image whose first row is the top. (The release samples texel corners of the transposed array.)
     """
 
     resolution: int
@@ -39,7 +39,8 @@ class TexelLattice:
         strongest = self.barycentric.argmax(1)[:, None, None].expand(-1, 1, 4)
         aligned = torch.where((quats * quats.gather(1, strongest)).sum(-1) < 0, -self.barycentric, self.barycentric)
         blended = (quats * aligned[..., None]).sum(1)
-        # The dual part of (q, t) is t q / 2; blending it and multiplying by the conjugate of the blend gives the translation.
+        # The dual part of (q, t) is t q / 2; blending it and multiplying by the conjugate of the blend gives the
+        # translation.
         moments = _dual_parts(quats, transforms.translations[self.corners])
         moment = (moments * aligned[..., None]).sum(1)
         length = blended.norm(dim=-1, keepdim=True)
@@ -97,8 +98,8 @@ def motion_aware_textures(
 ) -> Float[Tensor, "c r r"]:
     """Normal and position textures of a window of frames, newest first: `c = 6 window` channels.
 
-    Positions (metres) are relative to the root of the newest frame, so the textures do not change when the whole motion is
-    moved; with `yaw_normalise` they do not change either when it is turned about the vertical axis.
+    Positions (metres) are relative to the root of the newest frame, so the textures do not change when the whole
+    motion is moved; with `yaw_normalise` they do not change either when it is turned about the vertical axis.
     """
     dofs = torch.from_numpy(motion.dofs[frame]).float()
     root = dofs[:3] + torch.from_numpy(template.skeleton.heads[0]).float()

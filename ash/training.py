@@ -29,7 +29,7 @@ LOG_EVERY = 50
 FINAL_LEARNING_RATE = 0.05  # Of the initial one, at the end of the cosine.
 
 
-class Diverged(RuntimeError):
+class Diverged(FloatingPointError):
     """Training produced NaN or infinity twice. That is a result, and is recorded as one."""
 
 
@@ -168,9 +168,7 @@ def fit(
 def view_loss(images: Float[Tensor, "c h w 3"], batch: Batch, config: TrainingConfig) -> Tensor:
     """ASH Eq. 9, mean over the views."""
     losses = [
-        l1_ssim_loss(
-            image, cache_target(target), l1_weight=config.l1_weight, ssim_weight=config.ssim_weight
-        )
+        l1_ssim_loss(image, cache_target(target), l1_weight=config.l1_weight, ssim_weight=config.ssim_weight)
         for image, target in zip(images, batch.targets, strict=True)
     ]
     return torch.stack(losses).mean()

@@ -1,8 +1,9 @@
 """A DDC-style mesh avatar: the animatable template with a dynamic texture, rasterised.
 
 Habermann et al., "Real-time Deep Dynamic Characters" (SIGGRAPH 2021), as ASH describes its competitor: the same learned
-template as ASH, and a texture predicted from the motion-aware normal texture. The mesh decides which surface point a pixel
-sees; only the texture (and the light) is learned here, through perspective-correct bilinear sampling and antialiased coverage.
+template as ASH, and a texture predicted from the motion-aware normal texture. The mesh decides which surface point a
+pixel sees; only the texture (and the light) is learned here, through perspective-correct bilinear sampling and
+antialiased coverage.
 """
 
 from dataclasses import dataclass
