@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from ash.files import InputError
 
 
-def _one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
+def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
+    """Refuse a value that is not among those that exist."""
     if value not in allowed:
         raise InputError(f"{name}: expected one of {', '.join(allowed)}, got {value!r}")
 
@@ -33,8 +34,8 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be built."""
-        _one_of("norm", self.norm, ("instance", "none"))
-        _one_of("quat_frame", self.quat_frame, ("canonical", "world"))
+        one_of("norm", self.norm, ("instance", "none"))
+        one_of("quat_frame", self.quat_frame, ("canonical", "world"))
         if self.texels < 4 or self.texels % 2 ** (self.levels + self.half_resolution):
             raise InputError(f"texels: expected a multiple of 2^levels, got {self.texels} with {self.levels} levels")
         if not 0 <= self.sh_degree <= 3:
@@ -62,8 +63,8 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
-        _one_of("warmup", self.warmup, ("static", "analytic", "fitted", "none"))
-        _one_of("background", self.background, ("random", "black"))
+        one_of("warmup", self.warmup, ("static", "analytic", "fitted", "none"))
+        one_of("background", self.background, ("random", "black"))
         if self.steps < 1 or self.views_per_step < 1 or not 0 <= self.warmup_steps <= self.steps:
             raise InputError("expected steps >= 1, views_per_step >= 1 and 0 <= warmup_steps <= steps")
 
@@ -79,7 +80,7 @@ class AshConfig:
 
     def __post_init__(self) -> None:
         """Refuse an unknown template and a warm-up that the model cannot take."""
-        _one_of("template", self.template, ("skinned", "exact"))
+        one_of("template", self.template, ("skinned", "exact"))
         if self.training.warmup == "static" and not self.model.base:
             raise InputError("warmup='static' trains the base alone and needs base=True")
         if self.training.warmup in ("analytic", "fitted") and not self.model.motion:

@@ -279,6 +279,14 @@ def read_template_truth(capture: Capture) -> np.ndarray:
     return vertices
 
 
+def read_surface_truth(capture: Capture, frame: int) -> np.ndarray:
+    """Vertices of the rendered surface in a frame, `[s, 3]` metres: what a lab's per-frame reconstruction stands for."""
+    path = surface_path(capture.folder, frame)
+    vertices = read_arrays(path, expected=("vertices",))["vertices"]
+    _require(path, {"vertices [s, 3]": vertices.ndim == 2 and vertices.shape[1] == 3 and len(vertices) > 0})
+    return vertices
+
+
 def load_capture(folder: Path) -> Capture:
     """Load a finished capture and check its small parts; images are checked when they are read.
 

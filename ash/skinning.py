@@ -6,6 +6,7 @@ where they are blended (Kavan et al. 2007, "Skinning with Dual Quaternions").
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -101,13 +102,21 @@ def forward_kinematics(skeleton: Skeleton, dofs: Float[Tensor, " d"]) -> RigidTr
     """Skinning transform of every joint, rest to posed (see `ash.dataset.Skeleton` for the convention). Rows: `[j]`."""
     heads = torch.as_tensor(skeleton.heads, dtype=dofs.dtype, device=dofs.device)
     local = rotvec_to_unitquat(dofs[3:].view(-1, 3))
-    quats, origins = [local[0]], [heads[0] + dofs[:3]]
-    for joint in range(1, len(skeleton.parents)):
-        parent = int(skeleton.parents[joint])
-        quats.append(quat_multiply(quats[parent], local[joint]))
-        origins.append(origins[parent] + rotate(quats[parent], heads[joint] - heads[parent]))
-    rotations = torch.stack(quats)
-    return RigidTransforms(quats=rotations, translations=torch.stack(origins) - rotate(rotations, heads))
+    quats, origins = local.clone(), heads + dofs[:3]
+    for joints, parents in _generations(skeleton.parents):
+        turned = rotate(quats[parents], heads[joints] - heads[parents])
+        origins = origins.index_copy(0, joints, origins[parents] + turned)
+        quats = quats.index_copy(0, joints, quat_multiply(quats[parents], local[joints]))
+    return RigidTransforms(quats=quats, translations=origins - rotate(quats, heads))
+
+
+def _generations(parents: np.ndarray) -> list[tuple[Tensor, Tensor]]:
+    """Joints that are equally far from the root, with their parents, generation by generation without the root."""
+    depth = np.zeros(len(parents), dtype=np.int64)
+    for joint in range(1, len(parents)):
+        depth[joint] = depth[parents[joint]] + 1
+    members = [np.flatnonzero(depth == d) for d in range(1, depth.max() + 1)]
+    return [(torch.from_numpy(joints), torch.from_numpy(parents[joints])) for joints in members]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
