@@ -124,7 +124,7 @@ class Cell:
 
 
 def failed_result(config: CellConfig, status: Status, reason: str, provenance: Provenance | None = None) -> CellResult:
-    """The result of a cell that did not come through: the worst of every quality, for a missing row would flatter it."""
+    """The result of a cell that did not come through: the worst of every quality, never a missing row."""
     qualities = [(split, region, metric) for split in IMAGE_SPLITS for region, metric in VIEW_SCORES]
     rows = [Summary(split=s, region=r, metric=m, value=METRICS[m].worst) for s, r, m in qualities]
     rows.append(Summary(split="speed", region="", metric="frame_ms", value=METRICS["frame_ms"].worst))

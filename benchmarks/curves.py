@@ -11,7 +11,7 @@ MAX_POINTS = 200
 
 
 def read_curve(path: Path) -> tuple[CurvePoint, ...]:
-    """Points of `log.jsonl` that carry `seconds` and a `loss` or `psnr`, in order of time, thinned to 200.
+    """Points of `log.jsonl` that carry `seconds` and a `loss` or `train_psnr`, in order of time, thinned to 200.
 
     Lines of other kinds, and the half line that an interrupted process leaves, are passed over.
     """
@@ -29,7 +29,7 @@ def _point(line: str) -> CurvePoint | None:
         return None
     if not isinstance(row, dict):
         return None
-    seconds, loss, psnr = (_finite(row.get(name)) for name in ("seconds", "loss", "psnr"))
+    seconds, loss, psnr = (_finite(row.get(name)) for name in ("seconds", "loss", "train_psnr"))
     if seconds is None or (loss is None and psnr is None):
         return None
     return CurvePoint(seconds=seconds, loss=loss, psnr=psnr)

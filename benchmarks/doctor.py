@@ -9,6 +9,7 @@ from pathlib import Path
 
 import psutil
 
+from ash.files import InputError
 from benchmarks import provenance
 
 ALEXNET = Path.home() / ".cache" / "torch" / "hub" / "checkpoints" / "alexnet-owt-7be5be79.pth"
@@ -35,14 +36,15 @@ def _renderer() -> Finding:
         return Finding(what="Mitsuba", found="not installed", consequence="no ground truth can be rendered", good=False)
     from synth.render import probe
 
-    variant = probe()
-    if variant.startswith("llvm"):
-        return Finding(what="Mitsuba", found=f"{variant}, by a probe render", consequence="ground truth at full speed")
-    return Finding(
-        what="Mitsuba",
-        found=f"{variant}, by a probe render",
-        consequence="rendering takes about 3x as long; LLVM 19 (apt: libllvm19) would help",
+    try:
+        renderer = probe()
+    except InputError as error:
+        return Finding(what="Mitsuba", found=str(error), consequence="no ground truth can be rendered", good=False)
+    slow = renderer.variant.startswith("scalar")
+    consequence = (
+        "rendering takes about 3x as long; LLVM 19 (apt: libllvm19) helps" if slow else "renders at full speed"
     )
+    return Finding(what="Mitsuba", found=renderer.note, consequence=consequence)
 
 
 def _compiler() -> Finding:

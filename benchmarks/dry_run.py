@@ -17,7 +17,7 @@ def estimate(suite: Suite, options: RunOptions) -> str:
         cells = list(shard_of(cells, options.shard))
     lines = [f"{suite.name}: {suite.about}", ""]
     for spec in suite.captures:
-        lines.append(f"capture {spec.name}: {estimate_capture(scene(spec.scene, size=spec.size, seed=spec.seed))}")
+        lines.append(f"capture {spec.name}: {estimate_capture(scene(spec.scene, size=spec.size, seed=spec.seed)).text}")
     lines += [f"cell {cell.capture.scene} · {cell.method}:{cell.preset} · seed {cell.seed}" for cell in cells]
     hours = len(cells) * suite.cell_minutes / 60
     wall = hours / min(options.workers, max(1, len(cells)))

@@ -33,7 +33,7 @@ class Progress:
             self.say(f"{title}: {status}")
 
     def advance(self, finished: int, total: int) -> None:
-        """`finished` of `total` pieces are done, for work that counts for itself; without a terminal every tenth is told."""
+        """`finished` of `total` pieces are done, for work that counts for itself; a log hears of every tenth."""
         tenth = max(1, total // 10)
         news = finished // tenth != self.finished // tenth
         if self.total == 0 and finished < total:  # What was there before says nothing about the pace.

@@ -77,9 +77,9 @@ def run_cell(cell: Cell) -> CellResult:
         return finished
     start = time.perf_counter()
     capture = _capture_of(cell)
-    factory = find_method(cell.config.method).load()
+    method = find_method(cell.config.method)
     try:
-        result = _train_and_evaluate(cell, capture, factory)
+        result = _train_and_evaluate(cell, capture, method.load())
     except (InputError, OSError):
         raise
     except FloatingPointError as error:

@@ -175,7 +175,7 @@ class FakeAvatar:
 
     def fit(self, capture: Capture, *, folder: Path) -> None:
         assert set(capture.splits) == {"train"}, "a method that is no oracle was shown held-out views"
-        rows = [f'{{"step": {i}, "seconds": {0.1 * i}, "loss": {1 / (i + 1)}, "psnr": {10 + i}}}\n' for i in range(5)]
+        rows = [f'{{"step": {i}, "seconds": {0.1 * i}, "loss": {1 / (i + 1)}, "train_psnr": {10 + i}}}\n' for i in range(5)]
         (folder / "log.jsonl").write_text("".join(rows))
 
     def render(self, motion: Motion, frame: int, camera: Camera, *, clock: StageClock) -> np.ndarray:

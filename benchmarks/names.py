@@ -1,0 +1,41 @@
+"""How methods are called and coloured in tables and charts; a method of someone else keeps its own name."""
+
+from dataclasses import dataclass
+
+from benchmarks.experiments import ORACLES
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Look:
+    """A method's name for readers and its colour, which reads on white and on dark paper."""
+
+    title: str
+    colour: str
+
+
+LOOKS = {
+    "ash": Look(title="ASH", colour="#2f6fde"),
+    "ash_truth": Look(title="ASH, exact surface", colour="#2f6fde"),
+    "ddc": Look(title="DDC", colour="#dd6b20"),
+    "ddc_truth": Look(title="DDC, exact surface", colour="#dd6b20"),
+    "wo_disp": Look(title="w/o disp.", colour="#2a9d8f"),
+    "wo_mot": Look(title="w/o mot.", colour="#9b59b6"),
+    "mlp": Look(title="w/ MLP", colour="#c2415c"),
+    "static": Look(title="static", colour="#7a869a"),
+    "nearest": Look(title="nearest image", colour="#7a869a"),
+    "oracle_texture": Look(title="best texture, exact mesh", colour="#b8860b"),
+}
+SPARE_COLOURS = ("#b8860b", "#c2415c", "#5b8c2a", "#7a869a", "#008fb3", "#a0522d")
+EXACT = {"ash": "ash_truth", "ddc": "ddc_truth"}  # A method and the same method given the exact surface.
+
+
+def look_of(method: str) -> Look:
+    """The look of a method; unknown ones get a colour by the sum of their letters, the same in every report."""
+    if method in LOOKS:
+        return LOOKS[method]
+    return Look(title=method, colour=SPARE_COLOURS[sum(method.encode()) % len(SPARE_COLOURS)])
+
+
+def is_oracle(method: str) -> bool:
+    """Whether the method was shown the truth, and so is a bound and no competitor."""
+    return method in ORACLES
