@@ -127,6 +127,16 @@ class AshAvatar:
         drawn = self.module(motion, frame, camera, clock)
         return torch.cat([drawn.rgb[0], drawn.alpha[0, ..., None]], -1).clamp(0, 1).numpy()
 
+    def template_vertices(self, motion: Motion, frame: int) -> np.ndarray:
+        """The posed template, `[v, 3]` metres."""
+        return self.template.pose(motion, frame).vertices.numpy()
+
+    @torch.no_grad()
+    def gaussian_means(self, motion: Motion, frame: int) -> np.ndarray:
+        """Centres of the posed Gaussians, `[n, 3]` metres."""
+        conditions = self.module.conditions(motion, frame)
+        return self.module.pose(self.module.decode(conditions), conditions).means.numpy()
+
     def parameter_count(self) -> int:
         """Numbers that training may change."""
         return sum(p.numel() for p in self.module.parameters() if p.requires_grad)

@@ -187,6 +187,14 @@ class DdcAvatar:
         with clock.stage("stg4"):
             return self.module.draw(texture, posed, camera, torch.zeros(3)).clamp(0, 1).numpy()
 
+    def template_vertices(self, motion: Motion, frame: int) -> np.ndarray:
+        """The posed template, `[v, 3]` metres."""
+        return self.template.pose(motion, frame).vertices.numpy()
+
+    def gaussian_means(self, motion: Motion, frame: int) -> np.ndarray:
+        """A mesh has none."""
+        return np.zeros((0, 3))
+
     def parameter_count(self) -> int:
         """Numbers that training may change."""
         return sum(p.numel() for p in self.module.parameters() if p.requires_grad)

@@ -52,3 +52,17 @@ def front_camera(width: int = 64, height: int = 64, distance: float = 2.0) -> Ca
     viewmat[:3, 3] = (0.0, 0.5, distance)
     K = np.array([[1.2 * height, 0, width / 2], [0, 1.2 * height, height / 2], [0, 0, 1.0]])
     return Camera(name="front", width=width, height=height, K=K, viewmat=viewmat)
+
+
+def ring_cameras(count: int, size: int) -> list[Camera]:
+    """Cameras around the tube, all upright and looking at its middle."""
+    cameras = []
+    for index in range(count):
+        angle = 2 * np.pi * index / count
+        turn = np.array([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]])
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ turn
+        viewmat[:3, 3] = -viewmat[:3, :3] @ (np.array([0, 0.5, 0]) - 2.0 * viewmat[2, :3])
+        K = np.array([[1.3 * size, 0, size / 2], [0, 1.3 * size, size / 2], [0, 0, 1.0]])
+        cameras.append(Camera(name=f"cam{index}", width=size, height=size, K=K, viewmat=viewmat))
+    return cameras

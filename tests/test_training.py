@@ -1,0 +1,148 @@
+import json
+import os
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from captures import tube_model_config, write_tube_capture
+
+from ash.config import AshConfig, TrainingConfig
+from ash.files import InputError
+from ash.method import AshAvatar
+from ash.protocol import StageClock
+from ash.training import Diverged, Interrupted, cut_batch, draw_batch, load_training_images
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
+
+
+def config(**changes) -> AshConfig:
+    training = TrainingConfig(
+        steps=12,
+        views_per_step=2,
+        warmup="static",
+        warmup_steps=4,
+        l1_weight=0.8,
+        ssim_weight=0.2,
+        learning_rate=2e-3,
+    )
+    return AshConfig(model=tube_model_config(), training=replace(training, **changes))
+
+
+def weights(avatar: AshAvatar) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in avatar.module.state_dict().items()}
+
+
+def psnr(avatar, capture, split: str) -> float:
+    errors = []
+    for camera, frame in capture.splits[split].views:
+        truth = capture.image(camera, frame).astype(np.float64) / 255
+        drawn = avatar.render(capture.motion, frame, capture.cameras[camera], clock=StageClock())
+        errors.append((((drawn[..., :3] - truth[..., :3] * truth[..., 3:])[truth[..., 3] > 0.5]) ** 2).mean())
+    return -10 * np.log10(np.mean(errors))
+
+
+def test_known_gaussians_are_recovered_from_their_images(capture, tmp_path):
+    avatar = AshAvatar(config(steps=150, warmup_steps=100), capture)
+    before = psnr(avatar, capture, "novel_view")
+    avatar.fit(capture, folder=tmp_path)
+    assert psnr(avatar, capture, "novel_view") > before + 6
+    assert psnr(avatar, capture, "novel_pose") > before + 4
+    rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert rows[-1]["step"] == 149
+    assert rows[-1]["train_psnr"] > rows[0]["train_psnr"] + 6
+
+
+def test_a_run_stopped_anywhere_ends_with_the_same_bits(capture, tmp_path):
+    undisturbed = AshAvatar(config(), capture)
+    undisturbed.fit(capture, folder=tmp_path / "whole")
+    for stop in (1, 5, 11):  # In the warm-up, after it, and at the last step.
+        folder = tmp_path / f"stopped{stop}"
+        first = AshAvatar(config(), capture)
+        draw = first.draw_training_views
+
+        def draw_then_signal(frame, cameras, background, step, draw=draw, stop=stop):
+            if step == stop:
+                os.kill(os.getpid(), signal.SIGTERM)
+            return draw(frame, cameras, background, step)
+
+        first.draw_training_views = draw_then_signal
+        with pytest.raises(Interrupted, match=f"stopped at step {stop + 1} of 12"):
+            first.fit(capture, folder=folder)
+        again = AshAvatar(config(), capture)
+        again.fit(capture, folder=folder)
+        for name, value in weights(undisturbed).items():
+            assert torch.equal(weights(again)[name], value), name
+
+
+def test_equal_seeds_give_equal_bits_and_other_seeds_do_not(capture, tmp_path):
+    results = []
+    for run, seed in enumerate((0, 0, 1)):
+        avatar = AshAvatar(replace(config(), seed=seed), capture)
+        avatar.fit(capture, folder=tmp_path / str(run))
+        results.append(weights(avatar)["base"])
+    assert torch.equal(results[0], results[1])
+    assert not torch.equal(results[0], results[2])
+
+
+def test_nan_rolls_back_once_and_then_ends_the_run(capture, tmp_path):
+    avatar = AshAvatar(config(), capture)
+    draw, spoiled = avatar.draw_training_views, []
+
+    def spoil(frame, cameras, background, step):
+        image = draw(frame, cameras, background, step)
+        spoiled.append(step == 6)
+        return image * float("nan") if step == 6 and sum(spoiled) <= times else image
+
+    avatar.draw_training_views = spoil
+    times = 1
+    avatar.fit(capture, folder=tmp_path / "once")
+    assert all(torch.isfinite(value).all() for value in weights(avatar).values())
+    times = 99
+    spoiled.clear()
+    with pytest.raises(Diverged, match="step 6"):
+        avatar.fit(capture, folder=tmp_path / "always")
+
+
+def test_a_damaged_checkpoint_is_named(capture, tmp_path):
+    avatar = AshAvatar(config(), capture)
+    avatar.save(tmp_path / "weights.safetensors")
+    content = (tmp_path / "weights.safetensors").read_bytes()
+    (tmp_path / "weights.safetensors").write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match=r"weights\.safetensors: expected a safetensors checkpoint"):
+        avatar.load(tmp_path / "weights.safetensors")
+
+
+def test_saved_weights_render_the_same_image(capture, tmp_path):
+    avatar = AshAvatar(config(), capture)
+    avatar.fit(capture, folder=tmp_path)
+    avatar.save(tmp_path / "weights.safetensors")
+    other = AshAvatar(config(), capture)
+    other.load(tmp_path / "weights.safetensors")
+    camera = capture.cameras["cam0"]
+    drawn = [a.render(capture.motion, 5, camera, clock=StageClock()) for a in (avatar, other)]
+    np.testing.assert_array_equal(*drawn)
+
+
+def test_a_crop_draws_what_the_full_image_shows_there(capture):
+    images = load_training_images(capture.training_only())
+    batch = cut_batch(images, 1, ["cam1", "cam2"], torch.tensor([0.2, 0.4, 0.6]))
+    avatar = AshAvatar(config(), capture)
+    background = torch.tensor([0.2, 0.4, 0.6])
+    cropped = avatar.draw_training_views(1, batch.cameras, background, 0)
+    for view, (name, camera) in enumerate(zip(["cam1", "cam2"], batch.cameras, strict=True)):
+        full = avatar.draw_training_views(1, [capture.cameras[name]], background, 0)[0]
+        left, top = (capture.cameras[name].K[:2, 2] - camera.K[:2, 2]).astype(int)
+        window = full[top : top + camera.height, left : left + camera.width]
+        torch.testing.assert_close(cropped[view], window, atol=2e-5, rtol=0)
+
+
+def test_every_epoch_shows_every_frame_once(capture):
+    images = load_training_images(capture.training_only())
+    for epoch in range(3):
+        frames = [draw_batch(images, config().training, 7, 4 * epoch + k).frame for k in range(4)]
+        assert sorted(frames) == [0, 1, 2, 3]
