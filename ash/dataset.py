@@ -12,7 +12,8 @@ A capture is a folder:
         template.npz     vertices [t, v, 3]: where the template's vertices really are, per frame
         surface.npz      faces, uvs, uv_faces, part (label per face) of the rendered surface
         surface/FRAME.npz  vertices [s, 3] of the rendered surface, metres
-        pixels/CAM/FRAME.npz  triangle [h, w] (-1: none), barycentric [h, w, 2], noise [h, w] (variance of sRGB in 0..1)
+        pixels/CAM/FRAME.npz  triangle [h, w] (-1: none), barycentric [h, w, 2] (weights of corners
+                         1 and 2; corner 0 has the rest), noise [h, w] (variance of sRGB in 0..1)
 
 Units are metres, radians and seconds; right-handed, y up; cameras follow OpenCV (x right, y down, z forward) with pixel
 centres at +0.5. NumPy only: this module knows formats, no method and no renderer.

@@ -1,0 +1,138 @@
+"""Named scenes. A scene is a function of its size and seed; each rung adds exactly one phenomenon to `skinned`."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ash.files import InputError
+from synth.motion import Clip
+from synth.scene import Light, Outfit, Rig, Scene
+
+SIZES = ("ci", "quick", "table", "paper")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Size:
+    """How much of everything."""
+
+    rig: Rig
+    repeats: int  # rounds of the training clips
+    frames: int  # per clip
+    test_frames: int
+    stride: int
+    samples: int
+    texture: int
+
+
+def _size(name: str) -> Size:
+    if name == "ci":
+        rig = Rig(cameras=6, held_out=2, width=128, height=128)
+        return Size(rig=rig, repeats=1, frames=4, test_frames=3, stride=3, samples=16, texture=512)
+    if name == "quick":
+        return Size(rig=Rig(), repeats=1, frames=10, test_frames=12, stride=5, samples=64, texture=2048)
+    if name == "table":
+        rig = Rig(cameras=34, held_out=4, width=512, height=512)
+        return Size(rig=rig, repeats=4, frames=20, test_frames=80, stride=20, samples=128, texture=4096)
+    if name == "paper":
+        rig = Rig(kind="studio120", cameras=120, held_out=4, width=1285, height=940, radius=4.5)
+        return Size(rig=rig, repeats=100, frames=50, test_frames=7000, stride=100, samples=64, texture=4096)
+    raise InputError(f"unknown size {name!r}, expected one of {', '.join(SIZES)}")
+
+
+def _base(name: str, size: str, seed: int, *, body: str, outfit: Outfit) -> Scene:
+    amount = _size(size)
+    kinds = ("walk", "squat") if size == "ci" else ("walk", "reach", "turn", "squat")
+    return Scene(
+        name=name,
+        size=size,
+        seed=seed,
+        body=body,
+        outfit=outfit,
+        light=Light(),
+        rig=amount.rig,
+        train=tuple(Clip(generator=kind, frames=amount.frames) for kind in kinds * amount.repeats),
+        test=(Clip(generator="dance", frames=amount.test_frames),),
+        novel_view_stride=amount.stride,
+        samples=amount.samples,
+        texture=amount.texture,
+    )
+
+
+def mannequin(*, size: str, seed: int) -> Scene:
+    """A procedural humanoid in a swinging skirt: needs no body model; the scene of the tests."""
+    outfit = Outfit(skirt=True, folds_mm=5.0, swing=1.0)
+    return _base("mannequin", size, seed, body="mannequin", outfit=outfit)
+
+
+def loose(*, size: str, seed: int) -> Scene:
+    """A realistic body in loose clothes and a swinging skirt, everything on: the default of the main job."""
+    outfit = Outfit(skirt=True, folds_mm=7.0, slack_mm=12.0, swing=1.0, scan_mm=4.0)
+    return _base("loose", size, seed, body="anny", outfit=outfit)
+
+
+def tight(*, size: str, seed: int) -> Scene:
+    """A realistic body in tight clothes that fold a little."""
+    return _base("tight", size, seed, body="anny", outfit=Outfit(folds_mm=3.0, scan_mm=1.0))
+
+
+SCENES: dict[str, Callable[..., Scene]] = {"mannequin": mannequin, "loose": loose, "tight": tight}
+
+
+def scene(name: str, *, size: str, seed: int = 0) -> Scene:
+    """The named scene at a size (`ci`, `quick`, `table`, `paper`).
+
+    Raises:
+        InputError: an unknown name or size; the message lists the known ones.
+    """
+    if name not in SCENES:
+        raise InputError(f"unknown scene {name!r}, expected one of {', '.join(sorted(SCENES))}")
+    if not 0 <= seed < 2**31:
+        raise InputError(f"seed {seed}, expected 0 to 2^31 - 1")
+    return SCENES[name](size=size, seed=seed)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Estimate:
+    """What a capture will cost, from figures measured on two cores of a 2019 server."""
+
+    images: int
+    core_seconds: float
+    bytes: int
+
+    @property
+    def text(self) -> str:
+        """One line for the user."""
+        hours = self.core_seconds / 3600
+        time = f"{hours:.1f} core-hours" if hours >= 1 else f"{self.core_seconds / 60:.1f} core-minutes"
+        return f"{self.images} images, about {time}, {self.bytes / 1e9:.2f} GB"
+
+
+def estimate(scene: Scene) -> Estimate:
+    """Images, core seconds and bytes of a capture before it is made."""
+    training = sum(clip.frames for clip in scene.train)
+    rig = scene.rig
+    train_views = (rig.cameras - rig.held_out) * training
+    novel_views = rig.held_out * (len(range(scene.novel_view_stride // 2, training, scene.novel_view_stride)))
+    images = train_views + novel_views + rig.held_out * (scene.frames - training)
+    pixels = rig.width * rig.height
+    per_image = 0.05 + 4.5e-8 * pixels * scene.samples
+    fixed = 20.0 + 0.3 * scene.frames
+    size = int(images * pixels * 1.1 + scene.frames * 1.2e6 + 3 * scene.texture**2)
+    return Estimate(images=images, core_seconds=fixed + images * per_image, bytes=size)
+
+
+def require_space(scene: Scene, folder: Path) -> None:
+    """Refuse a capture that the disk cannot hold. What an earlier run wrote counts as there already."""
+    there = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    needed = estimate(scene).bytes - there
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        raise InputError(
+            f"{folder}: the capture needs {needed / 1e9:.1f} GB more and the disk has {free / 1e9:.1f} GB free"
+        )
+
+
+def with_outfit(scene: Scene, **strengths: float) -> Scene:
+    """The scene with other strengths of its outfit, for sweeps."""
+    return replace(scene, outfit=replace(scene.outfit, **strengths))

@@ -1,0 +1,103 @@
+"""What a scene is: one frozen description from which every byte of a capture follows."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from ash.files import InputError, hash_of
+from synth.motion import Clip
+
+BODIES = ("mannequin", "anny")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Outfit:
+    """How the truth departs from the skinned template. Every strength at zero leaves exactly the skinned template."""
+
+    skirt: bool = False  # wear a skirt; alone it changes the garment, not how it moves
+    folds_mm: float = 0.0  # amplitude of pose-dependent folds
+    slack_mm: float = 0.0  # how far loose cloth sags and lags over the body
+    swing: float = 0.0  # 1: the skirt swings as its pendulum does; 0: rigidly skinned
+    scan_mm: float = 0.0  # rms of a smooth error of the template's rest shape on clothes, as of a scan
+
+    def __post_init__(self) -> None:
+        for name in ("folds_mm", "slack_mm", "swing", "scan_mm"):
+            if not 0 <= getattr(self, name) <= 100:
+                raise InputError(f"outfit: {name} is {getattr(self, name)}, expected 0 to 100")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Light:
+    """Light fixed in the world: a constant sky and soft area lights."""
+
+    sky: float = 0.45  # radiance of the constant environment
+    area: float = 1.0  # strength of the area lights
+    falloff: float = 0.0  # 0: equal everywhere; 1: a lamp close to the floor that lights one side of it only
+    gloss: float = 0.0  # 0: diffuse cloth; 1: satin
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Rig:
+    """Calibrated cameras around the capture volume, framed so that the person never leaves the picture."""
+
+    kind: str = "dome"
+    cameras: int = 16
+    held_out: int = 4
+    width: int = 256
+    height: int = 256
+    radius: float = 3.4  # metres
+
+    def __post_init__(self) -> None:
+        if not 0 < self.held_out < self.cameras <= 1000:
+            raise InputError(f"rig: {self.held_out} of {self.cameras} cameras held out, expected 1 to all but one")
+        if not (16 <= self.width <= 8192 and 16 <= self.height <= 8192):
+            raise InputError(f"rig: images of {self.width}x{self.height}, expected 16 to 8192 pixels")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Scene:
+    """A whole scene. Equal scenes make equal captures."""
+
+    name: str
+    size: str
+    seed: int
+    body: str
+    outfit: Outfit
+    light: Light
+    rig: Rig
+    train: tuple[Clip, ...]
+    test: tuple[Clip, ...]
+    novel_view_stride: int  # novel views are judged on every so many training frames
+    fps: float = 12.0
+    samples: int = 64  # per pixel, in two halves
+    depth: int = 3  # of light paths
+    texture: int = 2048  # side of the texture in texels
+
+    def __post_init__(self) -> None:
+        if self.body not in BODIES:
+            raise InputError(f"unknown body {self.body!r}, expected one of {', '.join(BODIES)}")
+        if not self.train or not self.test:
+            raise InputError("a scene needs at least one training and one test clip")
+        if sum(clip.frames for clip in self.train + self.test) > 1_000_000:
+            raise InputError("a scene of more than a million frames")
+        if not 2 <= self.samples <= 65536 or self.samples % 2:
+            raise InputError(f"{self.samples} samples per pixel, expected an even number from 2 to 65536")
+
+    @property
+    def frames(self) -> int:
+        """Number of frames, training and test."""
+        return sum(clip.frames for clip in self.train + self.test)
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Everything, as JSON."""
+        return asdict(self)
+
+    @property
+    def identity(self) -> str:
+        """SHA-256 over every parameter."""
+        return hash_of(self.parameters)
+
+
+def stream(scene: Scene, *purpose: str | int) -> int:
+    """Seed of a random stream: the hash of the root seed and what the stream is for. Independent of any order."""
+    return int(hash_of([scene.seed, *purpose])[:8], 16)
