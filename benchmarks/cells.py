@@ -190,7 +190,7 @@ def relocate(cell: Cell, capture_folder: Path) -> Cell:
     return replace(cell, capture_folder=capture_folder)
 
 
-def _result_from(content: dict[str, Any]) -> CellResult:
+def _result_from(content: Any) -> CellResult:
     if content["status"] not in STATUSES:
         raise ValueError(f"status {content['status']!r}")
     timing, provenance = content["timing"], content["provenance"]

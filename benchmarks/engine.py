@@ -94,7 +94,6 @@ def run_cells(plan: Plan, executor: Executor, limits: Limits, progress: Progress
         InputError: a cell found its input wrong; cells that wait are given up, results that are there stay.
         KeyboardInterrupt: the user's; all child processes have ended when it is seen.
     """
-    _stopping.clear()
     for cell in plan.todo:
         write_config(cell)
     futures: dict[Future[str], Cell] = {}
@@ -112,6 +111,7 @@ def run_cells(plan: Plan, executor: Executor, limits: Limits, progress: Progress
             future.cancel()
         stop_children()
         executor.shutdown(wait=True, cancel_futures=True)
+        _stopping.clear()
         raise
 
 

@@ -1,5 +1,6 @@
 """Live progress: how much is done, what runs, how long it will still take."""
 
+import io
 import sys
 import time
 from collections.abc import Sequence
@@ -13,9 +14,11 @@ class Progress:
     Times come from a monotonic clock: the wall clock may jump.
     """
 
-    def __init__(self, what: str, total: int, *, expected_s: float, workers: int, stream: TextIO | None = None) -> None:
+    def __init__(
+        self, what: str, total: int, *, expected_s: float, workers: int, stream: io.TextIOBase | None = None
+    ) -> None:
         self.what, self.total, self.expected_s, self.workers = what, total, expected_s, max(1, workers)
-        self.stream = stream or sys.stderr
+        self.stream: TextIO | io.TextIOBase = stream or sys.stderr
         self.live = self.stream.isatty()
         self.finished = self.failed = 0
         self.start = time.monotonic()

@@ -175,7 +175,9 @@ class FakeAvatar:
 
     def fit(self, capture: Capture, *, folder: Path) -> None:
         assert set(capture.splits) == {"train"}, "a method that is no oracle was shown held-out views"
-        rows = [f'{{"step": {i}, "seconds": {0.1 * i}, "loss": {1 / (i + 1)}, "train_psnr": {10 + i}}}\n' for i in range(5)]
+        rows = [
+            f'{{"step": {i}, "seconds": {0.1 * i}, "loss": {1 / (i + 1)}, "train_psnr": {10 + i}}}\n' for i in range(5)
+        ]
         (folder / "log.jsonl").write_text("".join(rows))
 
     def render(self, motion: Motion, frame: int, camera: Camera, *, clock: StageClock) -> np.ndarray:
@@ -255,6 +257,15 @@ def install(folder: Path) -> Path:
     lines = ["[ash_bench.methods]", *(f"fake_{name} = fakes:{name}" for name in METHODS)]
     (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
     return folder
+
+
+def use(folder: Path, monkeypatch) -> None:
+    """Install the fake methods for this process and for the processes of cells."""
+    install(folder)
+    here = str(Path(__file__).parent)
+    paths = [str(folder), here, *filter(None, [os.environ.get("PYTHONPATH")])]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
+    monkeypatch.syspath_prepend(str(folder))
 
 
 def _rotation(vector: np.ndarray) -> np.ndarray:
