@@ -72,12 +72,12 @@ class Axis:
         return self.start + (value - low) / (high - low) * (self.end - self.start)
 
 
-def scatter(panels: Sequence[Panel], *, x_title: str, y_title: str, width: int = 900, height: int = 400) -> str:
+def scatter(panels: Sequence[Panel], *, x_title: str, y_title: str, width: float = 900.0, height: float = 400.0) -> str:
     """Accuracy against speed: panels side by side that share both axes; x is logarithmic milliseconds."""
     everything = [point for panel in panels for point in panel.points]
     if not everything:
-        return document("", width=width, height=60, title="no results")
-    left, right, top, bottom, gap = 58, 16, 44, 52, 28
+        return document("", width=width, height=60.0, title="no results")
+    left, right, top, bottom, gap = 58.0, 16.0, 44.0, 52.0, 28.0
     each = (width - left - right - gap * (len(panels) - 1)) / len(panels)
     y = linear_axis(
         [v for p in everything for v in (p.y, p.low, p.high) if v is not None], start=height - bottom, end=top, pad=0.12
@@ -94,20 +94,20 @@ def scatter(panels: Sequence[Panel], *, x_title: str, y_title: str, width: int =
         parts.append(_text(start + each / 2, height - 12, x_title, anchor="middle", kind="dim"))
     middle = (top + height - bottom) / 2
     turned = f'transform="rotate(-90 16 {_n(middle)})"'
-    parts.append(_text(16, middle, y_title, anchor="middle", kind="dim", extra=turned))
+    parts.append(_text(16.0, middle, y_title, anchor="middle", kind="dim", extra=turned))
     return document("".join(parts), width=width, height=height, title=f"{y_title} against {x_title}")
 
 
-def curves(lines: Sequence[Line], *, x_title: str, y_title: str, width: int = 900, height: int = 320) -> str:
+def curves(lines: Sequence[Line], *, x_title: str, y_title: str, width: float = 900.0, height: float = 320.0) -> str:
     """Curves over a logarithmic x axis, each named at its end."""
     drawn = [line for line in lines if len(line.points) > 1]
     if not drawn:
         return ""
-    left, right, top, bottom = 58, 150, 20, 48
+    left, right, top, bottom = 58.0, 150.0, 20.0, 48.0
     x = log_axis([point[0] for line in drawn for point in line.points], start=left, end=width - right, tight=True)
     y = linear_axis([point[1] for line in drawn for point in line.points], start=height - bottom, end=top, pad=0.05)
     parts = [_frame("", x, y, y_labels=True)]
-    ends = _apart([y.at(line.points[-1][1]) for line in drawn], 15, top, height - bottom)
+    ends = _apart([y.at(line.points[-1][1]) for line in drawn], 15.0, top, height - bottom)
     for line, end in zip(drawn, ends, strict=True):
         path = " ".join(f"{_n(x.at(px))},{_n(y.at(py))}" for px, py in line.points)
         dash = ' stroke-dasharray="5 3"' if line.dashed else ""
@@ -120,41 +120,41 @@ def curves(lines: Sequence[Line], *, x_title: str, y_title: str, width: int = 90
     parts.append(_text((left + width - right) / 2, height - 10, x_title, anchor="middle", kind="dim"))
     middle = (top + height - bottom) / 2
     turned = f'transform="rotate(-90 16 {_n(middle)})"'
-    parts.append(_text(16, middle, y_title, anchor="middle", kind="dim", extra=turned))
+    parts.append(_text(16.0, middle, y_title, anchor="middle", kind="dim", extra=turned))
     return document("".join(parts), width=width, height=height, title=f"{y_title} over {x_title}")
 
 
-def bars(rows: Sequence[Bar], names: Sequence[str], colours: Sequence[str], *, unit: str, width: int = 900) -> str:
+def bars(rows: Sequence[Bar], names: Sequence[str], colours: Sequence[str], *, unit: str, width: float = 900.0) -> str:
     """Horizontal stacked bars with a legend."""
     if not rows:
         return ""
-    left, right, top, step = 170, 70, 40, 30
+    left, right, top, step = 170.0, 70.0, 40.0, 30.0
     height = top + step * len(rows) + 10
     scale = (width - left - right) / max(sum(row.parts) for row in rows)
-    parts, at = [], float(left)
+    parts, at = [], left
     for name, colour in zip(names, colours, strict=True):
         parts.append(f'<rect x="{_n(at)}" y="10" width="12" height="12" rx="2" fill="{colour}"/>')
-        parts.append(_text(at + 17, 20, name, kind="dim"))
+        parts.append(_text(at + 17, 20.0, name, kind="dim"))
         at += 34 + 6.6 * len(name)
     for index, row in enumerate(rows):
-        y, at = top + index * step, float(left)
+        y, at = top + index * step, left
         parts.append(_text(left - 10, y + 15, row.label, anchor="end"))
         for name, colour, value in zip(names, colours, row.parts, strict=True):
             title = f"<title>{escape(row.label)}, {escape(name)}: {value:.2f} {unit}</title>"
-            box = f'x="{_n(at)}" y="{y}" width="{_n(value * scale)}" height="20"'
+            box = f'x="{_n(at)}" y="{_n(y)}" width="{_n(value * scale)}" height="20"'
             parts.append(f'<rect {box} fill="{colour}">{title}</rect>')
             at += value * scale
         parts.append(_text(at + 6, y + 15, f"{sum(row.parts):.1f} {unit}", kind="dim"))
     return document("".join(parts), width=width, height=height, title="time per stage")
 
 
-def document(content: str, *, width: int, height: int, title: str) -> str:
+def document(content: str, *, width: float, height: float, title: str) -> str:
     """A complete SVG that adapts to light and dark pages."""
-    size = f'viewBox="0 0 {width} {height}" width="{width}" height="{height}"'
+    size = f'viewBox="0 0 {width:g} {height:g}" width="{width:g}" height="{height:g}"'
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" {size} role="img" aria-label="{escape(title)}">'
         f"<style>{STYLE}</style>"
-        f'<rect class="paper" width="{width}" height="{height}" rx="6"/>{content}</svg>\n'
+        f'<rect class="paper" width="{width:g}" height="{height:g}" rx="6"/>{content}</svg>\n'
     )
 
 
@@ -167,7 +167,7 @@ def linear_axis(values: Sequence[float], *, start: float, end: float, pad: float
     magnitude = 10 ** math.floor(math.log10(raw))
     step = next(m * magnitude for m in (1, 2, 5, 10) if m * magnitude >= raw)
     first = math.ceil(low / step)
-    ticks = tuple(round(i * step, 10) for i in range(first, math.floor(high / step) + 1))
+    ticks = tuple(float(round(i * step, 10)) for i in range(first, math.floor(high / step) + 1))
     return Axis(low, high, start, end, False, ticks)
 
 

@@ -91,10 +91,11 @@ def train(arguments: argparse.Namespace) -> int:
     from benchmarks.cells import write_config
     from benchmarks.experiments import CaptureSpec, CellSpec, find_method
     from benchmarks.run import run_cell
-    from benchmarks.runs import cell_for
+    from benchmarks.runs import cell_for, require_intact
 
     find_method(arguments.method)
     capture = load_capture(arguments.capture)
+    require_intact(arguments.capture)
     spec = CaptureSpec(scene=capture.scene, size="as given", seed=int(capture.manifest["seed"]))
     cell_spec = CellSpec(capture=spec, method=arguments.method, preset=arguments.preset, seed=arguments.seed)
     cell = cell_for(cell_spec, arguments.capture, arguments.out)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ash.dataset import load_capture
+from ash.dataset import load_capture, verify_capture
 from ash.files import InputError, read_json, write_json
 from benchmarks.cells import Cell, CellConfig, CellResult, read_cell, read_result
 from benchmarks.engine import Limits, make_executor, plan_cells, run_cells, shard_of
@@ -45,6 +45,8 @@ def run_suite(suite: Suite, options: RunOptions) -> Run:
         find_method(method)
     options.out.mkdir(parents=True, exist_ok=True)
     folders = {spec: make_capture(spec, options.data, workers=options.workers) for spec in suite.captures}
+    for folder in folders.values():
+        require_intact(folder)
     cells = [cell_for(spec, folders[spec.capture], options.out) for spec in suite.cells]
     run = Run(folder=options.out, suite=suite.name, about=suite.about, command=options.command, cells=tuple(cells))
     write_run(run)
@@ -76,6 +78,18 @@ def make_capture_in(spec: CaptureSpec, folder: Path, *, workers: int) -> None:
     progress = Progress(f"images of {spec.name}", 0, expected_s=0.0, workers=workers)
     render(scene(spec.scene, size=spec.size, seed=spec.seed), folder, workers=workers, progress=progress.advance)
     progress.close()
+
+
+def require_intact(folder: Path) -> None:
+    """Hash a capture again before anything is learned from it.
+
+    Raises:
+        InputError: a file is missing, altered or foreign; names the first.
+    """
+    problems = verify_capture(folder)
+    if problems:
+        more = f" (and {len(problems) - 1} more, see ash-bench verify)" if len(problems) > 1 else ""
+        raise InputError(f"{folder}: {problems[0]}{more}")
 
 
 def cell_for(spec: CellSpec, capture_folder: Path, out: Path) -> Cell:
