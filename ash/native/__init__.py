@@ -1,0 +1,1 @@
+"""C++17 kernels and the way to them."""

@@ -1,0 +1,66 @@
+// The instruction set: the best that this machine runs, unless another is asked for by name.
+#include "dispatch.h"
+
+#include <atomic>
+#include <chrono>
+#include <cstring>
+
+#include "team.h"
+
+namespace ash {
+
+static bool runs(const Kernels* kernels) {
+#ifdef ASH_X86
+    if (kernels == &avx512_kernels)
+        return __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw") &&
+               __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+    if (kernels == &avx2_kernels) return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+#endif
+    return kernels == &plain_kernels;
+}
+
+static const Kernels* const all_kernels[] = {
+#ifdef ASH_X86
+    &avx512_kernels, &avx2_kernels,
+#endif
+    &plain_kernels};
+
+static std::atomic<const Kernels*> chosen{nullptr};
+
+const Kernels& kernels() {
+    const Kernels* now = chosen.load(std::memory_order_relaxed);
+    for (const Kernels* one : all_kernels)
+        if (!now && runs(one)) now = one;
+    chosen.store(now, std::memory_order_relaxed);
+    return *now;
+}
+
+}  // namespace ash
+
+extern "C" {
+
+// Changes whenever a function below or its arguments change; ash/native/library.py holds the same number.
+int ash_abi_version() { return 1; }
+
+const char* ash_instruction_set() { return ash::kernels().name; }
+
+// 0 if the machine runs it, else nothing changes.
+int ash_use_instruction_set(const char* name) {
+    for (const ash::Kernels* one : ash::all_kernels)
+        if (!std::strcmp(one->name, name) && ash::runs(one)) {
+            ash::chosen.store(one);
+            return 0;
+        }
+    return 1;
+}
+
+// Floating point operations per second of nothing but fused multiply-adds, on `threads` threads.
+double ash_fma_peak(int threads) {
+    constexpr int64_t ROUNDS = 4000000;
+    std::atomic<double> work{0};
+    auto start = std::chrono::steady_clock::now();
+    ash::in_parallel(threads, threads, [&](int64_t) { work = ash::kernels().fma_work(ROUNDS); });
+    std::chrono::duration<double> time = std::chrono::steady_clock::now() - start;
+    return work * threads / time.count();
+}
+}

@@ -1,0 +1,103 @@
+// What the kernels of one instruction set offer, and the plain data that goes in and out. No inline functions here (see simd.h).
+#pragma once
+#include <cstdint>
+
+namespace ash {
+
+constexpr float ALPHA_MIN = 1.0f / 255.0f;
+constexpr float LOG2_ALPHA_MIN = -7.99435344f;
+constexpr float ALPHA_MAX = 0.99f;
+constexpr float TRANSMITTANCE_MIN = 1e-4f;
+constexpr float COMPENSATION_MIN = 1e-6f;
+constexpr float NOT_DRAWN = -1e30f;  // log2 opacity of a splat that is drawn nowhere
+
+// A tile is 32x32 pixels = 8x8 blocks of 4x4 pixels: one bit of a 64-bit mask per block, one AVX-512 register per block.
+constexpr int TILE = 32;
+constexpr int BLOCK = 4;
+constexpr int BLOCKS = TILE / BLOCK;
+constexpr int LANES = BLOCK * BLOCK;
+constexpr int TILE_PIXELS = TILE * TILE;
+
+// The splats' parameters as the blend wants them ("packed", one row per camera and Gaussian). With dx, dy in pixels from the
+// centre, u = a dx + b dy and v = e dy:  log2 alpha = l - u^2 - v^2.
+enum Packed { PACKED_A, PACKED_B, PACKED_E, PACKED_L, PACKED_R, PACKED_G, PACKED_BLUE, PACKED_Z, PACKED };
+
+// Gradients collected per splat and tile: sums over pixels of q = dL/d(ln alpha) times 1, u, v, uu, uv, vv; then of the
+// blending weight times dL/d(rgb, depth).
+enum Sums { SUM_Q, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_R, SUM_G, SUM_BLUE, SUM_Z, SUMS };
+constexpr int SLOT = 12;  // floats from one slot to the next
+
+struct ProjectArgs {
+    const float *means, *quats, *scales, *opacities, *sh;
+    const float *viewmats, *Ks;  // [c, 4, 4], [c, 3, 3]
+    int64_t count;
+    int cameras, coefficients, width, height, compensate;
+    float dilation, near;
+    float *means2d, *packed;  // [c, n, 2], [c, n, PACKED]
+    double* depths;           // [c, n]; what the order is taken from
+    // Backward only.
+    const float *grad_means2d, *grad_packed;
+    float *grad_means, *grad_quats, *grad_scales, *grad_opacities, *grad_sh;
+};
+
+// One splat in one image, 64 bytes.
+struct Splat {
+    float x, y, a, b, e, l, red, green, blue, z;
+    float reach;   // u^2 + v^2 at the rim
+    float lean;    // dy at the rim's rightmost point
+    float half_height;
+    float inverse_a, slope;  // 1 / a, b / a
+    float half_width;
+};
+
+struct Entry {
+    uint32_t splat, slot;
+    uint64_t blocks;  // those the forward pass found touched
+};
+
+struct Tile {
+    int camera, x, y;  // upper left pixel
+    int64_t first, count, done;  // entries; those before the tile was finished
+};
+
+struct BlendArgs {
+    const Splat* splats;
+    Entry* entries;
+    int width, height;
+    float background[3];
+    float *rgb, *alpha, *depth;                               // [c, h, w, 3], [c, h, w], [c, h, w]
+    const float *grad_rgb, *grad_alpha, *grad_depth;          // any of them may be null
+    float* slots;
+};
+
+struct SsimArgs {
+    const float *image, *target, *mean, *square;  // [h, 3 w]; the target, its window means and those of its square
+    const float* weights;                         // [h, w] or null: 1 everywhere
+    float* grad;                                  // [h, 3 w] or null
+    int width, height;
+    int top, bottom;             // rows outside have weight 0
+    float l1_scale, ssim_scale;  // factors of sum |I - T| and of sum SSIM in the loss
+    double* row_l1;              // [h] sums
+    double* row_ssim;
+};
+
+// What is wrong with an input, found while it is read. 0: nothing.
+enum Fault : int64_t { FAULT_MEANS = 1, FAULT_QUATS, FAULT_ZERO_QUAT, FAULT_SCALES, FAULT_OPACITIES, FAULT_SH };
+
+struct Kernels {
+    const char* name;
+    int64_t (*project)(const ProjectArgs&, int64_t first, int64_t last);  // 0, or fault + 16 * index
+    void (*project_backward)(const ProjectArgs&, int64_t first, int64_t last, double* grad_views);  // adds to [c, 12]
+    void (*prepare)(const float* means2d, const float* packed, Splat* splats, int64_t first, int64_t last);
+    void (*blend)(const BlendArgs&, Tile&);
+    void (*blend_backward)(const BlendArgs&, const Tile&);
+    void (*gather)(const Splat*, const float* slots, const int64_t* offsets, int64_t first, int64_t last, float* grad_means2d,
+                   float* grad_packed);
+    void (*ssim_rows)(const SsimArgs&, int first, int last, float* scratch);
+    int64_t (*ssim_scratch)(int width);  // floats
+    double (*fma_work)(int64_t rounds);  // floating point operations done
+};
+
+extern const Kernels avx512_kernels, avx2_kernels, plain_kernels;
+
+}  // namespace ash

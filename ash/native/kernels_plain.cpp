@@ -1,0 +1,7 @@
+#define ASH_ISA plain
+#include "kernels.inc"
+
+namespace ash {
+const Kernels plain_kernels = {"plain", plain::project, plain::project_backward, plain::prepare, plain::blend, plain::blend_backward,
+                               plain::gather, plain::ssim_rows, plain::ssim_scratch, plain::fma_work};
+}

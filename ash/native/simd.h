@@ -1,0 +1,159 @@
+// A vector of floats as wide as the instruction set of this translation unit: 16 (AVX-512), 8 (AVX2) or 4 (anything else).
+//
+// Everything lives in a namespace named after the instruction set, and no standard header with inline functions is included
+// here: the linker would otherwise be free to keep an AVX-512 copy of, say, std::max for the whole library.
+#pragma once
+#include <cstdint>
+
+#if defined(__AVX2__)
+#include <immintrin.h>
+#endif
+
+namespace ASH_ISA {
+
+#if defined(__AVX512F__)
+
+constexpr int W = 16;
+struct V {
+    __m512 x;
+};
+struct Mask {
+    __mmask16 x;
+};
+inline V all(float s) { return {_mm512_set1_ps(s)}; }
+inline V load(const float* p) { return {_mm512_loadu_ps(p)}; }
+inline void store(float* p, V a) { _mm512_storeu_ps(p, a.x); }
+inline V operator+(V a, V b) { return {_mm512_add_ps(a.x, b.x)}; }
+inline V operator-(V a, V b) { return {_mm512_sub_ps(a.x, b.x)}; }
+inline V operator*(V a, V b) { return {_mm512_mul_ps(a.x, b.x)}; }
+inline V operator/(V a, V b) { return {_mm512_div_ps(a.x, b.x)}; }
+inline V fma(V a, V b, V c) { return {_mm512_fmadd_ps(a.x, b.x, c.x)}; }
+inline V fnma(V a, V b, V c) { return {_mm512_fnmadd_ps(a.x, b.x, c.x)}; }
+inline V min(V a, V b) { return {_mm512_min_ps(a.x, b.x)}; }
+inline V max(V a, V b) { return {_mm512_max_ps(a.x, b.x)}; }
+inline V sqrt(V a) { return {_mm512_sqrt_ps(a.x)}; }
+inline Mask operator<(V a, V b) { return {_mm512_cmp_ps_mask(a.x, b.x, _CMP_LT_OQ)}; }
+inline Mask operator>=(V a, V b) { return {_mm512_cmp_ps_mask(a.x, b.x, _CMP_GE_OQ)}; }
+inline Mask operator&(Mask a, Mask b) { return {(__mmask16)(a.x & b.x)}; }
+inline Mask without(Mask a, Mask b) { return {(__mmask16)(a.x & ~b.x)}; }
+inline bool any(Mask a) { return a.x != 0; }
+inline V select(Mask m, V a, V b) { return {_mm512_mask_blend_ps(m.x, b.x, a.x)}; }
+inline V only(Mask m, V a) { return {_mm512_maskz_mov_ps(m.x, a.x)}; }
+// 1 / a to about one unit in the last place, for ordinary a.
+inline V reciprocal(V a) {
+    V r{_mm512_rcp14_ps(a.x)};
+    return fma(r, fnma(a, r, all(1.0f)), r);
+}
+// 2^a = mantissa * 2^floor(a); `fraction` is a - floor(a).
+inline V fraction(V a) { return {_mm512_reduce_ps(a.x, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)}; }
+inline V scale_by_floor(V mantissa, V a) { return {_mm512_scalef_ps(mantissa.x, a.x)}; }
+inline float sum(V a) { return _mm512_reduce_add_ps(a.x); }
+
+#elif defined(__AVX2__)
+
+constexpr int W = 8;
+struct V {
+    __m256 x;
+};
+struct Mask {
+    __m256 x;
+};
+inline V all(float s) { return {_mm256_set1_ps(s)}; }
+inline V load(const float* p) { return {_mm256_loadu_ps(p)}; }
+inline void store(float* p, V a) { _mm256_storeu_ps(p, a.x); }
+inline V operator+(V a, V b) { return {_mm256_add_ps(a.x, b.x)}; }
+inline V operator-(V a, V b) { return {_mm256_sub_ps(a.x, b.x)}; }
+inline V operator*(V a, V b) { return {_mm256_mul_ps(a.x, b.x)}; }
+inline V operator/(V a, V b) { return {_mm256_div_ps(a.x, b.x)}; }
+inline V fma(V a, V b, V c) { return {_mm256_fmadd_ps(a.x, b.x, c.x)}; }
+inline V fnma(V a, V b, V c) { return {_mm256_fnmadd_ps(a.x, b.x, c.x)}; }
+inline V min(V a, V b) { return {_mm256_min_ps(a.x, b.x)}; }
+inline V max(V a, V b) { return {_mm256_max_ps(a.x, b.x)}; }
+inline V sqrt(V a) { return {_mm256_sqrt_ps(a.x)}; }
+inline Mask operator<(V a, V b) { return {_mm256_cmp_ps(a.x, b.x, _CMP_LT_OQ)}; }
+inline Mask operator>=(V a, V b) { return {_mm256_cmp_ps(a.x, b.x, _CMP_GE_OQ)}; }
+inline Mask operator&(Mask a, Mask b) { return {_mm256_and_ps(a.x, b.x)}; }
+inline Mask without(Mask a, Mask b) { return {_mm256_andnot_ps(b.x, a.x)}; }
+inline bool any(Mask a) { return _mm256_movemask_ps(a.x) != 0; }
+inline V select(Mask m, V a, V b) { return {_mm256_blendv_ps(b.x, a.x, m.x)}; }
+inline V only(Mask m, V a) { return {_mm256_and_ps(m.x, a.x)}; }
+inline V reciprocal(V a) {
+    V r{_mm256_rcp_ps(a.x)};
+    r = fma(r, fnma(a, r, all(1.0f)), r);
+    return fma(r, fnma(a, r, all(1.0f)), r);
+}
+inline V fraction(V a) { return {_mm256_sub_ps(a.x, _mm256_floor_ps(a.x))}; }
+inline V scale_by_floor(V mantissa, V a) {
+    __m256i exponent = _mm256_cvtps_epi32(_mm256_floor_ps(a.x));
+    __m256i bits = _mm256_add_epi32(_mm256_castps_si256(mantissa.x), _mm256_slli_epi32(exponent, 23));
+    return {_mm256_castsi256_ps(bits)};
+}
+inline float sum(V a) {
+    __m128 s = _mm_add_ps(_mm256_castps256_ps128(a.x), _mm256_extractf128_ps(a.x, 1));
+    s = _mm_add_ps(s, _mm_movehl_ps(s, s));
+    return _mm_cvtss_f32(_mm_add_ss(s, _mm_shuffle_ps(s, s, 1)));
+}
+
+#else
+
+constexpr int W = 4;
+typedef float Lanes __attribute__((vector_size(16)));
+typedef int32_t Bits __attribute__((vector_size(16)));
+struct V {
+    Lanes x;
+};
+struct Mask {
+    Bits x;
+};
+inline V all(float s) { return {Lanes{s, s, s, s}}; }
+inline V load(const float* p) {
+    V a;
+    __builtin_memcpy(&a.x, p, 16);
+    return a;
+}
+inline void store(float* p, V a) { __builtin_memcpy(p, &a.x, 16); }
+inline V operator+(V a, V b) { return {a.x + b.x}; }
+inline V operator-(V a, V b) { return {a.x - b.x}; }
+inline V operator*(V a, V b) { return {a.x * b.x}; }
+inline V operator/(V a, V b) { return {a.x / b.x}; }
+inline V fma(V a, V b, V c) { return {a.x * b.x + c.x}; }
+inline V fnma(V a, V b, V c) { return {c.x - a.x * b.x}; }
+inline Mask operator<(V a, V b) { return {a.x < b.x}; }
+inline Mask operator>=(V a, V b) { return {a.x >= b.x}; }
+inline Mask operator&(Mask a, Mask b) { return {a.x & b.x}; }
+inline Mask without(Mask a, Mask b) { return {a.x & ~b.x}; }
+inline bool any(Mask a) { return (a.x[0] | a.x[1] | a.x[2] | a.x[3]) != 0; }
+inline V select(Mask m, V a, V b) { return {(Lanes)((m.x & (Bits)a.x) | (~m.x & (Bits)b.x))}; }
+inline V only(Mask m, V a) { return {(Lanes)(m.x & (Bits)a.x)}; }
+inline V min(V a, V b) { return select(a < b, a, b); }
+inline V max(V a, V b) { return select(a < b, b, a); }
+inline V sqrt(V a) {
+    for (int i = 0; i < W; ++i) a.x[i] = __builtin_sqrtf(a.x[i]);
+    return a;
+}
+inline V reciprocal(V a) { return all(1.0f) / a; }
+inline Bits floor_of(V a) {
+    Bits whole = __builtin_convertvector(a.x, Bits);
+    return whole + (__builtin_convertvector(whole, Lanes) > a.x);  // a true comparison is -1
+}
+inline V fraction(V a) { return {a.x - __builtin_convertvector(floor_of(a), Lanes)}; }
+inline V scale_by_floor(V mantissa, V a) { return {(Lanes)((Bits)mantissa.x + (floor_of(a) << 23))}; }
+inline float sum(V a) { return (a.x[0] + a.x[2]) + (a.x[1] + a.x[3]); }
+
+#endif
+
+inline V operator-(V a) { return all(0.0f) - a; }
+
+// 2^a for a in [-126, 1): a polynomial of degree 5 on [0, 1), relative error 2e-7.
+inline V exp2_of(V a) {
+    V f = fraction(a);
+    V y = all(1.877576608e-3f);
+    y = fma(y, f, all(8.989340252e-3f));
+    y = fma(y, f, all(5.582631792e-2f));
+    y = fma(y, f, all(2.401536171e-1f));
+    y = fma(y, f, all(6.931530732e-1f));
+    y = fma(y, f, all(9.999999251e-1f));
+    return scale_by_floor(y, a);
+}
+
+}  // namespace ASH_ISA

@@ -1,0 +1,513 @@
+"""Stg. 4: Gaussians to images. `splat_naive` is the definition (ASH Eq. 1-3), `splat` the same function, fast.
+
+Kerbl et al.'s constants, here and in the native kernels: a splat's opacity at a pixel lies in [1/255, 0.99], smaller ones
+are skipped; a pixel is finished before the splat that would take its transmittance below 1e-4; 0.3 px^2 is added to both
+axes of every projected covariance (an argument: at 256x256 pixels 0.05 gains over a decibel). A splat reaches exactly as
+far as its opacity exceeds 1/255: no fixed number of standard deviations. Equal depths are drawn in the order given.
+"""
+
+import math
+import weakref
+from ctypes import c_float
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+from ash.files import InputError
+from ash.gaussians import Gaussians
+from ash.native.library import address, check_memory, float32_on_cpu, load
+
+ALPHA_MIN = 1 / 255
+ALPHA_MAX = 0.99
+TRANSMITTANCE_MIN = 1e-4
+# Below this ratio of determinants a compensated splat cannot reach 1/255, so that the square root needs no smaller argument.
+COMPENSATION_MIN = 1e-6
+NAIVE_TILE = 16
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Splatted:
+    """Images of one or several cameras, all premultiplied: sums over splats weighted by w = alpha' prod(1 - alpha')."""
+
+    rgb: Float[Tensor, "c h w 3"]  # sum of w times colour, plus (1 - alpha) times the background
+    alpha: Float[Tensor, "c h w"]  # sum of w
+    depth: Float[Tensor, "c h w"]  # sum of w times camera z, metres; divide by alpha for the mean depth
+    means2d: Float[Tensor, "c n 2"]  # projected centres, pixels, (0, 0) behind the near plane; part of the graph
+
+
+def check_cameras(
+    viewmats: Float[Tensor, "c 4 4"],
+    Ks: Float[Tensor, "c 3 3"],
+    *,
+    width: int,
+    height: int,
+    near: float,
+    dilation: float,
+) -> None:
+    """Raise an InputError unless the cameras are pinholes without skew and the numbers are usable."""
+    for name, value in (("viewmats", viewmats), ("Ks", Ks)):
+        if not bool(torch.isfinite(value).all()):
+            raise InputError(f"{name}: expected finite numbers, got NaN or infinity")
+    rotation = viewmats[:, :3, :3].detach().double()
+    if (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().max() > 1e-3:
+        raise InputError("viewmats: expected a rotation in the upper left 3x3, got a matrix that scales or shears")
+    focal = Ks.detach()
+    if bool((focal[:, 0, 0] <= 0).any() or (focal[:, 1, 1] <= 0).any() or (focal[:, 0, 1] != 0).any()):
+        raise InputError("Ks: expected positive focal lengths and no skew")
+    if not (1 <= width <= 1 << 15 and 1 <= height <= 1 << 15):
+        raise InputError(f"image size: expected 1 to 32768 pixels a side, got {width} x {height}")
+    if not (near > 0 and dilation >= 0):
+        raise InputError(f"expected near > 0 and dilation >= 0, got near = {near} and dilation = {dilation}")
+
+
+def check_gaussians(gaussians: Gaussians) -> None:
+    """Raise an InputError that names the first tensor with a bad number, a zero quaternion, or a value out of range."""
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        if not bool(torch.isfinite(getattr(gaussians, name)).all()):
+            raise InputError(f"{name}: expected finite numbers, got NaN or infinity")
+    if bool((gaussians.quats == 0).all(dim=1).any()):
+        raise InputError("quats: expected quaternions that are not zero, got a zero quaternion")
+    if bool((gaussians.scales < 0).any()):
+        raise InputError("scales: expected standard deviations >= 0, got a negative one")
+    if bool(((gaussians.opacities < 0) | (gaussians.opacities > 1)).any()):
+        raise InputError("opacities: expected numbers in [0, 1]")
+    check_sh(gaussians.sh)
+
+
+def check_sh(sh: Float[Tensor, "n k 3"]) -> None:
+    """Raise an InputError unless the number of coefficients belongs to a degree from 0 to 3."""
+    if sh.shape[1] not in (1, 4, 9, 16):
+        raise InputError(f"sh: expected 1, 4, 9 or 16 coefficients per channel (degree 0 to 3), got {sh.shape[1]}")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The definition
+
+
+def sh_basis(directions: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "n k"]:
+    """The first `count` real spherical harmonics at unit directions, in Kerbl et al.'s order and signs."""
+    x, y, z = directions.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    basis = [torch.full_like(x, 0.28209479177387814)]
+    if count > 1:
+        basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+    if count > 4:
+        basis += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * zz - xx - yy),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+        ]
+    if count > 9:
+        basis += [
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+        ]
+    return torch.stack(basis, dim=-1)
+
+
+def rotations_of(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
+    """Rotation matrices of quaternions (wxyz) of any length but zero."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1, eps=0).unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Projected:
+    """Gaussians in one image: those in front of the near plane, nearest first."""
+
+    means2d: Tensor  # [m, 2] pixels
+    conics: Tensor  # [m, 3] inverse covariance: xx, xy, yy, 1 / px^2
+    opacities: Tensor  # [m]
+    colours: Tensor  # [m, 3]
+    depths: Tensor  # [m] metres
+    extents: Tensor  # [m, 2] pixels: half the box beyond which the opacity is below ALPHA_MIN; no gradient
+
+
+def _project_means(means: Tensor, viewmat: Tensor, K: Tensor, *, near: float) -> Tensor:
+    """Centres in the image, `[n, 2]` pixels; (0, 0) behind the near plane."""
+    in_camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    visible = in_camera[:, 2:].detach() > near
+    z = torch.where(visible, in_camera[:, 2:], 1.0)
+    return torch.where(visible, in_camera[:, :2] / z * K[[0, 1], [0, 1]] + K[:2, 2], 0.0)
+
+
+def _project_naive(
+    gaussians: Gaussians,
+    means2d: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    *,
+    width: int,
+    height: int,
+    dilation: float,
+    compensate: bool,
+    near: float,
+) -> _Projected:
+    """Eq. 2, and the colour H of Eq. 3."""
+    to_camera, centre = viewmat[:3, :3], -viewmat[:3, :3].T @ viewmat[:3, 3]
+    in_camera = gaussians.means @ to_camera.T + viewmat[:3, 3]
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    order = torch.argsort(in_camera[:, 2].detach(), stable=True)
+    order = order[in_camera[order, 2].detach() > near]
+
+    x, y, z = in_camera[order].unbind(-1)
+    # The affine approximation is taken no further outside the image than Kerbl et al. do: 15 % of its size beyond the border.
+    tan_x = torch.clamp(x / z, -(cx + 0.15 * width) / fx, (1.15 * width - cx) / fx)
+    tan_y = torch.clamp(y / z, -(cy + 0.15 * height) / fy, (1.15 * height - cy) / fy)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack([fx / z, zero, -fx * tan_x / z, zero, fy / z, -fy * tan_y / z], dim=-1).reshape(-1, 2, 3)
+    half = jacobian @ to_camera @ (rotations_of(gaussians.quats[order]) * gaussians.scales[order][:, None, :])
+    covariance = half @ half.mT
+    a, b, c = covariance[:, 0, 0] + dilation, covariance[:, 0, 1], covariance[:, 1, 1] + dilation
+    # det(half half^T) as a sum of squared minors (Cauchy-Binet) does not cancel where the splat is a needle.
+    sharp = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(-1)
+    det = sharp + dilation * (covariance[:, 0, 0] + covariance[:, 1, 1]) + dilation**2
+    drawn = det.detach() > 0
+    conics = torch.stack([c, -b, a], dim=-1) / torch.where(drawn, det, 1.0)[:, None]
+    opacities = gaussians.opacities[order] * drawn
+    if compensate:
+        opacities = opacities * torch.sqrt(torch.clamp(sharp / torch.where(drawn, det, 1.0), min=COMPENSATION_MIN))
+
+    directions = torch.nn.functional.normalize(gaussians.means[order] - centre, dim=-1)
+    basis = sh_basis(directions, gaussians.sh.shape[1])
+    colours = torch.clamp_min(0.5 + (basis[:, :, None] * gaussians.sh[order]).sum(1), 0.0)
+
+    reach = 2 * torch.log(torch.clamp_min(opacities.detach() / ALPHA_MIN, 1.0))
+    extents = torch.sqrt(reach[:, None] * torch.stack([a, c], dim=-1).detach())
+    extents = torch.where((opacities.detach() >= ALPHA_MIN)[:, None], extents, -torch.inf)
+    return _Projected(
+        means2d=means2d[order], conics=conics, opacities=opacities, colours=colours, depths=z, extents=extents
+    )
+
+
+def _composite_naive(projected: Tensor, pixels: Tensor) -> Tensor:
+    """Eq. 3 for `[p, 2]` pixel centres: `[p, 5]` = premultiplied colour, depth, alpha.
+
+    `projected` is `[m, 10]`, nearest first: means2d, conics, opacity, colour, depth.
+    """
+    dx, dy = (pixels[None, :, i] - projected[:, i, None] for i in range(2))
+    a, b, c = (projected[:, i, None] for i in (2, 3, 4))
+    power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
+    alpha = torch.clamp_max(projected[:, 5, None] * torch.exp(power), ALPHA_MAX)
+    alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0.0)
+    left = torch.cumprod(1 - alpha, dim=0)
+    # `left` never grows, so a finished pixel stays finished.
+    alpha = torch.where(left >= TRANSMITTANCE_MIN, alpha, 0.0)
+    before = torch.cat([torch.ones_like(left[:1]), left[:-1]])
+    weights = alpha * before
+    features = torch.cat([projected[:, 6:10], torch.ones_like(projected[:, :1])], dim=1)
+    return weights.T @ features
+
+
+def splat_naive(
+    gaussians: Gaussians,
+    *,
+    viewmats: Float[Tensor, "c 4 4"],
+    Ks: Float[Tensor, "c 3 3"],
+    width: int,
+    height: int,
+    background: Float[Tensor, " 3"] | None = None,
+    dilation: float = 0.3,
+    compensate: bool = False,
+    near: float = 0.01,
+    tile: int = NAIVE_TILE,
+) -> Splatted:
+    """Draw Gaussians: the definition, ASH Eq. 1-3 in plain torch, for any float dtype, differentiable in every tensor.
+
+    The arguments are those of `splat`. The image is composited in squares of `tile` pixels, only to bound the memory.
+    """
+    check_gaussians(gaussians)
+    check_cameras(viewmats, Ks, width=width, height=height, near=near, dilation=dilation)
+    cameras = list(zip(viewmats, Ks, strict=True))
+    means2d = torch.stack([_project_means(gaussians.means, viewmat, K, near=near) for viewmat, K in cameras])
+    images = []
+    for centres, (viewmat, K) in zip(means2d, cameras, strict=True):
+        projected = _project_naive(
+            gaussians,
+            centres,
+            viewmat,
+            K,
+            width=width,
+            height=height,
+            dilation=dilation,
+            compensate=compensate,
+            near=near,
+        )
+        images.append(_draw_naive(projected, width=width, height=height, tile=tile))
+    image = torch.stack(images)
+    rgb, depth, alpha = image[..., :3], image[..., 3], image[..., 4]
+    if background is not None:
+        rgb = rgb + (1 - alpha)[..., None] * background
+    return Splatted(rgb=rgb, alpha=alpha, depth=depth, means2d=means2d)
+
+
+def _draw_naive(projected: _Projected, *, width: int, height: int, tile: int) -> Tensor:
+    """One image `[h, w, 5]` from `_composite_naive`, square by square."""
+    columns, rows = -(-width // tile), -(-height // tile)
+    # A hair wider than exact: the threshold on alpha decides, not this box.
+    low = (projected.means2d.detach() - projected.extents - 0.6) / tile
+    high = (projected.means2d.detach() + projected.extents + 0.6) / tile
+    record = torch.cat(
+        [
+            projected.means2d,
+            projected.conics,
+            projected.opacities[:, None],
+            projected.colours,
+            projected.depths[:, None],
+        ],
+        dim=1,
+    )
+    members = []
+    for row in range(rows):
+        in_row = torch.nonzero((low[:, 1] < row + 1) & (high[:, 1] > row))[:, 0]
+        for column in range(columns):
+            inside = (low[in_row, 0] < column + 1) & (high[in_row, 0] > column)
+            members.append(in_row[inside])
+    # One gather for all squares: a gather per square would write a whole gradient per square.
+    records = record[torch.cat(members)].split([len(m) for m in members])
+    steps = torch.arange(tile, dtype=record.dtype, device=record.device) + 0.5
+    lattice = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1).reshape(-1, 2)
+    empty = torch.zeros(tile * tile, 5, dtype=record.dtype, device=record.device)
+    squares = []
+    for number, entries in enumerate(records):
+        corner = torch.tensor([number % columns, number // columns], dtype=record.dtype, device=record.device) * tile
+        squares.append(_composite_naive(entries, lattice + corner) if len(entries) else empty)
+    image = torch.stack(squares).reshape(rows, columns, tile, tile, 5).transpose(1, 2)
+    return image.reshape(rows * tile, columns * tile, 5)[:height, :width]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The fast version
+
+
+def splat(
+    gaussians: Gaussians,
+    *,
+    viewmats: Float[Tensor, "c 4 4"],
+    Ks: Float[Tensor, "c 3 3"],
+    width: int,
+    height: int,
+    background: Float[Tensor, " 3"] | None = None,
+    dilation: float = 0.3,
+    compensate: bool = False,
+    near: float = 0.01,
+    threads: int = 1,
+) -> Splatted:
+    """Draw Gaussians in one or several cameras: `splat_naive` by native kernels on the CPU, by gsplat on CUDA.
+
+    ASH Eq. 1-3. Differentiable in every Gaussian parameter and in `viewmats`; not in `Ks` and `background`. Float32 only.
+    The same numbers come out for any number of threads. gsplat differs in three constants: it lets an opacity reach 0.999,
+    stops at 1e-4 inclusive, and draws no splat beyond 3.33 standard deviations.
+
+    Args:
+        gaussians: in the world's frame.
+        viewmats: world to camera, OpenCV axes, metres.
+        Ks: pixels, no skew, any principal point; pixel centres at +0.5.
+        width: pixels.
+        height: pixels.
+        background: RGB behind the splats, black if None.
+        dilation: px^2, added to both axes of a projected covariance.
+        compensate: scale a splat's opacity by the root of the ratio of determinants before and after dilation.
+        near: metres; a Gaussian is drawn if its centre lies beyond this depth.
+        threads: CPU threads of this call.
+
+    Raises:
+        InputError: a tensor holds NaN or infinity, a quaternion is zero, a number is out of range; names the tensor.
+    """
+    check_cameras(viewmats, Ks, width=width, height=height, near=near, dilation=dilation)
+    check_sh(gaussians.sh)
+    for name, tensor in (("Ks", Ks), ("background", background)):
+        if tensor is not None and tensor.requires_grad:
+            raise InputError(f"{name}: splat has no gradient for it; splat_naive does")
+    if background is not None and not bool(torch.isfinite(background).all()):
+        raise InputError("background: expected finite numbers, got NaN or infinity")
+    if gaussians.means.is_cuda:
+        return _splat_gsplat(
+            gaussians,
+            viewmats=viewmats,
+            Ks=Ks,
+            width=width,
+            height=height,
+            background=background,
+            dilation=dilation,
+            compensate=compensate,
+            near=near,
+        )
+    if threads < 1:
+        raise InputError(f"threads: expected at least 1, got {threads}")
+    tensors = {name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
+    arrays = [float32_on_cpu(name, tensor) for name, tensor in (tensors | {"viewmats": viewmats, "Ks": Ks}).items()]
+    view = _View(width, height, int(compensate), dilation, near, threads)
+    means2d, packed, depths = _Project.apply(view, *arrays)
+    behind = (0.0, 0.0, 0.0) if background is None else tuple(background.tolist())
+    rgb, alpha, depth = _Blend.apply(view, behind, means2d, packed, depths)
+    return Splatted(rgb=rgb, alpha=alpha, depth=depth, means2d=means2d)
+
+
+class _View(NamedTuple):
+    """The plain numbers of a call, in the order in which the native functions take them."""
+
+    width: int
+    height: int
+    compensate: int
+    dilation: float
+    near: float
+    threads: int
+
+
+_FAULTS = {  # `Fault` in native/kernels.h
+    1: "means: expected finite numbers, got NaN or infinity",
+    2: "quats: expected finite numbers, got NaN or infinity",
+    3: "quats: expected quaternions that are not zero, got a zero quaternion",
+    4: "scales: expected finite standard deviations >= 0, got something else",
+    5: "opacities: expected numbers in [0, 1], got something else",
+    6: "sh: expected finite numbers, got NaN or infinity",
+}
+
+
+class _Project(Function):
+    """Gaussians to splats: means2d, the blend's parameters (`Packed` in native/kernels.h), and depths for the order."""
+
+    @staticmethod
+    def forward(ctx: Any, view: _View, *arrays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        means, sh, viewmats = arrays[0], arrays[4], arrays[5]
+        count, cameras, coefficients = len(means), len(viewmats), sh.shape[1]
+        means2d = torch.empty(cameras, count, 2)
+        packed = torch.empty(cameras, count, 8)
+        depths = torch.empty(cameras, count, dtype=torch.float64)
+        ctx.sizes = (count, cameras, coefficients, *view)
+        fault = load().ash_project(*map(address, arrays), *ctx.sizes, *map(address, (means2d, packed, depths)))
+        if fault:
+            raise InputError(f"{_FAULTS[fault % 16]} at Gaussian {fault // 16}")
+        ctx.save_for_backward(*arrays, packed)
+        ctx.mark_non_differentiable(depths)
+        return means2d, packed, depths
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_means2d: Tensor, grad_packed: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        *arrays, packed = ctx.saved_tensors
+        grads = [torch.empty_like(array) for array in arrays[:5]]
+        cameras = len(arrays[5])
+        inputs = (packed, grad_means2d.contiguous(), grad_packed.contiguous())
+        flat = torch.empty(cameras, 12, dtype=torch.float64)
+        check_memory(
+            load().ash_project_backward(
+                *map(address, arrays), *ctx.sizes, *map(address, inputs), *map(address, grads), address(flat)
+            )
+        )
+        views = torch.zeros_like(arrays[5])
+        views[:, :3, :3] = flat[:, :9].reshape(-1, 3, 3)
+        views[:, :3, 3] = flat[:, 9:]
+        return None, *grads, views, None
+
+
+class _Drawing:
+    """Owns what the native blend keeps for its backward pass."""
+
+    def __init__(self, handle: int) -> None:
+        self.handle = handle
+        weakref.finalize(self, load().ash_release, handle)
+
+
+class _Blend(Function):
+    """Splats to images, Eq. 3."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, view: _View, background: tuple[float, float, float], means2d: Tensor, packed: Tensor, depths: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        cameras, count = depths.shape
+        images = [torch.empty(cameras, view.height, view.width, *rest) for rest in ((3,), (), ())]
+        handle = load().ash_blend(
+            *map(address, (means2d, packed, depths)),
+            count,
+            cameras,
+            view.width,
+            view.height,
+            (c_float * 3)(*background),
+            view.threads,
+            *map(address, images),
+        )
+        check_memory(handle is None)
+        ctx.drawing, ctx.threads = _Drawing(handle), view.threads
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*images, packed)
+        return images[0], images[1], images[2]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grad_images: Tensor | None) -> tuple[Tensor | None, ...]:
+        *images, packed = ctx.saved_tensors
+        given = [None if grad is None else grad.contiguous() for grad in grad_images]
+        grad_means2d, grad_packed = packed.new_empty(*packed.shape[:2], 2), torch.empty_like(packed)
+        check_memory(
+            load().ash_blend_backward(
+                ctx.drawing.handle,
+                *map(address, images),
+                *map(address, given),
+                ctx.threads,
+                address(grad_means2d),
+                address(grad_packed),
+            )
+        )
+        return None, None, grad_means2d, grad_packed, None
+
+
+def _splat_gsplat(
+    gaussians: Gaussians,
+    *,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    background: Tensor | None,
+    dilation: float,
+    compensate: bool,
+    near: float,
+) -> Splatted:
+    """The same call for gsplat, which is imported only here."""
+    check_gaussians(gaussians)
+    try:
+        from gsplat import rasterization
+    except ImportError as error:
+        raise InputError("means: on CUDA, where splatting needs the package gsplat (pip install gsplat)") from error
+    backgrounds = (
+        None if background is None else torch.cat([background, background.new_zeros(1)]).expand(len(viewmats), 4)
+    )
+    image, alpha, info = rasterization(
+        means=gaussians.means,
+        quats=gaussians.quats,
+        scales=gaussians.scales,
+        opacities=gaussians.opacities,
+        colors=gaussians.sh,
+        viewmats=viewmats,
+        Ks=Ks,
+        width=width,
+        height=height,
+        near_plane=near,
+        eps2d=dilation,
+        sh_degree=math.isqrt(gaussians.sh.shape[1]) - 1,
+        packed=False,
+        backgrounds=backgrounds,
+        render_mode="RGB+D",
+        rasterize_mode="antialiased" if compensate else "classic",
+    )
+    return Splatted(rgb=image[..., :3], alpha=alpha[..., 0], depth=image[..., 3], means2d=info["means2d"])
