@@ -59,14 +59,16 @@ def _compiler() -> Finding:
 
 def _kernels() -> Finding:
     try:
-        from ash import native
-    except ImportError as error:
+        from ash.native.library import instruction_set
+
+        instructions = instruction_set()
+    except (RuntimeError, OSError) as error:
         return Finding(
             what="native kernels", found=f"not built ({error})", consequence="install again with a compiler", good=False
         )
     return Finding(
         what="native kernels",
-        found=str(native.instruction_set()),
+        found=instructions,
         consequence="splatting, loss and rasterising run natively",
     )
 
