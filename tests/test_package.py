@@ -1,0 +1,153 @@
+"""What is installed: the wheel's contents, exact versions, and the direction of imports."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from importlib.metadata import PackageNotFoundError, distribution
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("ash", "synth", "baselines", "benchmarks")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The unpacked wheel, without the kernels: compiling them takes longer than all the rest of this file."""
+    if find_spec("scikit_build_core") is None:
+        pytest.skip("building a wheel needs scikit-build-core, which ./ash-bench installs")
+    folder = tmp_path_factory.mktemp("wheel")
+    # A copy is built, because the build may leave files behind.
+    listed = subprocess.run(["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True)
+    names = listed.stdout.split() if listed.returncode == 0 else []
+    for name in names or [path.relative_to(ROOT).as_posix() for path in ROOT.rglob("*") if path.suffix != ".pyc"]:
+        if (ROOT / name).is_file() and name.split("/")[0] in (
+            *PACKAGES,
+            "pyproject.toml",
+            "README.md",
+            "LICENSE",
+            "tests",
+        ):
+            (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / "source" / name).write_bytes((ROOT / name).read_bytes())
+    build = "import sys; from scikit_build_core.build import build_wheel as f; f(sys.argv[1], {'wheel.cmake': 'false'})"
+    subprocess.run([sys.executable, "-c", build, str(folder)], cwd=folder / "source", check=True, capture_output=True)
+    (built,) = folder.glob("*.whl")
+    zipfile.ZipFile(built).extractall(folder / "unpacked")
+    return folder / "unpacked"
+
+
+def test_wheel_holds_the_four_packages_and_the_licence(wheel: Path) -> None:
+    (info,) = wheel.glob("*.dist-info")
+    assert {path.name for path in wheel.iterdir()} - {info.name} == set(PACKAGES)
+    assert "Apache License" in (info / "licenses" / "LICENSE").read_text()
+    for package in PACKAGES:
+        sources = {path.relative_to(ROOT) for path in (ROOT / package).rglob("*.py")}
+        assert {path.relative_to(wheel) for path in (wheel / package).rglob("*.py")} == sources
+    assert {path.name for path in (wheel / "benchmarks" / "templates").iterdir()} == {
+        path.name for path in (ROOT / "benchmarks" / "templates").iterdir() if path.is_file()
+    }
+
+
+def test_wheel_works_outside_the_checkout(wheel: Path, tmp_path: Path) -> None:
+    """`-S` leaves out the editable installation that these tests run from."""
+    program = f"""
+import sys
+sys.path[:0] = [{str(wheel)!r}]
+sys.path += {[path for path in sys.path if path.endswith("-packages")]!r}
+import ash.dataset, synth.scene
+from importlib.metadata import entry_points
+from benchmarks.cli import main
+assert ash.dataset.__file__.startswith({str(wheel)!r})
+main(["--help"])
+"""
+    done = subprocess.run(
+        [sys.executable, "-S", "-c", program],
+        cwd=tmp_path,
+        env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "ash-bench run" in done.stdout
+
+
+def test_methods_can_be_imported() -> None:
+    for name, target in PROJECT["project"]["entry-points"]["ash_bench.methods"].items():
+        module, function = target.split(":")
+        spec = find_spec(module)
+        assert spec is not None and spec.origin is not None, f"{name}: no module {module}"
+        defined = [
+            node.name for node in ast.parse(Path(spec.origin).read_text()).body if isinstance(node, ast.FunctionDef)
+        ]
+        assert function in defined, f"{name}: {module} defines no {function}"
+
+
+def canonical(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def constraints() -> dict[str, str]:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pairs = [line.split("==") for line in lines if line and not line.startswith("#")]
+    return {canonical(name): version for name, version in pairs}
+
+
+def closure() -> set[str]:
+    """Every distribution that an installation for users and developers brings along, as far as it is installed here."""
+    project = PROJECT["project"]
+    waiting = [*project["dependencies"], *project["optional-dependencies"]["dev"], *PROJECT["build-system"]["requires"]]
+    found: set[str] = set()
+    while waiting:
+        requirement = waiting.pop()
+        name = canonical(re.split(r"[^A-Za-z0-9._-]", requirement.strip(), maxsplit=1)[0])
+        if "extra ==" in requirement or name in found or not _wanted_here(requirement):
+            continue
+        found.add(name)
+        try:
+            waiting += distribution(name).requires or []
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _wanted_here(requirement: str) -> bool:
+    from packaging.requirements import Requirement
+
+    marker = Requirement(requirement).marker
+    return marker is None or marker.evaluate()
+
+
+def test_constraints_hold_every_package_to_one_version() -> None:
+    pinned = constraints()
+    # A build of torch for GPUs brings libraries of its vendor along, and holds them to exact versions itself.
+    unpinned = {name for name in closure() - set(pinned) if not name.startswith(("nvidia-", "cuda-", "triton"))}
+    assert unpinned == set()
+    assert all(re.fullmatch(r"[0-9][0-9A-Za-z.]*", version) for version in pinned.values()), "expected plain versions"
+
+
+def test_imports_follow_the_contracts() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", "from importlinter.cli import lint_imports_command as f; f()"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout
+
+
+def test_torchvision_is_never_imported() -> None:
+    """lpips brings it along, and beside a CPU build of torch its import fails."""
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+                names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+                assert not {name.split(".")[0] for name in names} & {"torchvision", "lpips"}, path
