@@ -1,10 +1,10 @@
 """What a report asks of the results: one number with its spread for a scene, a method and a quantity."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from benchmarks.cells import CellResult
+from benchmarks.statistics import mean_interval
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -46,20 +46,10 @@ class Scores:
         values = self.values(scene, method, split, region, metric)
         if not values:
             return None
-        mean = sum(values) / len(values)
-        return Score(mean=mean, half_width=_half_width(values), seeds=len(values))
+        interval = mean_interval(values)
+        half_width = None if interval.high is None else interval.high - interval.mean
+        return Score(mean=interval.mean, half_width=half_width, seeds=len(values))
 
     def fg(self, scene: str, method: str, split: str = "novel_view", metric: str = "psnr") -> Score | None:
         """A foreground quality."""
         return self.get(scene, method, split, "foreground", metric)
-
-
-def _half_width(values: list[float]) -> float | None:
-    """Half of the 95 % interval of a mean by Student's t: right for the few seeds that there are."""
-    if len(values) < 2:
-        return None
-    from scipy.stats import t
-
-    mean = sum(values) / len(values)
-    deviation = math.sqrt(sum((value - mean) ** 2 for value in values) / (len(values) - 1))
-    return float(t.ppf(0.975, len(values) - 1)) * deviation / math.sqrt(len(values))
