@@ -1,6 +1,7 @@
-"""The photometric loss L1 + SSIM (ASH Eq. 8-9). `l1_ssim_loss_naive` is the definition, `l1_ssim_loss` the same function, fast.
+"""The photometric loss L1 + SSIM (ASH Eq. 8-9): `l1_ssim_loss_naive` defines it, `l1_ssim_loss` is fast.
 
-SSIM (Wang et al. 2004) per channel: 11x11 Gaussian windows of sigma 1.5, zeros beyond the border, C1 = 0.01^2, C2 = 0.03^2.
+SSIM (Wang et al. 2004) per channel: 11x11 Gaussian windows of sigma 1.5, zeros beyond the border, C1 = 0.01^2 and
+C2 = 0.03^2.
 """
 
 from ctypes import c_double
@@ -96,8 +97,8 @@ def l1_ssim_loss(
 ) -> Float[Tensor, ""]:
     """`l1_ssim_loss_naive` in one fused native pass with the analytic gradient; float32 on the CPU.
 
-    On CUDA the definition itself runs. Differentiable in `image`; the gradient of |x| at 0 is 0. The same numbers come out
-    for any number of threads.
+    On CUDA the definition itself runs. Differentiable in `image`; the gradient of |x| at 0 is 0. The same numbers come
+    out for any number of threads.
 
     Raises:
         InputError: shapes differ, or the image is neither float32 nor on CUDA. NaN in the image gives a NaN loss.

@@ -1,7 +1,7 @@
 """Which triangle a pixel sees, and where in it: for the texel lattice of a UV map and for a camera's view of a mesh.
 
-Vertices are homogeneous pixels (x w, y w, w): of a camera what `project_vertices` returns, w being the depth in metres; of a
-UV map (x, y, 1). Pixel centres lie at +0.5. Not differentiable.
+Vertices are homogeneous pixels (x w, y w, w): of a camera what `project_vertices` returns, w being the depth in metres;
+of a UV map (x, y, 1). Pixel centres lie at +0.5. Not differentiable.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class Rasterized:
 def project_vertices(
     points: Float[Tensor, "v 3"], viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "v 3"]:
-    """World points to homogeneous pixels (x w, y w, w), w the depth along the optical axis, metres; no division by it."""
+    """World points to homogeneous pixels (x w, y w, w): w is the depth along the optical axis in metres."""
     return (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
 
 
@@ -41,10 +41,10 @@ def rasterize_mesh(
 ) -> Rasterized:
     """The triangle nearest to the camera at every pixel's centre, whichever way it faces.
 
-    A pixel on an edge belongs to the triangle to whose left or top that edge is, so that a closed surface covers each pixel
-    exactly once. Points with a depth below `near` are not seen, points beyond are, of one and the same triangle too: nothing
-    needs clipping before. Of two triangles at the same depth the one listed first is seen. The same numbers come out for any
-    number of threads.
+    A pixel on an edge belongs to the triangle to whose left or top that edge is, so that a closed surface covers each
+    pixel exactly once. Points with a depth below `near` are not seen, points beyond are, of one and the same triangle
+    too: nothing needs clipping before. Of two triangles at the same depth the one listed first is seen. The same
+    numbers come out for any number of threads.
 
     Args:
         vertices: homogeneous pixels, float32 or float64 on the CPU (see the top of this file).
@@ -110,7 +110,7 @@ def rasterize_mesh_naive(
 
 
 def _edge(corners: Tensor, start: int, end: int) -> Tensor:
-    """The line from one corner to another, from the lower-numbered one whichever triangle asks: exactly opposite for both."""
+    """The line between two corners, from the lower-numbered one whichever triangle asks: exactly opposite for both."""
     if start < end:
         return torch.linalg.cross(corners[start], corners[end])
     return -torch.linalg.cross(corners[end], corners[start])
@@ -119,7 +119,7 @@ def _edge(corners: Tensor, start: int, end: int) -> Tensor:
 def _check_mesh(vertices: Tensor, faces: Tensor, *, width: int, height: int, near: float) -> None:
     if not bool(torch.isfinite(vertices).all()):
         raise InputError("vertices: expected finite numbers, got NaN or infinity")
-    if len(faces) and not (0 <= int(faces.min()) and int(faces.max()) < len(vertices)):
+    if len(faces) and not (int(faces.min()) >= 0 and int(faces.max()) < len(vertices)):
         raise InputError(
             f"faces: expected rows of the {len(vertices)} vertices, got {int(faces.min())}..{int(faces.max())}"
         )

@@ -1,31 +1,29 @@
 """Stg. 4: Gaussians to images. `splat_naive` is the definition (ASH Eq. 1-3), `splat` the same function, fast.
 
-Kerbl et al.'s constants, here and in the native kernels: a splat's opacity at a pixel lies in [1/255, 0.99], smaller ones
-are skipped; a pixel is finished before the splat that would take its transmittance below 1e-4; 0.3 px^2 is added to both
-axes of every projected covariance (an argument: at 256x256 pixels 0.05 gains over a decibel). A splat reaches exactly as
-far as its opacity exceeds 1/255: no fixed number of standard deviations. Equal depths are drawn in the order given.
+Kerbl et al.'s constants, here and in the native kernels: a splat's opacity at a pixel lies in [1/255, 0.99], smaller
+ones are skipped; a pixel is finished before the splat that would take its transmittance below 1e-4; 0.3 px^2 is added
+to both axes of every projected covariance (an argument: at 256x256 pixels 0.05 gains over a decibel). A splat reaches
+as far as its opacity exceeds 1/255: no fixed number of standard deviations. Equal depths are drawn as they come.
 """
 
 import math
-import weakref
-from ctypes import c_float
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd import Function
-from torch.autograd.function import once_differentiable
 
 from ash.files import InputError
 from ash.gaussians import Gaussians
-from ash.native.library import address, check_memory, float32_on_cpu, load
+from ash.harmonics import sh_basis
+from ash.native.drawing import View, draw
+from ash.native.library import float32_on_cpu
+from ash.skinning import unitquat_to_rotmat
 
 ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.99
 TRANSMITTANCE_MIN = 1e-4
-# Below this ratio of determinants a compensated splat cannot reach 1/255, so that the square root needs no smaller argument.
+# Below this ratio of determinants a compensated splat cannot reach 1/255: the square root needs no smaller argument.
 COMPENSATION_MIN = 1e-6
 NAIVE_TILE = 16
 
@@ -50,6 +48,8 @@ def check_cameras(
     dilation: float,
 ) -> None:
     """Raise an InputError unless the cameras are pinholes without skew and the numbers are usable."""
+    if len(viewmats) == 0:
+        raise InputError("viewmats: expected at least one camera, got none")
     for name, value in (("viewmats", viewmats), ("Ks", Ks)):
         if not bool(torch.isfinite(value).all()):
             raise InputError(f"{name}: expected finite numbers, got NaN or infinity")
@@ -87,45 +87,6 @@ def check_sh(sh: Float[Tensor, "n k 3"]) -> None:
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The definition
-
-
-def sh_basis(directions: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "n k"]:
-    """The first `count` real spherical harmonics at unit directions, in Kerbl et al.'s order and signs."""
-    x, y, z = directions.unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
-    basis = [torch.full_like(x, 0.28209479177387814)]
-    if count > 1:
-        basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
-    if count > 4:
-        basis += [
-            1.0925484305920792 * x * y,
-            -1.0925484305920792 * y * z,
-            0.31539156525252005 * (2 * zz - xx - yy),
-            -1.0925484305920792 * x * z,
-            0.5462742152960396 * (xx - yy),
-        ]
-    if count > 9:
-        basis += [
-            -0.5900435899266435 * y * (3 * xx - yy),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (4 * zz - xx - yy),
-            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-            -0.4570457994644658 * x * (4 * zz - xx - yy),
-            1.445305721320277 * z * (xx - yy),
-            -0.5900435899266435 * x * (xx - 3 * yy),
-        ]
-    return torch.stack(basis, dim=-1)
-
-
-def rotations_of(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
-    """Rotation matrices of quaternions (wxyz) of any length but zero."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1, eps=0).unbind(-1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -168,12 +129,13 @@ def _project_naive(
     order = order[in_camera[order, 2].detach() > near]
 
     x, y, z = in_camera[order].unbind(-1)
-    # The affine approximation is taken no further outside the image than Kerbl et al. do: 15 % of its size beyond the border.
+    # The affine approximation is taken no further outside the image than by Kerbl et al.: 15 % of its size.
     tan_x = torch.clamp(x / z, -(cx + 0.15 * width) / fx, (1.15 * width - cx) / fx)
     tan_y = torch.clamp(y / z, -(cy + 0.15 * height) / fy, (1.15 * height - cy) / fy)
     zero = torch.zeros_like(z)
     jacobian = torch.stack([fx / z, zero, -fx * tan_x / z, zero, fy / z, -fy * tan_y / z], dim=-1).reshape(-1, 2, 3)
-    half = jacobian @ to_camera @ (rotations_of(gaussians.quats[order]) * gaussians.scales[order][:, None, :])
+    rotations = unitquat_to_rotmat(torch.nn.functional.normalize(gaussians.quats[order], dim=-1, eps=0))
+    half = jacobian @ to_camera @ (rotations * gaussians.scales[order][:, None, :])
     covariance = half @ half.mT
     a, b, c = covariance[:, 0, 0] + dilation, covariance[:, 0, 1], covariance[:, 1, 1] + dilation
     # det(half half^T) as a sum of squared minors (Cauchy-Binet) does not cancel where the splat is a needle.
@@ -186,7 +148,7 @@ def _project_naive(
         opacities = opacities * torch.sqrt(torch.clamp(sharp / torch.where(drawn, det, 1.0), min=COMPENSATION_MIN))
 
     directions = torch.nn.functional.normalize(gaussians.means[order] - centre, dim=-1)
-    basis = sh_basis(directions, gaussians.sh.shape[1])
+    basis = sh_basis(directions, math.isqrt(gaussians.sh.shape[1]) - 1)
     colours = torch.clamp_min(0.5 + (basis[:, :, None] * gaussians.sh[order]).sum(1), 0.0)
 
     reach = 2 * torch.log(torch.clamp_min(opacities.detach() / ALPHA_MIN, 1.0))
@@ -312,9 +274,9 @@ def splat(
 ) -> Splatted:
     """Draw Gaussians in one or several cameras: `splat_naive` by native kernels on the CPU, by gsplat on CUDA.
 
-    ASH Eq. 1-3. Differentiable in every Gaussian parameter and in `viewmats`; not in `Ks` and `background`. Float32 only.
-    The same numbers come out for any number of threads. gsplat differs in three constants: it lets an opacity reach 0.999,
-    stops at 1e-4 inclusive, and draws no splat beyond 3.33 standard deviations.
+    ASH Eq. 1-3. Differentiable in every Gaussian parameter and in `viewmats`; not in `Ks` and `background`. Float32
+    only. The same numbers come out for any number of threads. gsplat's own constants differ: it lets an opacity reach
+    0.999, stops at 1e-4 inclusive, and draws no splat beyond 3.33 standard deviations.
 
     Args:
         gaussians: in the world's frame.
@@ -354,121 +316,10 @@ def splat(
         raise InputError(f"threads: expected at least 1, got {threads}")
     tensors = {name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
     arrays = [float32_on_cpu(name, tensor) for name, tensor in (tensors | {"viewmats": viewmats, "Ks": Ks}).items()]
-    view = _View(width, height, int(compensate), dilation, near, threads)
-    means2d, packed, depths = _Project.apply(view, *arrays)
-    behind = (0.0, 0.0, 0.0) if background is None else tuple(background.tolist())
-    rgb, alpha, depth = _Blend.apply(view, behind, means2d, packed, depths)
+    view = View(width, height, int(compensate), dilation, near, threads)
+    behind = [0.0, 0.0, 0.0] if background is None else background.tolist()
+    rgb, alpha, depth, means2d = draw(view, behind, arrays)
     return Splatted(rgb=rgb, alpha=alpha, depth=depth, means2d=means2d)
-
-
-class _View(NamedTuple):
-    """The plain numbers of a call, in the order in which the native functions take them."""
-
-    width: int
-    height: int
-    compensate: int
-    dilation: float
-    near: float
-    threads: int
-
-
-_FAULTS = {  # `Fault` in native/kernels.h
-    1: "means: expected finite numbers, got NaN or infinity",
-    2: "quats: expected finite numbers, got NaN or infinity",
-    3: "quats: expected quaternions that are not zero, got a zero quaternion",
-    4: "scales: expected finite standard deviations >= 0, got something else",
-    5: "opacities: expected numbers in [0, 1], got something else",
-    6: "sh: expected finite numbers, got NaN or infinity",
-}
-
-
-class _Project(Function):
-    """Gaussians to splats: means2d, the blend's parameters (`Packed` in native/kernels.h), and depths for the order."""
-
-    @staticmethod
-    def forward(ctx: Any, view: _View, *arrays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        means, sh, viewmats = arrays[0], arrays[4], arrays[5]
-        count, cameras, coefficients = len(means), len(viewmats), sh.shape[1]
-        means2d = torch.empty(cameras, count, 2)
-        packed = torch.empty(cameras, count, 8)
-        depths = torch.empty(cameras, count, dtype=torch.float64)
-        ctx.sizes = (count, cameras, coefficients, *view)
-        fault = load().ash_project(*map(address, arrays), *ctx.sizes, *map(address, (means2d, packed, depths)))
-        if fault:
-            raise InputError(f"{_FAULTS[fault % 16]} at Gaussian {fault // 16}")
-        ctx.save_for_backward(*arrays, packed)
-        ctx.mark_non_differentiable(depths)
-        return means2d, packed, depths
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_means2d: Tensor, grad_packed: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
-        *arrays, packed = ctx.saved_tensors
-        grads = [torch.empty_like(array) for array in arrays[:5]]
-        cameras = len(arrays[5])
-        inputs = (packed, grad_means2d.contiguous(), grad_packed.contiguous())
-        flat = torch.empty(cameras, 12, dtype=torch.float64)
-        check_memory(
-            load().ash_project_backward(
-                *map(address, arrays), *ctx.sizes, *map(address, inputs), *map(address, grads), address(flat)
-            )
-        )
-        views = torch.zeros_like(arrays[5])
-        views[:, :3, :3] = flat[:, :9].reshape(-1, 3, 3)
-        views[:, :3, 3] = flat[:, 9:]
-        return None, *grads, views, None
-
-
-class _Drawing:
-    """Owns what the native blend keeps for its backward pass."""
-
-    def __init__(self, handle: int) -> None:
-        self.handle = handle
-        weakref.finalize(self, load().ash_release, handle)
-
-
-class _Blend(Function):
-    """Splats to images, Eq. 3."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, view: _View, background: tuple[float, float, float], means2d: Tensor, packed: Tensor, depths: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        cameras, count = depths.shape
-        images = [torch.empty(cameras, view.height, view.width, *rest) for rest in ((3,), (), ())]
-        handle = load().ash_blend(
-            *map(address, (means2d, packed, depths)),
-            count,
-            cameras,
-            view.width,
-            view.height,
-            (c_float * 3)(*background),
-            view.threads,
-            *map(address, images),
-        )
-        check_memory(handle is None)
-        ctx.drawing, ctx.threads = _Drawing(handle), view.threads
-        ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*images, packed)
-        return images[0], images[1], images[2]
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *grad_images: Tensor | None) -> tuple[Tensor | None, ...]:
-        *images, packed = ctx.saved_tensors
-        given = [None if grad is None else grad.contiguous() for grad in grad_images]
-        grad_means2d, grad_packed = packed.new_empty(*packed.shape[:2], 2), torch.empty_like(packed)
-        check_memory(
-            load().ash_blend_backward(
-                ctx.drawing.handle,
-                *map(address, images),
-                *map(address, given),
-                ctx.threads,
-                address(grad_means2d),
-                address(grad_packed),
-            )
-        )
-        return None, None, grad_means2d, grad_packed, None
 
 
 def _splat_gsplat(
@@ -489,9 +340,7 @@ def _splat_gsplat(
         from gsplat import rasterization
     except ImportError as error:
         raise InputError("means: on CUDA, where splatting needs the package gsplat (pip install gsplat)") from error
-    backgrounds = (
-        None if background is None else torch.cat([background, background.new_zeros(1)]).expand(len(viewmats), 4)
-    )
+    backgrounds = None if background is None else background.expand(len(viewmats), 3)
     image, alpha, info = rasterization(
         means=gaussians.means,
         quats=gaussians.quats,
