@@ -115,7 +115,7 @@ def read_image(path: Path, *, shape: tuple[int, ...]) -> np.ndarray:
         with Image.open(path) as image:
             if image.width * image.height > MAX_IMAGE_PIXELS:
                 raise InputError(f"{path}: {image.width}x{image.height} is larger than any image of ours")
-            pixels = np.asarray(image)
+            pixels = np.array(image)
     except (OSError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: expected a PNG image of shape {shape} ({error})") from error
     if pixels.shape != shape or pixels.dtype != np.uint8:

@@ -92,7 +92,7 @@ def visible_pixels(
         project_vertices(posed.vertices, viewmat, K), template.faces, width=camera.width, height=camera.height
     )
     projected = project_vertices(positions, viewmat, K)
-    pixels = projected[:, :2].floor().long()
+    pixels = (projected[:, :2] / projected[:, 2:]).floor().long()
     size = torch.tensor([camera.width, camera.height])
     inside = ((pixels >= 0) & (pixels < size)).all(1)
     pixels = pixels.clamp(min=torch.zeros(2, dtype=torch.long), max=size - 1)

@@ -77,9 +77,7 @@ def build_lattice(mesh: TemplateMesh, resolution: int) -> TexelLattice:
     """
     uvs = torch.from_numpy(mesh.uvs)
     pixels = torch.stack([uvs[:, 0] * resolution, (1 - uvs[:, 1]) * resolution, torch.ones_like(uvs[:, 0])], -1)
-    drawn = rasterize_mesh(
-        pixels.float(), torch.from_numpy(mesh.uv_faces), width=resolution, height=resolution, cull=False
-    )
+    drawn = rasterize_mesh(pixels, torch.from_numpy(mesh.uv_faces), width=resolution, height=resolution)
     texels = (drawn.triangle.reshape(-1) >= 0).nonzero().squeeze(1)
     if len(texels) == 0:
         raise InputError(f"the template's atlas covers no texel at resolution {resolution}")

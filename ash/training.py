@@ -78,15 +78,19 @@ def load_training_images(capture: Capture) -> TrainingImages:
         InputError: an image is damaged, or shows nobody.
     """
     views, boxes = {}, {}
-    for camera, frame in capture.splits["train"].views:
+    train = capture.splits["train"]  # An oracle's capture holds the held-out cameras too.
+    for camera, frame in train.views:
         image = capture.image(camera, frame)
         rows, columns = np.nonzero(image[..., 3].any(1))[0], np.nonzero(image[..., 3].any(0))[0]
         if len(rows) == 0:
             raise InputError(f"{capture.folder}: nobody is seen by camera {camera} in frame {frame}")
         views[camera, frame] = image
-        boxes[camera, frame] = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
+        boxes[camera, frame] = (int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
     return TrainingImages(
-        views=views, boxes=boxes, cameras=capture.cameras, frames=tuple(capture.splits["train"].frames)
+        views=views,
+        boxes=boxes,
+        cameras={name: capture.cameras[name] for name in train.cameras},
+        frames=tuple(train.frames),
     )
 
 
@@ -220,7 +224,7 @@ class _Run:
         row = {
             "step": self.step,
             "seconds": round(self._elapsed(), 3),
-            "loss": float(loss),
+            "loss": float(loss.detach()),
             "train_psnr": float(-10 * torch.log10(error)),
         }
         self.log.parent.mkdir(parents=True, exist_ok=True)

@@ -96,7 +96,8 @@ def test_skinning_of_a_rigid_motion_is_that_motion():
 
 
 def test_dual_quaternions_keep_volume_where_linear_blending_loses_it():
-    """Half-way between 0 and 180 degrees about the tube's axis, DQS turns by 90 degrees and LBS collapses to the axis."""
+    """Half-way between 0 and 180 degrees about the tube's axis, DQS turns by 90 degrees and LBS collapses to the
+    axis."""
     skeleton = tube_skeleton()
     dofs = torch.zeros(9, dtype=torch.float64)
     dofs[7] = np.pi * 0.999

@@ -47,14 +47,14 @@ def psnr(avatar, capture, split: str) -> float:
 
 
 def test_known_gaussians_are_recovered_from_their_images(capture, tmp_path):
-    avatar = AshAvatar(config(steps=150, warmup_steps=100), capture)
+    avatar = AshAvatar(config(steps=300, warmup_steps=200, base_learning_rate=5e-2), capture)
     before = psnr(avatar, capture, "novel_view")
     avatar.fit(capture, folder=tmp_path)
-    assert psnr(avatar, capture, "novel_view") > before + 6
-    assert psnr(avatar, capture, "novel_pose") > before + 4
+    assert psnr(avatar, capture, "novel_view") > before + 12
+    assert psnr(avatar, capture, "novel_pose") > before + 12
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert rows[-1]["step"] == 149
-    assert rows[-1]["train_psnr"] > rows[0]["train_psnr"] + 6
+    assert rows[-1]["step"] == 299
+    assert rows[-1]["train_psnr"] > rows[0]["train_psnr"] + 10
 
 
 def test_a_run_stopped_anywhere_ends_with_the_same_bits(capture, tmp_path):

@@ -1,0 +1,72 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from captures import write_tube_capture
+from figures import front_camera, tube_motion
+
+from ash.presets import named
+from ash.protocol import StageClock
+from baselines.ddc import SUPERSAMPLING, DdcAvatar, ddc_config, sample_texture
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
+
+
+def avatar(capture, *, steps: int = 60) -> DdcAvatar:
+    ash = named("ci")
+    small = replace(ash.model, texels=16, width=4, levels=2, window=2)
+    training = replace(ash.training, steps=steps, warmup_steps=steps // 2)
+    return DdcAvatar(ddc_config(replace(ash, model=small, training=training), seed=0, template="skinned"), capture)
+
+
+def test_samples_hit_texture_pixels_where_the_atlas_says():
+    texture = torch.arange(12.0).reshape(1, 3, 4)  # Three rows, the first on top.
+    centres = torch.tensor([[0.125, 1 - 1 / 6], [0.875, 1 - 1 / 6], [0.375, 1 / 6]])
+    torch.testing.assert_close(sample_texture(texture, centres)[:, 0], torch.tensor([0.0, 3.0, 9.0]))
+    between = torch.tensor([[0.25, 1 - 1 / 6]])
+    torch.testing.assert_close(sample_texture(texture, between), torch.tensor([[0.5]]))
+
+
+def test_a_constant_texture_draws_a_flat_silhouette_over_the_background(capture):
+    model = avatar(capture).module
+    posed = model.template.pose(tube_motion(), 0)
+    colour, background = torch.tensor([0.2, 0.5, 0.8]), torch.tensor([1.0, 0.0, 0.0])
+    texture = colour[:, None, None].expand(3, 64, 64)
+    with torch.no_grad():
+        image = model.draw(texture, posed, front_camera(), background)
+    coverage = image[..., 3:]
+    torch.testing.assert_close(image[..., :3], colour * coverage + background * (1 - coverage), atol=1e-6, rtol=0)
+    steps = coverage * SUPERSAMPLING**2
+    assert torch.equal(steps, steps.round())
+    assert ((coverage > 0) & (coverage < 1)).any()
+
+
+def test_gradients_reach_exactly_the_texture_pixels_that_are_seen(capture):
+    model = avatar(capture).module
+    posed = model.template.pose(tube_motion(), 0)
+    texture = torch.full((3, 64, 64), 0.5, requires_grad=True)
+    model.draw(texture, posed, front_camera(), torch.zeros(3))[..., 1].sum().backward()
+    assert texture.grad is not None
+    assert not texture.grad[[0, 2]].any()
+    lit = texture.grad[1] != 0
+    assert 0.3 < lit.float().mean() < 0.7  # The camera sees one half of the tube's unrolled surface.
+
+
+def test_training_improves_held_out_views(capture, tmp_path):
+    made = avatar(capture)
+    before = _error(made, capture)
+    made.fit(capture, folder=tmp_path)
+    assert _error(made, capture) < 0.7 * before
+
+
+def _error(made, capture) -> float:
+    errors = []
+    for camera, frame in capture.splits["novel_view"].views:
+        truth = capture.image(camera, frame).astype(np.float64) / 255
+        drawn = made.render(capture.motion, frame, capture.cameras[camera], clock=StageClock())
+        errors.append(((drawn[..., :3] - truth[..., :3] * truth[..., 3:]) ** 2).mean())
+    return float(np.mean(errors))
