@@ -89,6 +89,7 @@ def train(arguments: argparse.Namespace) -> int:
     """One cell by hand."""
     from ash.dataset import load_capture
     from benchmarks.cells import write_config
+    from benchmarks.engine import plan_cells
     from benchmarks.experiments import CaptureSpec, CellSpec, find_method
     from benchmarks.run import run_cell
     from benchmarks.runs import cell_for, require_intact
@@ -99,6 +100,7 @@ def train(arguments: argparse.Namespace) -> int:
     spec = CaptureSpec(scene=capture.scene, size="as given", seed=int(capture.manifest["seed"]))
     cell_spec = CellSpec(capture=spec, method=arguments.method, preset=arguments.preset, seed=arguments.seed)
     cell = cell_for(cell_spec, arguments.capture, arguments.out)
+    plan_cells([cell], retry_failed=True)
     write_config(cell)
     print(f"training {cell.config.title} in {cell.folder}", file=sys.stderr)
     return _tell(cell.folder, run_cell(cell))

@@ -151,9 +151,9 @@ def package_version() -> str:
 
 def _package_folder(package: str) -> Path:
     spec = find_spec(package)
-    if spec is None or not spec.submodule_search_locations:
+    if spec is None or spec.origin is None:
         raise InputError(f"the package {package} is not importable: install ash-bench again")
-    return Path(next(iter(spec.submodule_search_locations)))
+    return Path(spec.origin).parent  # Not its search locations: an editable install lists an empty folder among them.
 
 
 def _add_files(digest: "hashlib._Hash", root: Path, paths: list[Path]) -> None:

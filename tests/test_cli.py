@@ -253,3 +253,26 @@ def ash_bench(*command: str, preexec_fn=None) -> subprocess.CompletedProcess[str
     return subprocess.run(
         whole, env=environment, capture_output=True, text=True, timeout=60, preexec_fn=preexec_fn, check=False
     )
+
+
+def test_the_code_version_follows_every_deciding_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from benchmarks import experiments
+
+    root = Path(shutil.copytree(Path(experiments.__file__).parent.parent / "ash", tmp_path / "ash"))
+    monkeypatch.setattr(experiments, "_package_folder", lambda package: root)
+    seen = set()
+    for path in (None, root / "avatar.py", root / "native" / "splat.cpp", root / "native" / "project.inc"):
+        if path is not None:
+            path.write_text(path.read_text() + "\n")
+        experiments.code_version.cache_clear()
+        seen.add(experiments.code_version("fake_good"))
+    experiments.code_version.cache_clear()
+    assert len(seen) == 4
+    assert experiments._package_folder("ash") == root
+
+
+def test_the_code_version_reads_the_sources_that_run() -> None:
+    import ash.files
+    from benchmarks.experiments import _package_folder
+
+    assert _package_folder("ash") == Path(ash.files.__file__).parent

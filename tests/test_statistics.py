@@ -74,7 +74,7 @@ def test_false_alarms_and_power_on_our_design() -> None:
     for _ in range(rounds):
         test = welch(list(rng.normal(effect, sigma, 3)), list(rng.normal(0, sigma, 3)))
         found += test.p < 0.05
-    assert 0.7 < found / rounds < 0.88
+    assert 0.65 < found / rounds < 0.88
 
 
 def power_of_80_percent(freedom: int) -> float:
