@@ -151,3 +151,14 @@ def test_torchvision_is_never_imported() -> None:
                 names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
                 names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
                 assert not {name.split(".")[0] for name in names} & {"torchvision", "lpips"}, path
+
+
+@pytest.mark.parametrize("document", ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md"])
+def test_documents_name_files_and_verbs_that_exist(document: str) -> None:
+    text = (ROOT / document).read_text()
+    named = set(re.findall(r"\b(?:ash|synth|baselines|benchmarks|tests|docs|reports)/[\w/.-]*[\w/]", text))
+    named |= set(re.findall(r"\]\((?!https?:)([^)#]+)\)", text))
+    assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
+    verbs = set(re.findall(r"\./ash-bench ([a-z]+)", text))
+    known = set(re.findall(r'_verb\(verbs, \w+, "([a-z]+)"', (ROOT / "benchmarks" / "cli.py").read_text()))
+    assert verbs <= known
