@@ -129,7 +129,7 @@ class DdcModel(nn.Module):
         return image.mean((1, 3))
 
 
-def sample_texture(texture: Float[Tensor, "c t t"], uvs: Float[Tensor, "n 2"]) -> Float[Tensor, "n c"]:
+def sample_texture(texture: Float[Tensor, "c t s"], uvs: Float[Tensor, "n 2"]) -> Float[Tensor, "n c"]:
     """Bilinear samples at UVs in [0, 1], v up; differentiable in the texture and the UVs."""
     grid = torch.stack([2 * uvs[:, 0] - 1, 1 - 2 * uvs[:, 1]], -1)[None, None]
     sampled = nn.functional.grid_sample(texture[None], grid, padding_mode="border", align_corners=False)
