@@ -64,16 +64,14 @@ METRICS = {
             key="noise_ceiling", title="noise ceiling", unit="dB", direction="none", worst=0.0, decimals=1, abs_tol=0.1
         ),
         Metric(key="frame_ms", title="frame", unit="ms", direction="down", worst=1e6, decimals=1, abs_tol=0.0),
-        Metric(key="stg1_ms", title="Stg.1 template", unit="ms", direction="down", worst=1e6, decimals=1, abs_tol=0.0),
-        Metric(key="stg2_ms", title="Stg.2 textures", unit="ms", direction="down", worst=1e6, decimals=1, abs_tol=0.0),
-        Metric(key="stg3_ms", title="Stg.3 decoders", unit="ms", direction="down", worst=1e6, decimals=1, abs_tol=0.0),
-        Metric(
-            key="stg4_ms", title="Stg.4 skin, draw", unit="ms", direction="down", worst=1e6, decimals=1, abs_tol=0.0
-        ),
+        Metric(key="stg1_ms", title="Stg.1", unit="ms", direction="down", worst=1e6, decimals=1, abs_tol=0.0),
+        Metric(key="stg2_ms", title="Stg.2", unit="ms", direction="down", worst=1e6, decimals=1, abs_tol=0.0),
+        Metric(key="stg3_ms", title="Stg.3", unit="ms", direction="down", worst=1e6, decimals=1, abs_tol=0.0),
+        Metric(key="stg4_ms", title="Stg.4", unit="ms", direction="down", worst=1e6, decimals=1, abs_tol=0.0),
         Metric(key="train_s", title="training", unit="s", direction="down", worst=1e6, decimals=0, abs_tol=0.0),
         Metric(key="params", title="parameters", unit="", direction="down", worst=1e12, decimals=0, abs_tol=0.0),
         Metric(key="gaussians", title="Gaussians", unit="", direction="down", worst=1e12, decimals=0, abs_tol=0.0),
-        Metric(key="peak_rss_mb", title="peak memory", unit="MB", direction="down", worst=1e6, decimals=0, abs_tol=0.0),
+        Metric(key="peak_rss_mb", title="memory", unit="MB", direction="down", worst=1e6, decimals=0, abs_tol=0.0),
         Metric(key="failed", title="failed", unit="", direction="down", worst=1.0, decimals=0, abs_tol=0.0),
     )
 }

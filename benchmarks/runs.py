@@ -1,5 +1,6 @@
 """A run: a suite's captures, then its cells, then what they came to, all in one folder."""
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ from ash.files import InputError, read_json, write_json
 from benchmarks.cells import Cell, CellConfig, CellResult, read_cell, read_result
 from benchmarks.engine import Limits, make_executor, plan_cells, run_cells, shard_of
 from benchmarks.experiments import CaptureSpec, CellSpec, Suite, code_version, find_method
+from benchmarks.locks import only_run_in
 from benchmarks.metrics import PROTOCOL
 from benchmarks.progress import Progress
 
@@ -44,6 +46,11 @@ def run_suite(suite: Suite, options: RunOptions) -> Run:
     for method in suite.methods:
         find_method(method)
     options.out.mkdir(parents=True, exist_ok=True)
+    with contextlib.nullcontext() if options.shard else only_run_in(options.out):
+        return _run_suite(suite, options)
+
+
+def _run_suite(suite: Suite, options: RunOptions) -> Run:
     folders = {spec: make_capture(spec, options.data, workers=options.workers) for spec in suite.captures}
     for folder in folders.values():
         require_intact(folder)

@@ -165,9 +165,16 @@ def _entry(scores: Scores, scene: str, method: str, column: Column) -> Entry:
         return Entry(text="failed", sort=None if score is None else score.mean)
     if score is None:
         return Entry(text="n/a")
-    text = f"{score.mean:,.{measure.decimals}f}".replace(",", "\u2009")
+    text = _number(score.mean, measure)
     spread = "" if score.half_width is None or measure.decimals == 0 else f"{score.half_width:.{measure.decimals}f}"
     return Entry(text=text, spread=spread, sort=score.mean)
+
+
+def _number(value: float, measure: Metric) -> str:
+    """Counts in thousands or millions with three digits, everything else with the metric's decimals."""
+    if measure.key in ("params", "gaussians") and value >= 1e4:
+        return f"{value / 1e6:.3g}M" if value >= 1e6 else f"{value / 1e3:.3g}k"
+    return f"{value:.{measure.decimals}f}"
 
 
 def _marked(table: Table) -> Table:

@@ -276,3 +276,13 @@ def test_the_code_version_reads_the_sources_that_run() -> None:
     from benchmarks.experiments import _package_folder
 
     assert _package_folder("ash") == Path(ash.files.__file__).parent
+
+
+def test_two_runs_in_one_folder_do_not_meet(boxes: None, tmp_path: Path, capsys) -> None:
+    from benchmarks.locks import only_run_in
+
+    (tmp_path / "run").mkdir()
+    with only_run_in(tmp_path / "run"):
+        assert "another ash-bench is at work there" in refused(
+            capsys, "run", "boxes", "--out", str(tmp_path / "run"), "--data", str(tmp_path / "data")
+        )

@@ -1,0 +1,49 @@
+"""The suite `ci`, for real: a capture is rendered, methods are trained, and the numbers are those of working parts."""
+
+import pytest
+
+from benchmarks import cli
+from benchmarks.experiments import SUITES
+from benchmarks.runs import read_run, results_of
+from benchmarks.scores import Scores
+
+
+@pytest.fixture(scope="module")
+def scores(tmp_path_factory: pytest.TempPathFactory) -> Scores:
+    folder = tmp_path_factory.mktemp("ci")
+    command = ["run", "ci", "--out", str(folder / "run"), "--data", str(folder / "data")]
+    assert cli.main(command) == cli.DONE
+    assert (folder / "run" / "report.html").stat().st_size > 100_000
+    return Scores(results_of(read_run(folder / "run")))
+
+
+def test_every_method_of_the_suite_came_through(scores: Scores) -> None:
+    assert scores.methods("mannequin") == SUITES["ci"].methods
+    assert all(result.status == "done" for result in scores.results)
+
+
+@pytest.mark.parametrize("split", ["novel_view", "novel_pose"])
+@pytest.mark.parametrize(
+    ("method", "least_psnr", "least_iou"),
+    [("ash", 16.0, 0.9), ("ddc", 17.0, 0.9), ("ash_truth", 17.0, 0.95), ("ddc_truth", 20.5, 0.96)],
+)
+def test_quality_is_what_working_parts_reach(
+    scores: Scores, method: str, split: str, least_psnr: float, least_iou: float
+) -> None:
+    psnr, iou = scores.fg("mannequin", method, split), scores.get("mannequin", method, split, "full", "iou")
+    assert psnr is not None and psnr.mean > least_psnr
+    assert iou is not None and iou.mean > least_iou
+
+
+def test_an_oracle_has_no_template_error_and_the_others_have_an_honest_one(scores: Scores) -> None:
+    errors = {m: scores.get("mannequin", m, "novel_pose", "", "template_mm") for m in scores.methods("mannequin")}
+    assert errors["ash_truth"].mean < 0.01 and errors["ddc_truth"].mean < 0.01
+    assert 1 < errors["ash"].mean < 30
+
+
+def test_every_stage_is_timed_and_they_add_up_to_the_frame(scores: Scores) -> None:
+    for method in ("ash", "ddc"):
+        stages = [scores.get("mannequin", method, "speed", "", f"stg{i}_ms") for i in range(1, 5)]
+        whole = scores.get("mannequin", method, "speed", "", "frame_ms")
+        assert all(stage is not None for stage in stages)
+        assert sum(stage.mean for stage in stages) == pytest.approx(whole.mean, rel=0.25)
