@@ -1,7 +1,6 @@
 """The ASH avatar, in the paper's order: template, textures, decoders, skinning, splatting. START READING HERE."""
 
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -9,42 +8,41 @@ from torch import Tensor, nn
 
 from ash.config import ModelConfig
 from ash.dataset import Camera, Motion
-from ash.decoders import GEOMETRY_CHANNELS, Decoders
+from ash.decoders import GEOMETRY_CHANNELS
 from ash.gaussians import Gaussians
 from ash.harmonics import SH_C0, rotate_sh, sh_basis
 from ash.protocol import StageClock
-from ash.skinning import RigidTransforms, quat_multiply
+from ash.skinning import quat_multiply
 from ash.splatting import Splatted, splat
 from ash.template import Template
-from ash.textures import TexelLattice, motion_aware_textures
+from ash.textures import Conditions, TexelLattice, motion_aware_textures, normalised_motion
 
 # Metres per unit of a decoder's output: offsets are centimetres, so that all outputs are of order one.
 OFFSET_UNIT = 0.01
 LIGHT_COEFFICIENTS = 9
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Conditions:
-    """What Stg.1 and Stg.2 hand to the decoders for one frame; nothing in it is learned with the avatar."""
-
-    textures: Float[Tensor, "c r r"]
-    root_translation: Float[Tensor, " 3"]  # metres
-    canonical: Float[Tensor, "n 3"]  # texel positions on the canonical template, Eq. 4
-    normals: Float[Tensor, "n 3"]  # unit, world
-    transforms: RigidTransforms  # texel-wise T of Eq. 5
-
-
 class AshModel(nn.Module):
     """The learned part of ASH, and how the stages are joined. `base` and `light` are not in the paper."""
 
-    def __init__(self, config: ModelConfig, template: Template, lattice: TexelLattice, initial: Tensor) -> None:
-        """`initial`: raw parameters `[n, o]` per texel that the decoders start from (see `ash.initialising`)."""
+    def __init__(
+        self,
+        config: ModelConfig,
+        template: Template,
+        lattice: TexelLattice,
+        initial: Float[Tensor, "n o"],
+        decoders: nn.Module | None,
+    ) -> None:
+        """`initial`: raw parameters per texel, to which the decoders add theirs; no decoders: they are all there is.
+
+        Decoders map `Conditions` to `[n, o]`; those of the paper are `ash.decoders.Decoders`.
+        """
         super().__init__()
         self.config = config
         self.template = template
         self.lattice = lattice
         self.base = nn.Parameter(initial.clone(), requires_grad=config.base)
-        self.decoders = Decoders(config) if config.motion else None
+        self.decoders = decoders
         self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.light else None
 
     def conditions(self, motion: Motion, frame: int, clock: StageClock | None = None) -> Conditions:
@@ -54,6 +52,7 @@ class AshModel(nn.Module):
         with _stage(clock, "stg2"):
             return Conditions(
                 textures=self._textures(motion, frame),
+                motion=normalised_motion(motion, frame, window=self.config.window),
                 root_translation=torch.from_numpy(motion.dofs[frame, :3]).float(),
                 canonical=self.lattice.interpolate(posed.canonical),
                 normals=nn.functional.normalize(self.lattice.interpolate(posed.normals), dim=-1),
@@ -76,8 +75,7 @@ class AshModel(nn.Module):
         """Stg.3: raw Gaussian parameters per texel. `static` leaves the decoders out (the warm-up of the base)."""
         if self.decoders is None or static:
             return self.base
-        residual = self.lattice.from_texture(self.decoders(conditions.textures, conditions.root_translation))
-        return self.base + residual
+        return self.base + self.decoders(conditions)
 
     def pose(self, raw: Float[Tensor, "n o"], conditions: Conditions) -> Gaussians:
         """Activate the raw parameters and carry them from canonical to posed space (Eq. 5)."""

@@ -59,12 +59,15 @@ class TrainingConfig:
     learning_rate: float  # of the networks
     base_learning_rate: float = 1e-2  # of the static texels
     background: str = "random"  # "random": a new colour every step, so that opacity is learned; "black": the paper's
+    camera_share: float = 1.0  # of the training cameras, evenly spread
     checkpoint_seconds: float = 60.0
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
         one_of("warmup", self.warmup, ("static", "analytic", "fitted", "none"))
         one_of("background", self.background, ("random", "black"))
+        if not 0 < self.camera_share <= 1:
+            raise InputError(f"camera_share: expected more than 0 and at most 1, got {self.camera_share}")
         if self.steps < 1 or self.views_per_step < 1 or not 0 <= self.warmup_steps <= self.steps:
             raise InputError("expected steps >= 1, views_per_step >= 1 and 0 <= warmup_steps <= steps")
 

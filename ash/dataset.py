@@ -141,6 +141,21 @@ class Capture:
         return replace(self, splits={"train": train}, cameras=cameras, motion=motion)
 
 
+def fewer_cameras(capture: Capture, share: float) -> Capture:
+    """The capture with an evenly spread share (0..1] of its training cameras, at least one; other splits keep theirs.
+
+    Cameras are added one by one, each the farthest from those chosen so far, so that a smaller share is a part of a larger.
+    """
+    train = capture.splits["train"]
+    positions = np.stack([capture.cameras[name].position for name in train.cameras])
+    chosen = [0]
+    for _ in range(max(1, round(share * len(positions))) - 1):
+        distance = np.linalg.norm(positions[:, None] - positions[chosen], axis=-1).min(1)
+        chosen.append(int(distance.argmax()))
+    names = tuple(train.cameras[index] for index in sorted(chosen))
+    return replace(capture, splits=capture.splits | {"train": replace(train, cameras=names)})
+
+
 def image_path(folder: Path, camera: str, frame: int) -> Path:
     """Where the image of a view lies."""
     return folder / "frames" / camera / f"{frame:06d}.png"
@@ -281,7 +296,7 @@ def read_template_truth(capture: Capture) -> np.ndarray:
 
 
 def read_surface_truth(capture: Capture, frame: int) -> np.ndarray:
-    """Vertices of the rendered surface in a frame, `[s, 3]` metres: what a lab's per-frame reconstruction stands for."""
+    """Vertices of the rendered surface in a frame, `[s, 3]` metres: what a lab would reconstruct per frame."""
     path = surface_path(capture.folder, frame)
     vertices = read_arrays(path, expected=("vertices",))["vertices"]
     _require(path, {"vertices [s, 3]": vertices.ndim == 2 and vertices.shape[1] == 3 and len(vertices) > 0})

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ash.config import ModelConfig
+from ash.textures import Conditions, TexelLattice
 
 GEOMETRY_CHANNELS = 11  # offset 3, log-scale 3, quaternion 4, opacity logit 1
 GLOBAL_FEATURES = 16
@@ -77,19 +78,21 @@ class GlobalFeatures(nn.Module):
         return self.mlp(torch.cat([translation, angles.sin().flatten(), angles.cos().flatten()]))
 
 
+def raw_channels(config: ModelConfig) -> int:
+    """Raw parameters per Gaussian: `GEOMETRY_CHANNELS`, then rgb for each spherical harmonic."""
+    return GEOMETRY_CHANNELS + 3 * (config.sh_degree + 1) ** 2
+
+
 class Decoders(nn.Module):
-    """E_geo and E_app: motion-aware textures and Phi to a texture of raw Gaussian parameters.
+    """E_geo and E_app: motion-aware textures and Phi to the raw parameters of every texel's Gaussian."""
 
-    Output channels: `GEOMETRY_CHANNELS`, then 3 per spherical harmonic (coefficient-major, rgb inside).
-    """
-
-    def __init__(self, config: ModelConfig) -> None:
+    def __init__(self, config: ModelConfig, lattice: TexelLattice) -> None:
         super().__init__()
+        self.lattice = lattice
         self.half_resolution = config.half_resolution
-        appearance = 3 * (config.sh_degree + 1) ** 2
         features = GLOBAL_FEATURES if config.global_features else 0
         shuffle = 4 if config.half_resolution else 1
-        outputs = [GEOMETRY_CHANNELS, appearance]
+        outputs = [GEOMETRY_CHANNELS, raw_channels(config) - GEOMETRY_CHANNELS]
         if config.shared_trunk:
             outputs = [sum(outputs)]
         phi_inputs = [0] * (len(outputs) - 1) + [features]  # E_geo does not see Phi, unless the trunk is shared.
@@ -106,15 +109,13 @@ class Decoders(nn.Module):
         )
         self.phi = GlobalFeatures() if config.global_features else None
 
-    def forward(
-        self, textures: Float[Tensor, "c r r"], root_translation: Float[Tensor, " 3"]
-    ) -> Float[Tensor, "o r r"]:
+    def forward(self, conditions: Conditions) -> Float[Tensor, "n o"]:
         """Decode one frame."""
-        x = textures[None].contiguous(memory_format=torch.channels_last)
+        x = conditions.textures[None].contiguous(memory_format=torch.channels_last)
         if self.half_resolution:
             x = nn.functional.avg_pool2d(x, 2)
-        phi = self.phi(root_translation) if self.phi is not None else None
+        phi = self.phi(conditions.root_translation) if self.phi is not None else None
         decoded = [net(x) for net in self.nets[:-1]] + [self.nets[-1](x, phi)]
         if self.half_resolution:
             decoded = [nn.functional.pixel_shuffle(part, 2) for part in decoded]
-        return torch.cat(decoded, 1)[0]
+        return self.lattice.from_texture(torch.cat(decoded, 1)[0])

@@ -1,7 +1,7 @@
 """The learned deformation of Stg.1: graph convolutions from the motion window to the embedded graph and displacements.
 
-ASH appendix A and Habermann et al. 2021 (DDC). Trained on its own and then frozen: the Gaussians and the mesh baseline both
-stand on it.
+ASH appendix A and Habermann et al. 2021 (DDC). Trained on its own and then frozen: the Gaussians and the mesh
+baseline both stand on it.
 """
 
 from dataclasses import dataclass
@@ -80,7 +80,7 @@ class GraphNet(nn.Module):
 class LearnedDeformation(nn.Module):
     """Motion window -> embedded graph (angles, translations) and displacements -> canonical vertices (Eq. 10).
 
-    Both networks also see where on the body they are: the rest positions, because their weights are shared by all nodes.
+    Both networks also see the rest positions: their weights are shared by all nodes, which must know where they are.
     """
 
     def __init__(self, config: DeformationConfig, mesh: TemplateMesh, skeleton: Skeleton) -> None:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ash.config import ModelConfig
 from ash.dataset import Camera, Capture
+from ash.decoders import raw_channels
 from ash.harmonics import SH_C0
 from ash.rasterizing import project_vertices, rasterize_mesh
 from ash.skinning import rotmat_to_unitquat
@@ -26,7 +27,7 @@ def blank_gaussians(config: ModelConfig, count: int, pitch: float) -> Float[Tens
 
     Grey, round, of one texel pitch (metres), opacity 0.1 (Kerbl et al.), no offset.
     """
-    raw = torch.zeros(count, 11 + 3 * (config.sh_degree + 1) ** 2)
+    raw = torch.zeros(count, raw_channels(config))
     raw[:, 3:6] = math.log(DISC_SCALE * pitch)
     raw[:, 6] = 1.0
     raw[:, 10] = _logit(0.1)
@@ -62,7 +63,7 @@ def texel_pitch(lattice: TexelLattice, vertices: Float[Tensor, "v 3"]) -> Float[
 def mean_colours(capture: Capture, template: Template, lattice: TexelLattice) -> Float[Tensor, "n 3"]:
     """Mean training pixel of every texel, over a few frames and all training cameras.
 
-    Views count by how squarely they see the texel. Texels that no camera sees take the mean colour of those that are seen.
+    Views count by how squarely they see the texel. Unseen texels take the mean colour of the seen.
     """
     frames = capture.splits["train"].frames
     chosen = frames[:: max(1, len(frames) // COLOUR_FRAMES)]

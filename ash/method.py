@@ -1,5 +1,6 @@
 """ASH as a method of the suite: builds the model from a capture, warms it up, trains it, renders with it."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,31 +10,36 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from ash.avatar import AshModel, Conditions
-from ash.config import AshConfig
-from ash.dataset import Camera, Capture, Motion, read_template_truth
+from ash.avatar import AshModel
+from ash.config import AshConfig, ModelConfig
+from ash.dataset import Camera, Capture, Motion, fewer_cameras, read_template_truth
+from ash.decoders import Decoders
 from ash.files import write_atomic
 from ash.initialising import blank_gaussians, initial_gaussians, texel_pitch
 from ash.protocol import StageClock
 from ash.template import Template, exact_template, skinned_template
-from ash.textures import build_lattice
+from ash.textures import Conditions, TexelLattice, build_lattice
 from ash.training import TrainingImages, draw_batch, fit, load_module, load_training_images, read_safetensors, view_loss
 
 WARMUP_OPACITY_WEIGHT = 0.1  # As in the release.
 FITTED_FRAMES = 4
 FITTED_STEPS = 100
 
+MakeDecoders = Callable[[ModelConfig, TexelLattice], torch.nn.Module]
+
 
 class AshAvatar:
     """The Avatar protocol (see `ash.protocol`) for ASH and for every ablation that is a configuration of it."""
 
-    def __init__(self, config: AshConfig, capture: Capture) -> None:
+    def __init__(self, config: AshConfig, capture: Capture, *, make_decoders: MakeDecoders = Decoders) -> None:
         torch.manual_seed(config.seed)
+        capture = fewer_cameras(capture, config.training.camera_share)
         self.config = config
         self.template = template_of(config.template, capture)
         self.lattice = build_lattice(capture.template, config.model.texels)
         self.analytic = initial_gaussians(config.model, capture, self.template, self.lattice)
-        self.module = AshModel(config.model, self.template, self.lattice, self._start(capture))
+        decoders = make_decoders(config.model, self.lattice) if config.model.motion else None
+        self.module = AshModel(config.model, self.template, self.lattice, self._start(capture), decoders)
         self._conditions: dict[int, Conditions] = {}
         self._motion = capture.motion
 
@@ -46,7 +52,7 @@ class AshAvatar:
 
     def fit(self, capture: Capture, *, folder: Path) -> None:
         """Warm up and train; see `ash.training.fit`."""
-        images = load_training_images(capture)
+        images = load_training_images(fewer_cameras(capture, self.config.training.camera_share))
         fit(
             self,
             images,

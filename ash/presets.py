@@ -64,17 +64,3 @@ def ash(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
 def ash_truth(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
     """ASH on the exact surface: an oracle, to see what the template's error costs."""
     return AshAvatar(replace(named(preset), seed=seed, template="exact"), capture)
-
-
-def wo_disp(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """The paper's ablation w/o disp.: no learned canonical offset."""
-    config = named(preset)
-    return AshAvatar(replace(config, seed=seed, model=replace(config.model, offset=False)), capture)
-
-
-def wo_mot(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """The paper's ablation w/o mot.: one set of Gaussians, skinned only."""
-    config = named(preset)
-    model = replace(config.model, motion=False, base=True)
-    training = replace(config.training, warmup="none", warmup_steps=0)
-    return AshAvatar(replace(config, seed=seed, model=model, training=training), capture)

@@ -67,6 +67,14 @@ def rotvec_to_unitquat(r: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 4"]:
     return torch.cat([cosine, r * half_sinc], dim=-1)
 
 
+def unitquat_to_rotvec(q: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3"]:
+    """Unit quaternion to the rotation vector (radians) of at most half a turn."""
+    q = torch.where(q[..., :1] < 0, -q, q)
+    sine = q[..., 1:].norm(dim=-1, keepdim=True)
+    angle = 2 * torch.atan2(sine, q[..., :1])
+    return q[..., 1:] * torch.where(sine < 1e-9, torch.full_like(sine, 2.0), angle / sine.clamp(min=1e-9))
+
+
 def unitquat_to_rotmat(q: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:
     """Unit quaternion to rotation matrix."""
     w, x, y, z = q.unbind(-1)
@@ -160,6 +168,7 @@ def linear_blend_skinning(
 
 
 def root_yaw(dofs: Float[Tensor, " d"]) -> Float[Tensor, ""]:
-    """Heading of the root about the vertical (y) axis, radians: where its forward axis (+z) points in the floor plane."""
+    """Heading of the root about the vertical (y) axis, radians: where its forward axis (+z) points in the floor
+    plane."""
     forward = rotate(rotvec_to_unitquat(dofs[3:6]), dofs.new_tensor([0.0, 0.0, 1.0]))
     return torch.atan2(forward[0], forward[2])

@@ -9,7 +9,14 @@ from torch import Tensor
 from ash.dataset import Motion, TemplateMesh
 from ash.files import InputError
 from ash.rasterizing import rasterize_mesh
-from ash.skinning import RigidTransforms, root_yaw, rotate, rotvec_to_unitquat
+from ash.skinning import (
+    RigidTransforms,
+    quat_multiply,
+    root_yaw,
+    rotate,
+    rotvec_to_unitquat,
+    unitquat_to_rotvec,
+)
 from ash.template import PosedTemplate, Template
 
 
@@ -90,6 +97,32 @@ def build_lattice(mesh: TemplateMesh, resolution: int) -> TexelLattice:
     )
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Conditions:
+    """What Stg.1 and Stg.2 hand to the decoders for one frame; nothing in it is learned with the avatar."""
+
+    textures: Float[Tensor, "c r r"]  # motion-aware textures
+    motion: Float[Tensor, "k d"]  # the normalised motion window, newest frame first
+    root_translation: Float[Tensor, " 3"]  # metres
+    canonical: Float[Tensor, "n 3"]  # texel positions on the canonical template, Eq. 4
+    normals: Float[Tensor, "n 3"]  # unit, world
+    transforms: RigidTransforms  # texel-wise T of Eq. 5
+
+
+@torch.no_grad()
+def normalised_motion(motion: Motion, frame: int, *, window: int) -> Float[Tensor, "k d"]:
+    """Degrees of freedom of a window of frames, newest first, without where the newest stands and faces (ASH Sec. 3.1).
+
+    Root translations become R_y(-yaw) (t_k - t_f), and root rotations are turned by -yaw, as in the release.
+    """
+    dofs = torch.from_numpy(motion.dofs[motion.window(frame, window)])
+    yaw = root_yaw(dofs[0])
+    unturn = _about_y(-yaw).expand(len(dofs), 4)
+    translation = rotate(unturn, dofs[:, :3] - dofs[0, :3])
+    root = quat_multiply(unturn, rotvec_to_unitquat(dofs[:, 3:6]))
+    return torch.cat([translation, unitquat_to_rotvec(root), dofs[:, 6:]], dim=1).float()
+
+
 @torch.no_grad()
 def motion_aware_textures(
     template: Template, lattice: TexelLattice, motion: Motion, frame: int, *, window: int, yaw_normalise: bool
@@ -101,8 +134,7 @@ def motion_aware_textures(
     """
     dofs = torch.from_numpy(motion.dofs[frame]).float()
     root = dofs[:3] + torch.from_numpy(template.skeleton.heads[0]).float()
-    yaw = root_yaw(dofs) if yaw_normalise else torch.zeros(())
-    unturn = rotvec_to_unitquat(torch.stack([torch.zeros(()), -yaw, torch.zeros(())]))
+    unturn = _about_y(-root_yaw(dofs) if yaw_normalise else torch.zeros(()))
     posed = [template.pose(motion, int(past)) for past in motion.window(frame, window)]
     channels = torch.cat([_in_root_frame(p, root, unturn) for p in posed], dim=-1)
     return lattice.to_texture(lattice.interpolate(channels))
@@ -111,3 +143,8 @@ def motion_aware_textures(
 def _in_root_frame(posed: PosedTemplate, root: Tensor, unturn: Tensor) -> Float[Tensor, "v 6"]:
     turn = unturn.expand(len(posed.vertices), 4)
     return torch.cat([rotate(turn, posed.normals), rotate(turn, posed.vertices - root)], dim=-1)
+
+
+def _about_y(angle: Float[Tensor, ""]) -> Float[Tensor, " 4"]:
+    zero = torch.zeros_like(angle)
+    return rotvec_to_unitquat(torch.stack([zero, angle, zero]))

@@ -1,7 +1,7 @@
 """Training the deformable template (Stg.1), before and apart from the avatar.
 
-Supervision is either exact ("vertices": an oracle, correspondences known) or what a lab has ("chamfer": a surface per frame,
-no correspondences; UMA, the successor of ASH, states this loss).
+Supervision is either exact ("vertices": an oracle, correspondences known) or what a lab has ("chamfer": a surface
+per frame, no correspondences; UMA, the successor of ASH, states this loss).
 """
 
 from collections.abc import Callable

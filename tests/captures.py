@@ -50,7 +50,7 @@ def known_model() -> AshModel:
     raw = blank_gaussians(config, len(lattice.texels), 0.06)
     raw[:, 10] = 3.0
     raw[:, 11:14] = torch.randn(len(raw), 3, generator=torch.Generator().manual_seed(1))
-    return AshModel(config, template, lattice, raw)
+    return AshModel(config, template, lattice, raw, None)
 
 
 def write_tube_capture(folder: Path) -> Capture:

@@ -8,6 +8,7 @@ from figures import front_camera, tube_mesh, tube_motion, tube_skeleton
 
 from ash.avatar import AshModel, split_raw
 from ash.config import AshConfig, ModelConfig, TrainingConfig
+from ash.decoders import Decoders
 from ash.files import InputError
 from ash.harmonics import SH_C0, sh_basis
 from ash.initialising import blank_gaussians, texel_pitch
@@ -23,11 +24,10 @@ def model(**changes) -> AshModel:
     template = Template(tube_mesh(), tube_skeleton(), RestDeformation(tube_mesh()))
     lattice = build_lattice(tube_mesh(), config.texels)
     raw = blank_gaussians(config, len(lattice.texels), 0.05)
-    made = AshModel(config, template, lattice, raw + 0.1 * torch.randn_like(raw))
-    if made.decoders is not None:
-        for net in made.decoders.nets:
-            torch.nn.init.normal_(net.head.weight, std=0.1)
-    return made
+    decoders = Decoders(config, lattice) if config.motion else None
+    for net in decoders.nets if decoders is not None else ():
+        torch.nn.init.normal_(net.head.weight, std=0.1)
+    return AshModel(config, template, lattice, raw + 0.1 * torch.randn_like(raw), decoders)
 
 
 def test_eq_5_the_offset_is_added_before_posing():

@@ -4,9 +4,10 @@ import zipfile
 
 import numpy as np
 import pytest
-from figures import front_camera, tube_mesh, tube_motion, tube_skeleton
+from figures import front_camera, ring_cameras, tube_mesh, tube_motion, tube_skeleton
 
 from ash.dataset import (
+    fewer_cameras,
     image_path,
     load_capture,
     read_cameras,
@@ -179,3 +180,23 @@ def test_windows_stop_at_the_start_of_their_sequence():
 def test_a_capture_moves_with_its_folder(capture_folder, tmp_path):
     moved = shutil.copytree(capture_folder, tmp_path / "elsewhere")
     assert load_capture(moved).identity == load_capture(capture_folder).identity
+
+
+def test_fewer_cameras_are_evenly_spread_and_nested(tmp_path):
+    folder = tmp_path / "capture"
+    cameras = ring_cameras(12, 16)
+    write_cameras(folder / "cameras.json", cameras)
+    write_skeleton(folder / "skeleton.json", tube_skeleton())
+    write_template(folder / "template.npz", tube_mesh())
+    write_motion(folder / "motion.npz", tube_motion(2))
+    seal(folder, splits={"train": {"cameras": [c.name for c in cameras], "frames": [0]}})
+    capture = load_capture(folder)
+    quarter = fewer_cameras(capture, 0.25).splits["train"].cameras
+    half = fewer_cameras(capture, 0.5).splits["train"].cameras
+    assert len(quarter) == 3 and len(half) == 6
+    assert set(quarter) < set(half)
+    numbers = sorted(int(name[3:]) for name in half)
+    gaps = np.diff([*numbers, numbers[0] + 12])
+    assert gaps.max() <= 3  # Six of twelve on a ring: never more than three steps apart.
+    assert fewer_cameras(capture, 1.0).splits["train"].cameras == capture.splits["train"].cameras
+    assert len(fewer_cameras(capture, 0.01).splits["train"].cameras) == 1

@@ -1,7 +1,12 @@
+from dataclasses import replace
+
 import torch
+from figures import tube_mesh
 
 from ash.config import ModelConfig
 from ash.decoders import Decoders, UNet
+from ash.skinning import RigidTransforms
+from ash.textures import Conditions, build_lattice
 
 
 def config(**changes) -> ModelConfig:
@@ -9,9 +14,24 @@ def config(**changes) -> ModelConfig:
     return ModelConfig(**settings)
 
 
+LATTICE = build_lattice(tube_mesh(), 16)
+
+
+def conditions(textures: torch.Tensor) -> Conditions:
+    nothing = torch.zeros(0, 3)
+    return Conditions(
+        textures=textures,
+        motion=torch.zeros(2, 9),
+        root_translation=torch.zeros(3),
+        canonical=nothing,
+        normals=nothing,
+        transforms=RigidTransforms(quats=torch.zeros(0, 4), translations=nothing),
+    )
+
+
 def test_untrained_decoders_return_zero_so_that_training_starts_from_the_initial_gaussians():
-    decoded = Decoders(config())(torch.randn(12, 16, 16), torch.zeros(3))
-    assert decoded.shape == (11 + 12, 16, 16)
+    decoded = Decoders(config(), LATTICE)(conditions(torch.randn(12, 16, 16)))
+    assert decoded.shape == (len(LATTICE.texels), 11 + 12)
     assert not decoded.any()
 
 
@@ -26,18 +46,18 @@ def test_official_width_has_the_published_number_of_parameters():
 
 def test_every_parameter_learns_once_the_heads_have_moved():
     for changes in ({}, {"shared_trunk": True}, {"half_resolution": True, "shared_trunk": True}, {"norm": "none"}):
-        decoders = Decoders(config(**changes))
+        decoders = Decoders(config(**changes), LATTICE)
         for net in decoders.nets:
             torch.nn.init.normal_(net.head.weight)
-        decoders(torch.randn(12, 16, 16), torch.ones(3)).square().sum().backward()
+        decoders(conditions(torch.randn(12, 16, 16))).square().sum().backward()
         assert all(p.grad is not None and p.grad.any() for p in decoders.parameters()), changes
 
 
 def test_global_features_reach_appearance_alone():
-    decoders = Decoders(config())
+    decoders = Decoders(config(), LATTICE)
     for net in decoders.nets:
         torch.nn.init.normal_(net.head.weight)
-    textures = torch.randn(12, 16, 16)
-    here, there = decoders(textures, torch.zeros(3)), decoders(textures, torch.tensor([1.0, 0.0, 2.0]))
-    assert torch.equal(here[:11], there[:11])
-    assert not torch.allclose(here[11:], there[11:])
+    here = conditions(torch.randn(12, 16, 16))
+    there = replace(here, root_translation=torch.tensor([1.0, 0.0, 2.0]))
+    assert torch.equal(decoders(here)[:, :11], decoders(there)[:, :11])
+    assert not torch.allclose(decoders(here)[:, 11:], decoders(there)[:, 11:])

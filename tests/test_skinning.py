@@ -17,6 +17,7 @@ from ash.skinning import (
     rotvec_to_unitquat,
     sparse_skin_weights,
     unitquat_to_rotmat,
+    unitquat_to_rotvec,
 )
 
 
@@ -46,6 +47,7 @@ def test_rotation_vectors_agree_with_scipy_at_every_size(scale):
     r = scale * torch.nn.functional.normalize(torch.randn(20, 3, dtype=torch.float64), dim=-1)
     expected = Rotation.from_rotvec(r.numpy()).as_matrix()
     np.testing.assert_allclose(unitquat_to_rotmat(rotvec_to_unitquat(r)).numpy(), expected, atol=1e-12)
+    torch.testing.assert_close(unitquat_to_rotvec(-rotvec_to_unitquat(r)).abs(), r.abs(), atol=1e-9, rtol=1e-9)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-6, 0.7])

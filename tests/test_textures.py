@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from ash.dataset import Motion
 from ash.skinning import RigidTransforms, rotvec_to_unitquat
 from ash.template import RestDeformation, Template
-from ash.textures import build_lattice, motion_aware_textures
+from ash.textures import build_lattice, motion_aware_textures, normalised_motion
 
 RESOLUTION = 16
 
@@ -64,7 +64,7 @@ def test_texel_transforms_of_a_rigid_motion_are_that_motion():
 
 
 def test_posed_texels_are_close_to_the_posed_surface(template):
-    """Eq. 5 carries a texel; interpolating posed vertices is the other way. They agree up to the bend of one triangle."""
+    """Carrying a texel (Eq. 5) and interpolating posed vertices agree up to the bend of one triangle."""
     lattice, posed = build_lattice(tube_mesh(), RESOLUTION), template.pose(tube_motion(), 5)
     carried = lattice.interpolate_transforms(posed.transforms).apply(lattice.interpolate(posed.canonical))
     assert float((carried - lattice.interpolate(posed.vertices)).norm(dim=1).max()) < 0.01
@@ -107,3 +107,13 @@ def test_textures_hold_normals_then_positions_newest_frame_first(template):
     torch.testing.assert_close(stacked[:, 3:6], lattice.interpolate(posed.vertices) - root, atol=1e-6, rtol=0)
     before = template.pose(motion, 3)
     torch.testing.assert_close(stacked[:, 9:12], lattice.interpolate(before.vertices) - root, atol=1e-6, rtol=0)
+
+
+def test_normalised_motion_ignores_where_the_person_stands_and_faces():
+    motion = tube_motion()
+    here = normalised_motion(motion, 4, window=3)
+    there = normalised_motion(moved(motion, [5.0, 0, -2.0], 1.1), 4, window=3)
+    torch.testing.assert_close(there, here, atol=1e-5, rtol=0)
+    assert not here[0, :3].any()
+    unchanged = torch.from_numpy(motion.dofs[[4, 3, 2], 6:]).float()
+    assert torch.equal(here[:, 6:], unchanged)
