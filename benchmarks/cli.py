@@ -85,6 +85,45 @@ def report(arguments: argparse.Namespace) -> int:
     return _report(arguments.run)
 
 
+def gate(arguments: argparse.Namespace) -> int:
+    """Compare a run with the baseline, or make a run the new baseline."""
+    from ash.files import write_atomic
+    from benchmarks import gate as rules
+    from benchmarks.runs import read_run, results_of
+
+    path, baseline = arguments.baseline, None
+    if not arguments.update_baseline:
+        baseline = rules.read_baseline(path)
+    if arguments.head is None:
+        suite = arguments.suite if baseline is None else baseline.suite
+        command = ["run", suite, "--seeds", str(arguments.seeds), "--data", str(arguments.data)]
+        if (code := main(command)) not in (DONE, FAILED):
+            return code
+        arguments.head = Path("runs") / suite
+    found = read_run(arguments.head)
+    head = rules.summarise(found.suite, results_of(found))
+    if baseline is None:
+        rules.write_baseline(path, head)
+        print(f"{path}: now holds {len(head.entries)} methods at commit {head.commit}")
+        return DONE
+    checks = rules.judge(baseline, head)
+    summary = rules.markdown(baseline, head, checks)
+    print(summary)
+    if arguments.markdown:
+        write_atomic(arguments.markdown, summary.encode())
+    if arguments.junit:
+        write_atomic(arguments.junit, rules.junit(checks).encode())
+    return DONE if all(check.verdict == "pass" for check in checks) else FAILED
+
+
+def merge(arguments: argparse.Namespace) -> int:
+    """Put the cells of shards together and report."""
+    from benchmarks.merge import merge_runs
+
+    merge_runs(arguments.shards, arguments.out)
+    return _report(arguments.out)
+
+
 def train(arguments: argparse.Namespace) -> int:
     """One cell by hand."""
     from ash.dataset import load_capture
@@ -214,6 +253,10 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument("run", type=Path, metavar="RUN")
     verb = _verb(verbs, report, "report", "write the report of a run again")
     verb.add_argument("run", type=Path, metavar="RUN")
+    _add_gate(verbs)
+    verb = _verb(verbs, merge, "merge", "put the cells of shards together and report")
+    verb.add_argument("shards", type=Path, metavar="RUN", nargs="+")
+    verb.add_argument("--out", type=Path, metavar="DIR", required=True)
     verb = _verb(verbs, speed, "speed", "time the kernels, or whole frames by stage, beside their definitions")
     verb.add_argument("what", choices=("kernels", "frame"))
     verb.add_argument("--json", type=Path, metavar="FILE", help="write the rows there as well")
@@ -236,6 +279,18 @@ def _add_run(verbs: Any) -> None:
     verb.add_argument("--shard", metavar="i/n", help="do only every n-th cell, from the i-th; for job arrays")
     verb.add_argument("--retry-failed", action="store_true", help="run cells again that failed before")
     verb.add_argument("--dry-run", action="store_true", help="print cells, hours and gigabytes, and do nothing")
+
+
+def _add_gate(verbs: Any) -> None:
+    verb = _verb(verbs, gate, "gate", "compare a run with a committed baseline; exit code 1 where it is worse")
+    verb.add_argument("--baseline", type=Path, metavar="FILE", default=Path("reports/baseline.json"))
+    verb.add_argument("--head", type=Path, metavar="RUN", help="the run to judge (default: run the suite now)")
+    verb.add_argument("--suite", default="ci", help="suite of a new baseline (default: %(default)s)")
+    verb.add_argument("--seeds", type=_positive, default=3, metavar="N", help="seeds of the run (default: %(default)s)")
+    verb.add_argument("--data", type=Path, metavar="DIR", default=Path("data"), help="where captures are kept")
+    verb.add_argument("--markdown", type=Path, metavar="FILE", help="write the summary there, for a pull request")
+    verb.add_argument("--junit", type=Path, metavar="FILE", help="write the checks there as JUnit")
+    verb.add_argument("--update-baseline", action="store_true", help="make the run the new baseline")
 
 
 def _verb(verbs: Any, function: Callable[[argparse.Namespace], int], name: str, about: str) -> argparse.ArgumentParser:

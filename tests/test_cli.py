@@ -286,3 +286,41 @@ def test_two_runs_in_one_folder_do_not_meet(boxes: None, tmp_path: Path, capsys)
         assert "another ash-bench is at work there" in refused(
             capsys, "run", "boxes", "--out", str(tmp_path / "run"), "--data", str(tmp_path / "data")
         )
+
+
+def test_shards_are_merged_into_the_undisturbed_run(boxes: None, tmp_path: Path, capsys) -> None:
+    data, whole = ["--data", str(tmp_path / "data")], tmp_path / "whole"
+    assert cli.main(["run", "boxes", "--out", str(whole), *data]) == cli.DONE
+    shards = [tmp_path / "a", tmp_path / "b"]
+    for index, shard in enumerate(shards, 1):
+        assert cli.main(["run", "boxes", "--out", str(shard), "--shard", f"{index}/2", *data]) == cli.DONE
+    assert "are in no shard" in refused_last(capsys, "merge", str(shards[0]), "--out", str(tmp_path / "half"))
+    assert cli.main(["merge", *map(str, shards), "--out", str(tmp_path / "merged")]) == cli.DONE
+    quality = [
+        [
+            line
+            for line in (run / "results.csv").read_text().splitlines()
+            if ",speed," not in line and ",memory," not in line
+        ]
+        for run in (whole, tmp_path / "merged")
+    ]
+    assert quality[0] == quality[1] and len(quality[0]) > 40
+
+
+def test_the_gate_on_a_run(boxes: None, tmp_path: Path, capsys) -> None:
+    out, baseline = tmp_path / "run", tmp_path / "baseline.json"
+    run = ["run", "boxes", "--out", str(out), "--data", str(tmp_path / "data")]
+    assert cli.main(run) == cli.DONE
+    gate = ["gate", "--baseline", str(baseline), "--head", str(out)]
+    assert "baseline.json" in refused_last(capsys, *gate)
+    assert cli.main([*gate, "--update-baseline"]) == cli.DONE
+    assert cli.main([*gate, "--markdown", str(tmp_path / "s.md"), "--junit", str(tmp_path / "j.xml")]) == cli.DONE
+    assert "passed" in (tmp_path / "s.md").read_text() and (tmp_path / "j.xml").exists()
+    baseline.write_text(baseline.read_text().replace('"params": 2', '"params": 1'))
+    assert cli.main(gate) == cli.FAILED
+
+
+def refused_last(capsys: pytest.CaptureFixture[str], *command: str) -> str:
+    """The last line of a command that is refused after others spoke."""
+    assert cli.main(list(command)) == cli.WRONG_INPUT
+    return capsys.readouterr().err.strip().splitlines()[-1]
