@@ -144,7 +144,7 @@ class Capture:
 def fewer_cameras(capture: Capture, share: float) -> Capture:
     """The capture with an evenly spread share (0..1] of its training cameras, at least one; other splits keep theirs.
 
-    Cameras are added one by one, each the farthest from those chosen so far, so that a smaller share is a part of a larger.
+    Cameras are added one by one, each the farthest from those chosen so far: a smaller share is a part of a larger.
     """
     train = capture.splits["train"]
     positions = np.stack([capture.cameras[name].position for name in train.cameras])

@@ -41,7 +41,9 @@ class Interrupted(RuntimeError):
 class Trainable(Protocol):
     """What the loop needs of a model."""
 
-    module: torch.nn.Module
+    @property
+    def module(self) -> torch.nn.Module:
+        """Everything that is saved in a checkpoint."""
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Adam's groups, each with its own `lr`."""
