@@ -35,6 +35,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run a verb and return the exit code."""
     arguments = _parser().parse_args(argv)
     arguments.command = shlex.join(["ash-bench", *(sys.argv[1:] if argv is None else argv)])
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # As cells run; read when torch and FLIP are loaded, so set it first.
     try:
         with _terminate_as_interrupt():
             verb: Callable[[argparse.Namespace], int] = arguments.verb

@@ -29,7 +29,7 @@ from ash.files import sha256_of, write_arrays, write_image, write_json
 from ash.protocol import StageClock
 
 SIZE = 64
-TRAIN_FRAMES, TEST_FRAMES = 6, 4
+TRAIN_FRAMES, TEST_FRAMES = 4, 3
 FPS = 25.0
 SAMPLES = 26  # Surface points along each edge of a box's face.
 

@@ -1,3 +1,4 @@
+import json
 import os
 import resource
 import shutil
@@ -90,19 +91,26 @@ def test_a_failed_cell_is_told_and_exits_with_1(boxes: None, tmp_path: Path, cap
     assert "fake_nan" in (out / "results.csv").read_text()
 
 
-def test_rescore_recomputes_every_number_from_the_stored_images(boxes: None, tmp_path: Path, capsys) -> None:
-    out = tmp_path / "run"
-    assert cli.main(["run", "boxes", "--out", str(out), "--data", str(tmp_path / "data")]) == cli.DONE
-    path = sorted(out.rglob("result.json"))[0]
-    original = path.read_bytes()
+def test_rescore_recomputes_every_number_from_the_stored_images(capture: Path, tmp_path: Path, capsys) -> None:
+    assert cli.main(["train", "fake_good", str(capture), "--preset", "ci", "--out", str(tmp_path)]) == cli.DONE
+    path = next(tmp_path.rglob("result.json"))
+    out, original = path.parent, path.read_bytes()
     path.write_bytes(original.replace(b'"foreground/psnr": ', b'"foreground/psnr": 1'))
     assert cli.main(["rescore", str(out)]) == cli.DONE
     assert path.read_bytes() == original
-    assert cli.main(["eval", str(out)]) == cli.DONE
     capsys.readouterr()
     image = sorted(path.parent.rglob("*.png"))[0]
     shutil.copy(sorted(path.parent.rglob("*.png"))[1], image)
     assert "altered since it was scored" in refused(capsys, "rescore", str(out))
+
+
+def test_eval_renders_again_from_the_checkpoint(capture: Path, tmp_path: Path) -> None:
+    assert cli.main(["train", "fake_good", str(capture), "--preset", "ci", "--out", str(tmp_path)]) == cli.DONE
+    path = next(tmp_path.rglob("result.json"))
+    before = json.loads(path.read_text())
+    shutil.rmtree(path.parent / "images")
+    assert cli.main(["eval", str(path.parent)]) == cli.DONE
+    assert json.loads(path.read_text())["views"] == before["views"]
 
 
 def test_dry_run_starts_nothing(tmp_path: Path, capsys) -> None:
