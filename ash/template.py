@@ -69,12 +69,9 @@ class KnownDeformation:
 
 
 class Template:
-    """Poses the template mesh.
+    """Poses the template mesh. The last few frames are kept: in playback, they are the next frame's history."""
 
-    The last few frames are kept, because a motion window asks for each frame several times.
-    """
-
-    KEPT_FRAMES = 256
+    KEPT_FRAMES = 4
 
     def __init__(self, mesh: TemplateMesh, skeleton: Skeleton, deformation: Deformation) -> None:
         self.skeleton = skeleton

@@ -155,7 +155,7 @@ def _evaluate(cell: Cell, capture: Capture, avatar: Avatar, train_s: float) -> C
         write_image(prediction_path(cell.folder, view), prediction)
         scored.append(_score(cell, capture, view, prediction))
     last_split = views[-1].split
-    timing = time_frames(avatar, capture, [view for view in views if view.split == last_split])
+    timing = time_frames(avatar, capture, _playback(views, last_split))
     curve = read_curve(cell.folder / "log.jsonl")
     summary = (
         _image_summary(scored)
@@ -166,6 +166,12 @@ def _evaluate(cell: Cell, capture: Capture, avatar: Avatar, train_s: float) -> C
     return CellResult(
         config=cell.config, status="done", summary=summary, views=tuple(scored), timing=timing, curve=curve
     )
+
+
+def _playback(views: list[View], split: str) -> list[View]:
+    """One camera's views of a split: every frame is new to the avatar, as in playback, and only its history is not."""
+    first = next(view.camera for view in views if view.split == split)
+    return [view for view in views if view.split == split and view.camera == first]
 
 
 def _make(config: CellConfig, capture: Capture, factory: Callable[..., Avatar]) -> Avatar:
