@@ -149,7 +149,8 @@ class DdcAvatar:
         lattice = build_lattice(capture.template, config.texels)
         self.module = DdcModel(config, capture.template, self.template, lattice, initial)
         self._motion = capture.motion
-        self._conditions: dict[int, Tensor] = {}
+        self._conditions: dict[int, Tensor] = {}  # The template is frozen: each training frame is posed once.
+        self._posed: dict[int, PosedTemplate] = {}
 
     def fit(self, capture: Capture, *, folder: Path) -> None:
         """Train texture and network on the training images; see `ash.training.fit`."""
@@ -167,13 +168,12 @@ class DdcAvatar:
 
     def draw_training_views(self, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
         """The texture of the frame, drawn into each camera; the static texture alone while the warm-up lasts."""
-        if frame not in self._conditions:
-            with torch.no_grad():
-                self._conditions[frame] = self.module.conditions(self._motion, frame)
+        if frame not in self._posed:
+            self._posed[frame] = self.template.pose(self._motion, frame)
+            self._conditions[frame] = self.module.conditions(self._motion, frame)
         static = self.config.training.warmup == "static" and step < self.config.training.warmup_steps
         texture = self.module.texture if static else self.module.dynamic_texture(self._conditions[frame])
-        posed = self.template.pose(self._motion, frame)
-        return torch.stack([self.module.draw(texture, posed, c, background)[..., :3] for c in cameras])
+        return torch.stack([self.module.draw(texture, self._posed[frame], c, background)[..., :3] for c in cameras])
 
     @torch.no_grad()
     def render(self, motion: Motion, frame: int, camera: Camera, *, clock: StageClock) -> np.ndarray:
