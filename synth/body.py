@@ -1,8 +1,10 @@
 """Bodies: a clothed rest surface with its skeleton, UVs, parts and skin weights, and the coarser template cut from it."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+from scipy.sparse import coo_array, csr_array, eye_array
 
 from ash.dataset import Skeleton, TemplateMesh
 
@@ -48,6 +50,20 @@ class Body:
     template_faces: np.ndarray  # [g, 3] int64 into the template's vertices
     template_uv_faces: np.ndarray  # [g, 3] int64 into the surface's uvs
 
+    def scalp(self, points: np.ndarray) -> np.ndarray:
+        """How far rest points `[n, 3]` lie inside the hair, metres: behind a slanted hairline and not on the ears."""
+        x, y, z = (points - self.face.eyes.mean(axis=0)).T
+        if not self.face.modelled:
+            return (y - 0.045 - 0.9 * np.clip(z + 0.1, 0.03 - 0.04, 1)) / 1.3
+        above = (y - 0.062 - 0.98 * z) / 1.4
+        ears = np.hypot((y + 0.012) / 1.15, z + 0.088) - 0.038
+        return np.where(np.abs(x) > 0.06, np.minimum(above, ears), above)
+
+    def collar(self, points: np.ndarray) -> np.ndarray:
+        """How far rest points `[n, 3]` lie outside of the collar, metres."""
+        neck = self.skeleton.heads[self.skeleton.names.index("neck")]
+        return np.linalg.norm((points - neck) * [1, 0.8, 1], axis=1) - 0.092
+
     def template(self, offset: np.ndarray | None = None) -> TemplateMesh:
         """The template mesh: the kept vertices, moved by `offset` `[v, 3]` metres."""
         used, uv_faces = np.unique(self.template_uv_faces, return_inverse=True)
@@ -74,16 +90,20 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def neighbour_mean(values: np.ndarray, faces: np.ndarray, *, rounds: int) -> np.ndarray:
     """Smooth values `[s, ...]` over the mesh: the mean over each vertex and its neighbours, some rounds of it."""
-    from scipy.sparse import coo_matrix, identity
-
-    count = len(values)
-    rows = faces[:, [0, 1, 2, 1, 2, 0]].ravel()
-    columns = faces[:, [1, 2, 0, 0, 1, 2]].ravel()
-    links = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count)).tocsr()
-    links.data[:] = 1.0
-    links = links + identity(count)
-    degree = np.asarray(links.sum(axis=1)).ravel()
-    flat = values.reshape(count, -1).astype(np.float64)
+    operator = _averaging(len(values), faces.tobytes())
+    flat = values.reshape(len(values), -1).astype(np.float64)
     for _ in range(rounds):
-        flat = (links @ flat) / degree[:, None]
+        flat = operator @ flat
     return flat.reshape(values.shape)
+
+
+@lru_cache(maxsize=8)
+def _averaging(count: int, faces: bytes) -> csr_array:
+    """The sparse operator that replaces a value by the mean over the vertex and its neighbours."""
+    corners = np.frombuffer(faces, dtype=np.int64).reshape(-1, 3)
+    rows, columns = corners[:, [0, 1, 2, 1, 2, 0]].ravel(), corners[:, [1, 2, 0, 0, 1, 2]].ravel()
+    links = csr_array(coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count)))
+    links.data[:] = 1.0
+    links = csr_array(links + eye_array(count))
+    links.data /= np.repeat(np.diff(links.indptr), np.diff(links.indptr))
+    return links

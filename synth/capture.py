@@ -155,7 +155,7 @@ def make_body(scene: Scene) -> Body:
     """The scene's clothed body."""
     if scene.body == "mannequin":
         return mannequin(skirt=scene.outfit.skirt)
-    from synth.anny_body import anny_body
+    from synth.dressing import anny_body
 
     return anny_body(skirt=scene.outfit.skirt)
 

@@ -95,7 +95,9 @@ def true_surface(body: Body, motion: Motion, outfit: Outfit, *, seed: int) -> np
     if outfit.skirt and outfit.swing > 0:
         legs = body.surface.vertices_of("trousers", "skin", "shirt") & ~body.surface.vertices_of("skirt")
         cloth = body.surface.vertices_of("skirt")
-        for vertices in posed:
+        sleeves = leg_profiles(body)
+        for frames, vertices in zip(bone_frames(body.skeleton, motion.dofs), posed, strict=True):
+            clear_legs(body, sleeves, frames, vertices, cloth=cloth)
             push_out(vertices, body.surface.faces, cloth=cloth, inner=legs)
     return posed
 
@@ -112,28 +114,52 @@ def _sag(body: Body, posed: np.ndarray) -> np.ndarray:
 
 
 def _with_swing(body: Body, motion: Motion, posed: np.ndarray, strength: float) -> np.ndarray:
-    """The skirt hangs from the waist as a damped pendulum that lags behind the hips, instead of following the thighs."""
+    """The skirt hangs from the waist as a damped pendulum that lags behind the hips, and lies on thighs that rise."""
     cloth = body.surface.vertices_of("skirt")
     rest = body.surface.vertices[cloth]
     pelvis = body.skeleton.heads[0]
     top, bottom = rest[:, 1].max(), rest[:, 1].min()
     depth = ((top - rest[:, 1]) / (top - bottom))[:, None]
-    frames = bone_frames(body.skeleton, motion.dofs)[:, 0]
-    yaw = np.unwrap(np.arctan2(frames[:, 0, 2], frames[:, 2, 2]))
+    frames = bone_frames(body.skeleton, motion.dofs)
+    yaw = np.unwrap(np.arctan2(frames[:, 0, 0, 2], frames[:, 0, 2, 2]))
     result = posed.copy()
     for index in np.unique(motion.sequence):
         chosen = np.flatnonzero(motion.sequence == index)
-        sway, twist, spin = pendulum(frames[chosen, :3, 3], yaw[chosen], fps=motion.fps, length=top - bottom)
+        sway, twist, spin = pendulum(frames[chosen, 0, :3, 3], yaw[chosen], fps=motion.fps, length=top - bottom)
         for k, t in enumerate(chosen):
             upright = rotvec_to_rotmat(np.array([0, yaw[t], 0]))
-            stiff = (rest - pelvis) @ frames[t, :3, :3].T
+            stiff = (rest - pelvis) @ frames[t, 0, :3, :3].T
+            lifted = _over_thighs(body, frames[t], upright, rest) - pelvis
             turned = rotvec_to_rotmat(np.concatenate([0 * depth, twist[k] * depth, 0 * depth], axis=1))
-            hanging = np.einsum("vab,vb->va", turned, (rest - pelvis) @ upright.T)
+            hanging = np.einsum("vab,vb->va", turned, lifted @ upright.T)
             flare = 1 + 0.05 * np.minimum(spin[k] ** 2 / 10, 3.0) * depth
             hanging = hanging * np.concatenate([flare, 1 + 0 * flare, flare], axis=1)
-            swung = frames[t, :3, 3] + (1 - depth) * stiff + depth * hanging + (top - bottom) * depth**1.5 * sway[k]
+            stay = np.clip(1 - 3 * depth, 0, 1)  # Only the waistband is stiff.
+            swung = frames[t, 0, :3, 3] + stay * stiff + (1 - stay) * hanging + (top - bottom) * depth**1.5 * sway[k]
             result[t, cloth] += strength * (swung - posed[t, cloth])
     return result
+
+
+def _over_thighs(body: Body, frames: np.ndarray, upright: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """The skirt's rest points `[v, 3]`, its front raised with thighs that swing forward, its back with those that swing back."""
+    names, heads = body.skeleton.names, body.skeleton.heads
+    pitch, hips = [], []
+    for side in ("left", "right"):
+        hip, knee = names.index(f"thigh_{side}"), names.index(f"shin_{side}")
+        thigh = (frames[knee, :3, 3] - frames[hip, :3, 3]) @ upright
+        straight = heads[knee] - heads[hip]
+        pitch.append(np.arctan2(thigh[2], -thigh[1]) - np.arctan2(straight[2], -straight[1]))
+        hips.append(heads[hip])
+    left = 0.5 + 0.5 * np.tanh(rest[:, 0] / 0.06)
+    hip = np.mean(hips, axis=0) * [0, 1, 1]
+    front = 0.5 + 0.5 * np.tanh((rest[:, 2] - hip[2]) / 0.05)
+    forward = left * max(pitch[0], 0) + (1 - left) * max(pitch[1], 0)
+    back = left * min(pitch[0], 0) + (1 - left) * min(pitch[1], 0)
+    below = np.clip((hip[1] + 0.06 - rest[:, 1]) / 0.12, 0, 1)
+    angle = below * (front * forward + (1 - front) * back)
+    zero = np.zeros_like(angle)
+    turned = rotvec_to_rotmat(np.stack([-angle, zero, zero], axis=1))
+    return hip + np.einsum("vab,vb->va", turned, rest - hip)
 
 
 def pendulum(
@@ -164,6 +190,81 @@ def pendulum(
         [0.35 * np.tanh(swung[:, 0] / 0.35), np.zeros(len(swung)), 0.35 * np.tanh(swung[:, 1] / 0.35)], axis=1
     )
     return sway, 0.8 * np.tanh(swung[:, 2] / 0.8), turn(times, 1)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LegProfile:
+    """How thick the clothed leg is along one bone."""
+
+    start: int  # joints at the bone's ends
+    end: int
+    radii: np.ndarray  # [bins] metres, from start to end
+
+
+def leg_profiles(body: Body, bins: int = 8) -> list[LegProfile]:
+    """Measure thighs and shins at rest."""
+    names, heads = body.skeleton.names, body.skeleton.heads
+    profiles = []
+    for side in ("left", "right"):
+        for first, last in (("thigh", "shin"), ("shin", "foot")):
+            start, end = names.index(f"{first}_{side}"), names.index(f"{last}_{side}")
+            own = (body.skin_weights[:, start] > 0.5) & ~body.surface.vertices_of("skirt")
+            along, radius, _ = _cylindrical(body.surface.vertices[own], heads[start], heads[end])
+            place = np.clip((along * bins).astype(int), 0, bins - 1)
+            radii = np.array([np.quantile(radius[place == k], 0.9) if (place == k).any() else 0 for k in range(bins)])
+            profiles.append(LegProfile(start=start, end=end, radii=radii))
+    return profiles
+
+
+def _cylindrical(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position along a bone (0..1 between its ends), distance from its axis, and the unit axis."""
+    bone = end - start
+    axis = bone / np.linalg.norm(bone)
+    offset = points - start
+    along = offset @ axis / np.linalg.norm(bone)
+    radius = np.linalg.norm(offset - (offset @ axis)[:, None] * axis, axis=1)
+    return along, radius, axis
+
+
+def clear_legs(
+    body: Body,
+    profiles: list[LegProfile],
+    frames: np.ndarray,
+    vertices: np.ndarray,
+    *,
+    cloth: np.ndarray,
+    margin: float = 0.015,
+) -> None:
+    """Move cloth that has legs inside or outside of it outwards, in place, along its own normals until it clears them.
+
+    Going outwards along the cloth's normal, and not to the nearest side of the leg, keeps cloth on its side of the leg
+    however far the leg has moved.
+    """
+    faces = body.surface.faces[cloth[body.surface.faces].all(axis=1)]
+    rest = body.surface.vertices
+    outward = neighbour_mean(vertex_normals(vertices, faces), faces, rounds=8)
+    outward[cloth] /= np.maximum(np.linalg.norm(outward[cloth], axis=1, keepdims=True), 1e-9)
+    # A side of the skirt answers for the leg of its own side; in the middle for both.
+    shift = np.zeros(len(vertices))
+    for profile in profiles:
+        start, end = frames[profile.start, :3, 3], frames[profile.end, :3, 3]
+        points, normals = vertices[cloth], outward[cloth]
+        along, _, axis = _cylindrical(points, start, end)
+        bins = (np.arange(len(profile.radii)) + 0.5) / len(profile.radii)
+        limit = np.interp(along, bins, profile.radii) + margin
+        offset = points - start
+        flat = offset - (offset @ axis)[:, None] * axis
+        turned = normals - (normals @ axis)[:, None] * axis
+        a, b = np.sum(turned**2, axis=1), np.sum(turned * flat, axis=1)
+        c = np.sum(flat**2, axis=1) - limit**2
+        root = np.sqrt(np.maximum(b**2 - a * c, 0))
+        leave = np.where((b**2 > a * c) & (a > 0.04), (-b + root) / np.maximum(a, 0.04), 0)
+        beside = rest[cloth][:, 0] * np.sign(body.skeleton.heads[profile.start][0]) > -0.04
+        within = (along > -0.05) & (along < 1.0) & beside
+        shift[cloth] = np.maximum(shift[cloth], np.where(within, np.clip(leave, 0, 0.25), 0))
+    for _ in range(3):
+        shift = np.maximum(shift, neighbour_mean(shift, faces, rounds=4))
+    vertices += shift[:, None] * outward
 
 
 def push_out(

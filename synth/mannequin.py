@@ -1,30 +1,12 @@
 """A small procedural humanoid of tubes with rectangular UV charts. No download, no cache: the body of tests."""
 
-from dataclasses import dataclass
-
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 
 from synth.body import PARTS, Body, Face, Surface
 from synth.motion import SIDES, SIGNS, make_skeleton
+from synth.tubes import Tube, chain_weights, chart_uvs, grid_faces, lattice, skirt_weights
 
 ATLAS = 1.87  # metres of cloth along the side of the UV square
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Tube:
-    """Rings around a curve. The rings run along v, from the first knot to the last; the seam lies at the back."""
-
-    part: str
-    knots: np.ndarray  # [k, 3] centre of the ring
-    radii: np.ndarray  # [k, 2] to the side, to the front
-    front: tuple[float, float, float]
-    chain: tuple[str, ...]  # joints along the curve, first knot first
-    borders: tuple[float, ...]  # where along the curve (0..1) one joint hands over to the next
-    rings: int
-    segments: int
-    chart: tuple[float, float, float, float]  # u, v, width, height in metres
-    blend: float = 0.12  # half the width of a hand-over along the curve
 
 
 def heads() -> dict[str, np.ndarray]:
@@ -106,56 +88,6 @@ def _tubes(*, skirt: bool) -> list[Tube]:
     return tubes
 
 
-def _lattice(tube: Tube) -> tuple[np.ndarray, np.ndarray]:
-    """Points `[2 r - 1, 2 c, 3]` and how far along the curve each ring lies `[2 r - 1]`, 0..1."""
-    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(tube.knots, axis=0), axis=1))])
-    along = np.linspace(0, 1, 2 * tube.rings - 1)
-    centre = PchipInterpolator(length / length[-1], tube.knots)(along)
-    radii = PchipInterpolator(length / length[-1], tube.radii)(along)
-    axis = (tube.knots[-1] - tube.knots[0]) / length[-1]
-    axis /= np.linalg.norm(axis)
-    side = np.cross(axis, tube.front)
-    side /= np.linalg.norm(side)
-    front = np.cross(side, axis)
-    angle = 2 * np.pi * np.arange(2 * tube.segments) / (2 * tube.segments)
-    ring = (
-        -np.sin(angle)[None, :, None] * side * radii[:, None, :1]
-        - np.cos(angle)[None, :, None] * front * radii[:, None, 1:]
-    )
-    return centre[:, None] + ring, along
-
-
-def _weights(tube: Tube, along: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    weights = np.zeros((len(along), len(names)))
-    share = np.ones(len(along))
-    for joint, border in zip(tube.chain, tube.borders, strict=False):
-        x = np.clip((along - border) / (2 * tube.blend) + 0.5, 0, 1)
-        passed = x * x * (3 - 2 * x)
-        weights[:, names.index(joint)] = share * (1 - passed)
-        share = share * passed
-    weights[:, names.index(tube.chain[-1])] += share
-    return weights
-
-
-def _skirt_weights(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    """As a scan-based template would: the waist follows the pelvis, the hem half the nearer thigh."""
-    depth = np.clip((1.0 - points[:, 1]) / 0.4, 0, 1)
-    left = 0.5 + 0.5 * np.tanh(points[:, 0] / 0.05)
-    weights = np.zeros((len(points), len(names)))
-    weights[:, names.index("pelvis")] = 1 - 0.5 * depth
-    weights[:, names.index("thigh_left")] = 0.5 * depth * left
-    weights[:, names.index("thigh_right")] = 0.5 * depth * (1 - left)
-    return weights
-
-
-def _grid_faces(rows: int, columns: int, stride: int, wrap: int) -> np.ndarray:
-    """Triangles of a lattice; `stride` is the row length of the index space, `wrap` where columns start again."""
-    i, j = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
-    k = (j + 1) % wrap
-    a, b, c, d = i * stride + j, i * stride + k, (i + 1) * stride + k, (i + 1) * stride + j
-    return np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], axis=2).reshape(-1, 3)
-
-
 def mannequin(*, skirt: bool) -> Body:
     """Build the mannequin; the template keeps every second ring and every second segment."""
     skeleton = make_skeleton(heads())
@@ -163,25 +95,24 @@ def mannequin(*, skirt: bool) -> Body:
     kept, template_faces, template_uv_faces = [], [], []
     vertex_count = uv_count = kept_count = 0
     for tube in _tubes(skirt=skirt):
-        points, along = _lattice(tube)
+        points, along = lattice(tube, 2 * tube.rings - 1, 2 * tube.segments)
         rows, columns = points.shape[:2]
         flat = points.reshape(-1, 3)
         vertices.append(flat)
-        rings = _weights(tube, along, skeleton.names)
+        rings = chain_weights(tube, along, skeleton.names)
         skirted = tube.part == "skirt"
-        weights.append(_skirt_weights(flat, skeleton.names) if skirted else np.repeat(rings, columns, axis=0))
-        u, v, width, height = tube.chart
-        grid = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, columns + 1), indexing="ij")
-        uvs.append(
-            np.stack([u + 0.005 + width * grid[1], v + 0.005 + height * grid[0]], axis=-1).reshape(-1, 2) / ATLAS
+        weights.append(
+            skirt_weights(flat, skeleton.names, top=1.0, length=0.4) if skirted else np.repeat(rings, columns, axis=0)
         )
-        faces.append(vertex_count + _grid_faces(rows, columns, columns, columns))
-        uv_faces.append(uv_count + _grid_faces(rows, columns, columns + 1, columns + 1))
+        u, v, width, height = tube.chart
+        uvs.append(([u + 0.005, v + 0.005] + chart_uvs(rows, columns) * [width, height]) / ATLAS)
+        faces.append(vertex_count + grid_faces(rows, columns, stride=columns, wrap=columns))
+        uv_faces.append(uv_count + grid_faces(rows, columns, stride=columns + 1, wrap=columns + 1))
         part.append(np.full(len(faces[-1]), PARTS.index(tube.part)))
         even_rows, even_columns = (rows + 1) // 2, columns // 2
         kept.append(vertex_count + (2 * np.arange(even_rows)[:, None] * columns + 2 * np.arange(even_columns)).ravel())
-        template_faces.append(kept_count + _grid_faces(even_rows, even_columns, even_columns, even_columns))
-        coarse = _grid_faces(even_rows, even_columns, even_columns + 1, even_columns + 1)
+        template_faces.append(kept_count + grid_faces(even_rows, even_columns, stride=even_columns, wrap=even_columns))
+        coarse = grid_faces(even_rows, even_columns, stride=even_columns + 1, wrap=even_columns + 1)
         row, column = np.divmod(coarse, even_columns + 1)
         template_uv_faces.append(uv_count + 2 * row * (columns + 1) + 2 * column)
         vertex_count += rows * columns

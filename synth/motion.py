@@ -103,7 +103,7 @@ def walk(times: np.ndarray, rng: np.random.Generator) -> Plan:
     """Walk along a straight line through the middle of the floor."""
     plan = standing(times)
     duration = times[-1] - times[0]
-    speed, period = rng.uniform(0.62, 0.75), rng.uniform(1.0, 1.12)
+    speed, period = rng.uniform(0.5, 0.6), rng.uniform(1.0, 1.12)
     heading = rng.uniform(-0.5, 0.5)
     forward, side = np.array([np.sin(heading), np.cos(heading)]), np.array([np.cos(heading), -np.sin(heading)])
     along = speed * (times - times[0] - duration / 2)
@@ -144,7 +144,7 @@ def reach(times: np.ndarray, rng: np.random.Generator) -> Plan:
     high, low = int(rng.integers(2)), 0
     low = 1 - high
     up, out = bump(x, -0.25, 0.85), bump(x, 0.3, 1.25)
-    plan.flexion[:, high] += rng.uniform(2.0, 2.4) * up
+    plan.flexion[:, high] += rng.uniform(1.9, 2.2) * up
     plan.abduction[:, high] += 0.35 * up
     plan.elbow[:, high] += 0.5 * out
     plan.flexion[:, low] += rng.uniform(1.1, 1.4) * out
@@ -331,9 +331,9 @@ def _solve_arm(local: dict[str, np.ndarray], head: dict[str, np.ndarray], plan: 
     local[f"clavicle_{side}"] = rotvec_to_rotmat(np.stack([zero, zero, sign * lift], axis=1))
     abduct = rotvec_to_rotmat(np.stack([zero, zero, sign * np.maximum(plan.abduction[:, arm] - lift, 0.0)], axis=1))
     local[f"upper_arm_{side}"] = abduct @ flex @ hang
-    already = np.arctan2(straight[2], -straight[1])  # The rest pose may bend the elbow a little.
-    bend = np.stack([-(plan.elbow[:, arm] - already), zero, zero], axis=1)
-    local[f"forearm_{side}"] = hang.T @ rotvec_to_rotmat(bend) @ hang
+    bend = rotvec_to_rotmat(np.stack([-plan.elbow[:, arm], zero, zero], axis=1))
+    align = rotation_between(straight, np.array([0.05 * sign, -1.0, 0.0]))  # The rest pose may bend the elbow a little.
+    local[f"forearm_{side}"] = hang.T @ bend @ align @ hang
 
 
 class _Leg:

@@ -30,7 +30,7 @@ def _size(name: str) -> Size:
         rig = Rig(cameras=6, held_out=2, width=128, height=128)
         return Size(rig=rig, repeats=1, frames=4, test_frames=3, stride=3, samples=16, texture=512)
     if name == "quick":
-        return Size(rig=Rig(), repeats=1, frames=10, test_frames=12, stride=5, samples=64, texture=2048)
+        return Size(rig=Rig(), repeats=1, frames=10, test_frames=12, stride=5, samples=48, texture=2048)
     if name == "table":
         rig = Rig(cameras=34, held_out=4, width=512, height=512)
         return Size(rig=rig, repeats=4, frames=20, test_frames=80, stride=20, samples=128, texture=4096)

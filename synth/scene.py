@@ -29,7 +29,7 @@ class Outfit:
 class Light:
     """Light fixed in the world: a constant sky and soft area lights."""
 
-    sky: float = 0.45  # radiance of the constant environment
+    sky: float = 0.6  # radiance of the constant environment
     area: float = 1.0  # strength of the area lights
     falloff: float = 0.0  # 0: equal everywhere; 1: a lamp close to the floor that lights one side of it only
     gloss: float = 0.0  # 0: diffuse cloth; 1: satin
@@ -68,8 +68,8 @@ class Scene:
     test: tuple[Clip, ...]
     novel_view_stride: int  # novel views are judged on every so many training frames
     fps: float = 12.0
-    samples: int = 64  # per pixel, in two halves
-    depth: int = 3  # of light paths
+    samples: int = 48  # per pixel, in two halves
+    depth: int = 2  # of light paths: 2 is direct light, 3 adds a bounce
     texture: int = 2048  # side of the texture in texels
 
     def __post_init__(self) -> None:

@@ -12,6 +12,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from synth.body import PARTS, Body, vertex_normals
 
+SKIN, HAIR, SHIRT = (PARTS.index(name) for name in ("skin", "hair", "shirt"))
 LIMBS = ("torso", "left arm", "right arm", "left leg", "right leg")
 
 
@@ -96,6 +97,12 @@ def paint(body: Body, *, size: int, seed: int) -> np.ndarray:
     grain = _grain(rng, size)[texels.rows, texels.columns]
     part = body.surface.part[texels.face]
     along = _along(body, texels)
+    # Labels end at faces, paint does not: hairline and collar are smooth lines across faces.
+    part = np.where(
+        np.isin(part, (SKIN, HAIR)), np.where(_hairline(body, texels.position, grain) > 0, HAIR, SKIN), part
+    )
+    throat = (part == SHIRT) & (texels.limb == 0) & (body.collar(texels.position) < 0)
+    part = np.where(throat, SKIN, np.where((part == SKIN) & (np.abs(_past_collar(body, texels)) < 0.03), SHIRT, part))
     colour = np.empty((len(part), 3))
     painters = {
         "skin": lambda m: _skin(body, texels.position[m], grain[m]),
@@ -116,6 +123,19 @@ def paint(body: Body, *, size: int, seed: int) -> np.ndarray:
     covered[texels.rows, texels.columns] = True
     nearest = distance_transform_edt(~covered, return_distances=False, return_indices=True)
     return np.round(image[tuple(nearest)] * 255).astype(np.uint8)
+
+
+def _hairline(body: Body, position: np.ndarray, grain: np.ndarray) -> np.ndarray:
+    """Positive where hair grows, in metres from the hairline, ragged by single strands."""
+    return body.scalp(position) + 0.0006 * np.sin(900 * position[:, 0]) + 0.0008 * grain
+
+
+def _past_collar(body: Body, texels: Texels) -> np.ndarray:
+    """Metres outside of the collar on the trunk's skin; far where the collar does not matter."""
+    beyond = body.collar(texels.position)
+    return np.where(
+        (texels.limb == 0) & (beyond > 0) & (texels.position[:, 1] < body.face.mouth[1] - 0.06), beyond, 1.0
+    )
 
 
 def _pick(texels: Texels, chosen: np.ndarray) -> Texels:
@@ -205,8 +225,8 @@ def _shirt(body: Body, texels: Texels, along: np.ndarray, grain: np.ndarray) -> 
         panel = side * _edge(0.055 - np.abs(y), 0.002) * _edge(0.125 - np.abs(position[:, 0]), 0.002)
         colour = _mix(colour, (0.93, 0.72, 0.2), panel)
         colour = _mix(colour, (0.1, 0.08, 0.12), panel * _stamp(words, facing * position[:, 0], y, width=0.2))
-    collar = body.skeleton.heads[body.skeleton.names.index("neck")][1]
-    colour = _mix(colour, (0.75, 0.16, 0.14), torso * _edge(position[:, 1] - collar + 0.012, 0.003))
+    collar = body.collar(position)
+    colour = _mix(colour, (0.75, 0.16, 0.14), torso * _edge(0.018 - collar, 0.003))
     seam = torso * _edge(0.0025 - np.abs(position[:, 2]), 0.001)
     colour = _mix(colour, (0.08, 0.1, 0.2), 0.6 * seam)
     return colour * _weave(position, grain)[:, None]
@@ -289,9 +309,6 @@ def _skin(body: Body, position: np.ndarray, grain: np.ndarray) -> np.ndarray:
     lips = front * _edge(1 - np.hypot(wide / 0.4, tall / (0.14 * np.maximum(1 - 0.5 * np.abs(wide), 0.3))), 0.2)
     colour = _mix(colour, (0.7, 0.3, 0.3), 0.8 * lips)
     colour = _mix(colour, (0.4, 0.15, 0.15), 0.8 * lips * _edge(0.018 - np.abs(tall), 0.02))
-    if not body.face.modelled:
-        cap = _edge(y - eyes[0, 1] - 0.045 + 0.9 * np.maximum(-z, -0.03), 0.004)
-        colour += cap[:, None] * (_hair(body, position, grain) - colour)
     return colour
 
 
