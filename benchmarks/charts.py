@@ -8,9 +8,9 @@ from html import escape
 FONT = "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-serif"
 STYLE = """\
 text{font-family:FONT;font-size:12px;fill:#1f2733}.dim{fill:#5d6878}.head{font-size:14px;font-weight:600}
-.grid{stroke:#d8dde5;stroke-width:1}.axis{stroke:#8a94a3;stroke-width:1}.paper{fill:#ffffff}.hollow{fill:#ffffff}
+.grid{stroke:#d8dde5;stroke-width:1}.axis,.front{stroke:#8a94a3;stroke-width:1}.paper{fill:#ffffff}.hollow{fill:#ffffff}
 .halo{paint-order:stroke;stroke:#ffffff;stroke-width:3px;stroke-linejoin:round}
-@media (prefers-color-scheme:dark){text{fill:#e6eaf0}.dim{fill:#9aa6b6}.grid{stroke:#2c3543}.axis{stroke:#66717f}
+@media (prefers-color-scheme:dark){text{fill:#e6eaf0}.dim{fill:#9aa6b6}.grid{stroke:#2c3543}.axis,.front{stroke:#66717f}
 .paper,.hollow{fill:#12171f}.halo{stroke:#12171f}}""".replace("FONT", FONT)
 
 
@@ -25,15 +25,17 @@ class Point:
     hollow: bool = False
     low: float | None = None
     high: float | None = None
+    ringed: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Panel:
-    """A scatter panel: points, arrows between them (indices), and a note in its upper corner."""
+    """A scatter panel: points, dashed links and a front (indices of points), and a note in its upper corner."""
 
     title: str
     points: tuple[Point, ...]
     links: tuple[tuple[int, int], ...] = ()
+    front: tuple[int, ...] = ()
     note: str = ""
 
 
@@ -223,7 +225,7 @@ def text_width(text: str) -> float:
 
 def _points(panel: Panel, x: Axis, y: Axis) -> str:
     anchors = [(x.at(point.x), y.at(point.y)) for point in panel.points]
-    parts = []
+    parts = [_front([anchors[i] for i in panel.front], x, y)]
     for a, b in panel.links:
         (x1, y1), (x2, y2) = anchors[a], anchors[b]
         dashes = f'stroke="{panel.points[a].colour}" stroke-width="1.2" stroke-dasharray="3 3" opacity="0.75"'
@@ -240,12 +242,25 @@ def _points(panel: Panel, x: Axis, y: Axis) -> str:
     for point, (px, py) in zip(panel.points, anchors, strict=True):
         ink = f'class="hollow" stroke="{point.colour}" stroke-width="2"' if point.hollow else f'fill="{point.colour}"'
         title = f"<title>{escape(point.label)}: {point.y:.2f} at {point.x:.1f} ms</title>"
+        if point.ringed:
+            ring = f'stroke="{point.colour}" stroke-width="1.4" fill="none"'
+            parts.append(f'<circle class="ring" cx="{_n(px)}" cy="{_n(py)}" r="9.5" {ring}/>')
         parts.append(f'<circle cx="{_n(px)}" cy="{_n(py)}" r="5.5" {ink}>{title}</circle>')
     widths = [text_width(point.label) for point in panel.points]
     box = (x.start, y.end, x.end, y.start)
     for point, place in zip(panel.points, place_labels(anchors, widths, box, whiskers), strict=True):
         parts.append(_text(*place, point.label, colour=point.colour, kind="halo"))
     return "".join(parts)
+
+
+def _front(anchors: Sequence[tuple[float, float]], x: Axis, y: Axis) -> str:
+    """The staircase above which no method lies, from the cheapest member to the right edge."""
+    if not anchors:
+        return ""
+    path = f"M{_n(anchors[0][0])} {_n(y.start)}"
+    for px, py in anchors:
+        path += f"H{_n(px)}V{_n(py)}"
+    return f'<path class="front" d="{path}H{_n(x.end)}" fill="none" stroke-width="1"/>'
 
 
 def _frame(title: str, x: Axis, y: Axis, *, y_labels: bool) -> str:

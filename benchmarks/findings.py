@@ -1,5 +1,8 @@
 """The sentences that head a report, computed from its numbers."""
 
+import numpy as np
+
+from benchmarks import contrasts, pareto
 from benchmarks.names import EXACT, is_oracle, look_of
 from benchmarks.scores import Score, Scores
 
@@ -27,6 +30,30 @@ def remarks(scores: Scores, scene: str) -> list[str]:
     if scores.seeds == 1:
         found.append("One seed: a difference of a few tenths of a dB may be chance; --seeds 3 gives intervals.")
     return [remark for remark in found if remark]
+
+
+def frontier(scores: Scores, scene: str) -> tuple[str, ...]:
+    """Who is beaten by nobody in accuracy and speed together, what the field covers, and what would have sufficed."""
+    found = []
+    for split, where in (("novel_view", "held-out views"), ("novel_pose", "held-out motion")):
+        competing = contrasts.candidates(scores, scene, split)
+        if len(competing) < 2:
+            continue
+        names = ", ".join(look_of(name).title for name in pareto.front(competing))
+        area = f"hypervolume {pareto.hypervolume(competing):.1f} dB·decades"
+        if scores.seeds > 1:
+            low, high = pareto.hypervolume_interval(competing, rng=np.random.default_rng(0))
+            area += f" [{low:.1f}, {high:.1f}]"
+        sentence = f"On {where}, nobody beats {names} in both accuracy and speed ({area})."
+        sufficient = pareto.smallest_sufficient(competing)
+        if sufficient is not None:
+            bound = f"{pareto.SUFFICIENT_DB} dB to {look_of(sufficient.best).title}"
+            sentence += (
+                f" Smallest sufficient: {look_of(sufficient.name).title}, the cheapest that loses less than {bound}"
+            )
+            sentence += f" (95 % bound {sufficient.loss_bound_db:.2f} dB)."
+        found.append(sentence)
+    return tuple(found)
 
 
 def _duel(scores: Scores, scene: str) -> str:

@@ -4,16 +4,17 @@ Everything comes from the results of the run's cells; the page needs no network 
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from ash.dataset import load_capture
 from ash.files import InputError, write_atomic
-from benchmarks import charts, findings, tables
+from benchmarks import charts, contrasts, findings, pareto, tables
 from benchmarks.cells import Cell, CellResult
 from benchmarks.charts import Bar, Line, Panel, Point
+from benchmarks.contrasts import Contrast
 from benchmarks.metrics import PROTOCOL
 from benchmarks.names import EXACT, is_oracle, look_of
 from benchmarks.pictures import Comparison, comparisons_of, contact_sheet, missing_pictures, png
@@ -51,6 +52,8 @@ class SceneReport:
     cost: Table
     more: tuple[Table, ...]
     exact: tuple[Exact, ...]
+    contrasts: tuple[Contrast, ...]
+    frontier: tuple[str, ...]
     comparisons: tuple[Comparison, ...]
     no_pictures: str
     curves: str
@@ -91,6 +94,8 @@ def scene_report(run: Run, scores: Scores, scene: str) -> SceneReport:
         cost=tables.build(scores, scene, tables.cost_columns(COSTS), title=f"Cost on {scene}"),
         more=_more_tables(scores, scene),
         exact=tuple(_exact_pairs(scores, scene)),
+        contrasts=contrasts.contrasts(scores, scene),
+        frontier=findings.frontier(scores, scene),
         comparisons=tuple(comparisons),
         no_pictures=no_pictures,
         curves=training_curves(scores, scene),
@@ -157,6 +162,7 @@ def markdown_of(run: Run, results: Sequence[CellResult], scenes: Sequence[SceneR
     parts = [f"# Report of suite {run.suite}", run.about[:1].upper() + run.about[1:] + "."]
     for scene in scenes:
         parts += [f"## {scene.name}", f"**{scene.headline}**", "\n".join(f"- {remark}" for remark in scene.remarks)]
+        parts.append(_contrast_rows(scene.contrasts))
         parts.append(f"![Accuracy against speed](chart_{scene.name}.svg)")
         parts += [
             f"### {table.title}\n\n{tables.markdown(table)}" for table in (scene.quality, scene.cost, *scene.more)
@@ -170,7 +176,18 @@ def markdown_of(run: Run, results: Sequence[CellResult], scenes: Sequence[SceneR
     parts.append("## Provenance\n\n" + "\n".join(f"- {name}: {value}" for name, value in provenance_facts(results)))
     if run.command:
         parts.append(f"Command: `{run.command}`")
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _contrast_rows(found: Sequence[Contrast]) -> str:
+    lines = ["| ASH minus | split | dB | 95 % interval | p (Holm) | detectable |", "|---|---|---:|---:|---:|---:|"]
+    for c in found:
+        interval = f"[{c.test.low:+.2f}, {c.test.high:+.2f}]"
+        split = tables.SPLIT_TITLES[c.split]
+        lines.append(
+            f"| {c.title} | {split} | {c.test.mean:+.2f} | {interval} | {c.p_adjusted:.2g} | {c.test.detectable:.2f} |"
+        )
+    return "\n".join(lines) if found else ""
 
 
 def latex_of(scenes: Sequence[SceneReport]) -> str:
@@ -243,8 +260,13 @@ def _panel(scores: Scores, scene: str, split: str, title: str) -> Panel:
         points.append(_point(method, frame, quality))
     links = tuple((index[a], index[b]) for a, b in EXACT.items() if a in index and b in index)
     ceiling = next((c for m in index if (c := scores.fg(scene, m, split, "noise_ceiling"))), None)
+    competing = contrasts.candidates(scores, scene, split)
+    best = pareto.front(competing)
+    sufficient = pareto.smallest_sufficient(competing)
+    if sufficient is not None:
+        points[index[sufficient.name]] = replace(points[index[sufficient.name]], ringed=True)
     note = f"noise ceiling {ceiling.mean:.1f} dB" if ceiling else ""
-    return Panel(title=title, points=tuple(points), links=links, note=note)
+    return Panel(title=title, points=tuple(points), links=links, front=tuple(index[m] for m in best), note=note)
 
 
 def _point(method: str, frame: Score, quality: Score) -> Point:

@@ -168,7 +168,7 @@ def _evaluate(cell: Cell, capture: Capture, avatar: Avatar, train_s: float) -> C
     )
 
 
-def _playback(views: list[View], split: str) -> list[View]:
+def _playback(views: tuple[View, ...], split: str) -> list[View]:
     """One camera's views of a split: every frame is new to the avatar, as in playback, and only its history is not."""
     first = next(view.camera for view in views if view.split == split)
     return [view for view in views if view.split == split and view.camera == first]
