@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ash.dataset import load_capture, verify_capture
+from ash.dataset import load_capture, read_manifest, verify_capture
 from ash.files import InputError, read_json, write_json
 from benchmarks.cells import Cell, CellConfig, CellResult, read_cell, read_result
 from benchmarks.engine import Limits, make_executor, plan_cells, run_cells, shard_of
@@ -13,6 +13,7 @@ from benchmarks.experiments import CaptureSpec, CellSpec, Suite, code_version, f
 from benchmarks.locks import only_run_in
 from benchmarks.metrics import PROTOCOL
 from benchmarks.progress import Progress
+from synth.presets import scene
 
 RUN_FILE = "run.json"
 
@@ -71,8 +72,14 @@ def _run_suite(suite: Suite, options: RunOptions) -> Run:
 
 
 def make_capture(spec: CaptureSpec, data: Path, *, workers: int) -> Path:
-    """The folder of a finished capture under `data`, rendering what is missing of it."""
+    """The folder of a finished capture under `data`, rendering what is missing of it.
+
+    A capture that an older version of the scene left under the same name is not touched: the new one goes beside it.
+    """
     folder = data / spec.name
+    wanted = scene(spec.scene, size=spec.size, seed=spec.seed).identity
+    if (folder / "manifest.json").exists() and read_manifest(folder).get("identity", wanted) != wanted:
+        folder = data / f"{spec.name}-{wanted[:8]}"
     make_capture_in(spec, folder, workers=workers)
     return folder
 
@@ -80,7 +87,6 @@ def make_capture(spec: CaptureSpec, data: Path, *, workers: int) -> Path:
 def make_capture_in(spec: CaptureSpec, folder: Path, *, workers: int) -> None:
     """Render into `folder` what is missing of a capture."""
     from synth.capture import make_capture as render
-    from synth.presets import scene
 
     progress = Progress(f"images of {spec.name}", 0, expected_s=0.0, workers=workers)
     render(scene(spec.scene, size=spec.size, seed=spec.seed), folder, workers=workers, progress=progress.advance)

@@ -14,6 +14,7 @@ import pytest
 
 from benchmarks import cli, runs
 from benchmarks.experiments import SUITES, Suite
+from synth.presets import SCENES
 
 BOXES = Suite(
     name="boxes",
@@ -45,6 +46,7 @@ def boxes(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         if not folder.exists():
             shutil.copytree(capture, folder)
 
+    monkeypatch.setitem(SCENES, "boxes", lambda size, seed: SCENES["mannequin"](size=size, seed=seed))
     monkeypatch.setitem(SUITES, "boxes", BOXES)
     monkeypatch.setitem(SUITES, "broken", replace(BOXES, name="broken", methods=("fake_good", "fake_nan")))
     monkeypatch.setattr(runs, "make_capture_in", render)
@@ -332,3 +334,15 @@ def refused_last(capsys: pytest.CaptureFixture[str], *command: str) -> str:
     """The last line of a command that is refused after others spoke."""
     assert cli.main(list(command)) == cli.WRONG_INPUT
     return capsys.readouterr().err.strip().splitlines()[-1]
+
+
+def test_a_capture_of_an_older_scene_is_kept_and_the_new_one_goes_beside_it(
+    boxes: None, capture: Path, tmp_path: Path
+) -> None:
+    old = tmp_path / "data" / "boxes-ci-0"
+    shutil.copytree(capture, old)
+    manifest = old / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"complete"', '"identity": "older", "complete"'))
+    assert cli.main(["run", "boxes", "--out", str(tmp_path / "run"), "--data", str(tmp_path / "data")]) == cli.DONE
+    assert "older" in manifest.read_text()
+    assert len(list((tmp_path / "data").iterdir())) == 2
