@@ -1,4 +1,4 @@
-"""Bodies: a clothed rest surface with its skeleton, UVs, parts and skin weights, and the coarser template cut from it."""
+"""Bodies: a clothed rest surface with skeleton, UVs, parts and skin weights, and the coarser template cut from it."""
 
 from dataclasses import dataclass
 from functools import lru_cache

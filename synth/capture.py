@@ -88,7 +88,7 @@ def make_capture(
 
 
 def is_finished(scene: Scene, folder: Path) -> bool:
-    """Whether `folder` holds this scene, complete, every file in its place. Contents are checked by `verify_capture`."""
+    """Whether `folder` holds this scene, complete, every file in its place; `verify_capture` checks the contents."""
     if not (folder / "manifest.json").is_file():
         return False
     manifest = read_manifest(folder)

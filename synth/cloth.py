@@ -1,6 +1,6 @@
 """Clothes: where the true surface lies in every frame. Skinning first, then what no skinned template knows.
 
-Each departure has its strength in `Outfit`; at zero it is not evaluated at all, so that the skinned surface stays bit for bit.
+Each departure has its strength in `Outfit`; at zero it is not evaluated at all: the skinned surface stays bit for bit.
 """
 
 from dataclasses import dataclass
@@ -93,7 +93,7 @@ def true_surface(body: Body, motion: Motion, outfit: Outfit, *, seed: int) -> np
             height = outfit.folds_mm / 1000 * folds.displacement(body, dofs[3:].reshape(-1, 3))
             posed[t] += height[:, None] * vertex_normals(posed[t], body.surface.faces)
     if outfit.skirt and outfit.swing > 0:
-        legs = body.surface.vertices_of("trousers", "skin", "shirt") & ~body.surface.vertices_of("skirt")
+        legs = body.surface.vertices_of("trousers")
         cloth = body.surface.vertices_of("skirt")
         sleeves = leg_profiles(body)
         for frames, vertices in zip(bone_frames(body.skeleton, motion.dofs), posed, strict=True):
@@ -141,7 +141,7 @@ def _with_swing(body: Body, motion: Motion, posed: np.ndarray, strength: float) 
 
 
 def _over_thighs(body: Body, frames: np.ndarray, upright: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """The skirt's rest points `[v, 3]`, its front raised with thighs that swing forward, its back with those that swing back."""
+    """The skirt's rest points `[v, 3]`, its front raised with thighs that swing forward, its back with the others."""
     names, heads = body.skeleton.names, body.skeleton.heads
     pitch, hips = [], []
     for side in ("left", "right"):
@@ -274,7 +274,7 @@ def push_out(
     cloth: np.ndarray,
     inner: np.ndarray,
     margin: float = 0.008,
-    rounds: int = 6,
+    rounds: int = 3,
 ) -> None:
     """Move cloth vertices out of the posed body, in place, until they lie `margin` metres outside.
 

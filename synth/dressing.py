@@ -25,7 +25,8 @@ HAIR = 0.016
 THICKNESS = {"loose": {"shirt": 0.013, "trousers": 0.009}, "tight": {"shirt": 0.005, "trousers": 0.004}}
 DENSITY = {"head": 1.45, "hand": 1.25, "eye": 2.0}
 STORED = (
-    "vertices", "weights", "faces", "uvs", "uv_faces", "part", "kept", "template_faces", "template_uv_faces", "heads", "eyes", "mouth",
+    "vertices", "weights", "faces", "uvs", "uv_faces", "part", "kept", "template_faces", "template_uv_faces",
+    "heads", "eyes", "mouth",
 )  # fmt: skip
 
 
@@ -109,7 +110,7 @@ def _body_parts(baked: dict[str, np.ndarray]) -> tuple[Charted, np.ndarray, np.n
     for k in range(len(sizes)):
         middle = centre[original == k].mean(axis=0)
         eye = np.linalg.norm(baked["eyes"] - middle, axis=1).min()
-        if k == body or k == head:
+        if k in (body, head):
             names[k] = "body" if k == body else "head"
         elif abs(middle[0]) > 0.35:
             names[k] = "hand"
@@ -211,15 +212,17 @@ def _shoe(skeleton: Skeleton, side: str) -> Tube:
     # Each ring: distance in front of the ball, height of its centre, half its width, half its height.
     rings = np.array(
         [
-            (0.107, 0.028, 0.002, 0.002), (0.104, 0.028, 0.016, 0.012), (0.09, 0.030, 0.034, 0.022), (0.04, 0.034, 0.050, 0.031),
-            (-0.02, 0.039, 0.050, 0.038), (-0.09, 0.050, 0.043, 0.049), (-0.15, 0.066, 0.042, 0.066), (-0.195, 0.064, 0.038, 0.062),
+            (0.107, 0.028, 0.002, 0.002), (0.104, 0.028, 0.016, 0.012), (0.09, 0.030, 0.034, 0.022),
+            (0.04, 0.034, 0.050, 0.031), (-0.02, 0.039, 0.050, 0.038), (-0.09, 0.050, 0.043, 0.049), (-0.15, 0.066, 0.042, 0.066),
+            (-0.195, 0.064, 0.038, 0.062),
             (-0.218, 0.055, 0.02, 0.04), (-0.223, 0.052, 0.002, 0.003),
         ]
     )  # fmt: skip
     knots = middle + np.stack([np.zeros(len(rings)), rings[:, 1], rings[:, 0]], axis=1)
     return Tube(
         part="shoes", knots=knots, radii=rings[:, 2:], front=(0.0, 1.0, 0.0),
-        chain=(f"toe_{side}", f"foot_{side}"), borders=(0.36,), rings=20, segments=20, chart=(0, 0, 0.3, 0.33), blend=0.1,
+        chain=(f"toe_{side}", f"foot_{side}"), borders=(0.36,), rings=20, segments=20,
+        chart=(0, 0, 0.3, 0.33), blend=0.1,
     )  # fmt: skip
 
 
@@ -235,8 +238,8 @@ def _skirt(body: Charted) -> Tube:
         knots.append([0, height, (low[2] + high[2]) / 2])
         radii.append([(high[0] - low[0]) / 2 + flare, (high[2] - low[2]) / 2 + flare])
     return Tube(
-        part="skirt", knots=np.array(knots), radii=np.array(radii), front=(0.0, 0.0, 1.0), chain=("pelvis",), borders=(),
-        rings=20, segments=56, chart=(0, 0, 1.5, 0.5),
+        part="skirt", knots=np.array(knots), radii=np.array(radii), front=(0.0, 0.0, 1.0), chain=("pelvis",),
+        borders=(), rings=20, segments=56, chart=(0, 0, 1.5, 0.5),
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ ATLAS = 1.87  # metres of cloth along the side of the UV square
 
 def heads() -> dict[str, np.ndarray]:
     """Rest position of each joint, metres: 1.72 m tall, arms at 45 degrees."""
-    result = {
+    result: dict[str, tuple[float, ...]] = {
         "pelvis": (0, 0.95, 0),
         "spine": (0, 1.06, 0),
         "chest": (0, 1.20, 0),
@@ -62,7 +62,7 @@ def _tubes(*, skirt: bool) -> list[Tube]:
         )  # fmt: skip
         hip, knee, ankle = (joints[f"{name}_{side}"] for name in ("thigh", "shin", "foot"))
         leg = np.array([ankle - [0, 0.05, 0], ankle, (knee + 2 * ankle) / 3, (2 * knee + ankle) / 3, knee,
-                        (hip + 2 * knee) / 3, (2 * hip + knee) / 3, hip, hip + [-0.02 * sign, 0.06, 0]])  # fmt: skip
+                        (hip + 2 * knee) / 3, (2 * hip + knee) / 3, hip, hip - [0.02 * sign, -0.06, 0]])  # fmt: skip
         calf = np.array([[0.03, 0.03], [0.042, 0.046], [0.05, 0.058], [0.056, 0.062], [0.058, 0.062], [0.068, 0.073],
                          [0.08, 0.085], [0.085, 0.095], [0.02, 0.02]])  # fmt: skip
         tubes.append(
@@ -71,7 +71,8 @@ def _tubes(*, skirt: bool) -> list[Tube]:
                  rings=22, segments=14, chart=(0.47 * k, 0.42, 0.45, 0.87), blend=0.06)
         )  # fmt: skip
         toe = joints[f"toe_{side}"] * [1, 0, 1] + [0, 0.035, 0]
-        sole = np.array([toe + [0, -0.004, 0.09], toe + [0, 0, 0.07], toe, toe - [0, -0.01, 0.08], toe - [0, -0.014, 0.15],
+        sole = np.array([toe - [0, 0.004, -0.09], toe - [0, 0, -0.07], toe, toe - [0, -0.01, 0.08],
+                         toe - [0, -0.014, 0.15],
                          toe - [0, -0.01, 0.175]])  # fmt: skip
         thick = np.array([[0.01, 0.006], [0.034, 0.026], [0.046, 0.034], [0.04, 0.045], [0.036, 0.048], [0.012, 0.015]])
         tubes.append(

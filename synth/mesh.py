@@ -85,8 +85,8 @@ def locked_vertices(mesh: Charted) -> np.ndarray:
 def decimate(mesh: Charted, *, target: int, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Collapse vertices onto neighbours, flattest first, until `target` vertices are left.
 
-    `keep` `[s]` scales the cost of losing a vertex. Charts, parts and boundaries stay. Returns faces and UV faces into the
-    mesh's own vertices and UVs.
+    `keep` `[s]` scales the cost of losing a vertex. Charts, parts and boundaries stay. Returns faces and UV faces
+    into the mesh's own vertices and UVs.
     """
     work = _Collapser(mesh, keep)
     work.run(target)

@@ -1,7 +1,7 @@
-"""Motions: seeded generators that plan feet, pelvis, torso and arms over time, and a solver that turns plans into joints.
+"""Motions: seeded generators that plan feet, pelvis, torso and arms, and a solver that turns plans into joints.
 
-A plan plants each foot by the ball of its foot, so that feet neither slide nor leave the floor by accident; legs follow by
-two-bone inverse kinematics. The character faces +z, its left is +x.
+A plan plants the ball of each foot, so that feet neither slide nor leave the floor by accident; legs follow by two-bone
+inverse kinematics. The character faces +z, its left is +x.
 """
 
 from collections.abc import Callable
@@ -58,7 +58,7 @@ class Step:
 
 @dataclass(kw_only=True, slots=True)
 class Plan:
-    """What a generator decides, per time `[t]`; angles in radians, lengths in metres, zero is standing upright, arms hanging."""
+    """What a generator decides, per time `[t]`; radians and metres; zero is standing upright with hanging arms."""
 
     times: np.ndarray
     shift: np.ndarray  # [t, 3] of the pelvis
@@ -177,7 +177,7 @@ def turn(times: np.ndarray, rng: np.random.Generator) -> Plan:
     plan.shift[:, 1] = -0.03 + 0.01 * np.cos(6 * np.pi * x)
     plan.shift[:, 0] = 0.02 * np.sin(4 * np.pi * x)
     for arm in range(2):
-        plan.abduction[:, arm] += 0.45 * bump(x, 0, 1)
+        plan.abduction[:, arm] += 0.45 * bump(x, 0.0, 1.0)
         plan.elbow[:, arm] += 0.4 * bump(x, 0.1, 0.9)
         plan.flexion[:, arm] = SIGNS[arm] * sign * 0.3 * np.sin(np.pi * x)
     _plant(plan, yaw=float(plan.yaw[0]), width=0.1)
@@ -282,7 +282,7 @@ def feet_tracks(plan: Plan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def solve(skeleton: Skeleton, plan: Plan) -> np.ndarray:
-    """Degrees of freedom `[t, 3 + 3 j]` that follow a plan: the torso directly, the legs by two-bone inverse kinematics."""
+    """Degrees of freedom `[t, 3 + 3 j]` that follow a plan: the torso directly, legs by inverse kinematics."""
     names, heads = skeleton.names, skeleton.heads
     head = {name: heads[j] for j, name in enumerate(names)}
     count = len(plan.times)

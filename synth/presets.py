@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from ash.files import InputError
@@ -131,8 +131,3 @@ def require_space(scene: Scene, folder: Path) -> None:
         raise InputError(
             f"{folder}: the capture needs {needed / 1e9:.1f} GB more and the disk has {free / 1e9:.1f} GB free"
         )
-
-
-def with_outfit(scene: Scene, **strengths: float) -> Scene:
-    """The scene with other strengths of its outfit, for sweeps."""
-    return replace(scene, outfit=replace(scene.outfit, **strengths))

@@ -80,7 +80,7 @@ def probe() -> Renderer:
             return Renderer(variant="llvm_ad_rgb", libllvm=libllvm, mitsuba=version, note=note)
     version = _try("scalar_rgb", "")
     if version:
-        note = f"Mitsuba {version}, scalar_rgb: no LLVM from {OLDEST_LLVM} on was found, rendering takes three times as long"
+        note = f"Mitsuba {version}, scalar_rgb: no LLVM from {OLDEST_LLVM} on was found, rendering takes 3x as long"
         return Renderer(variant="scalar_rgb", libllvm="", mitsuba=version, note=note)
     raise InputError("Mitsuba does not render here: expected the mitsuba package to import (is libatomic1 installed?)")
 
@@ -243,8 +243,8 @@ class Studio:
                 "principal_point_offset_x": float(0.5 - centre[0] / width),
                 "principal_point_offset_y": float(0.5 - centre[1] / height),
                 "film": {
-                    "type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgba", "component_format": "float32",
-                    "rfilter": {"type": "box"}, "sample_border": False,
+                    "type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgba",
+                    "component_format": "float32", "rfilter": {"type": "box"}, "sample_border": False,
                 },
                 "sampler": {"type": "multijitter", "sample_count": 16},
             }

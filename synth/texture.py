@@ -91,7 +91,7 @@ def locate(body: Body, size: int) -> Texels:
 
 
 def paint(body: Body, *, size: int, seed: int) -> np.ndarray:
-    """Paint the body and its clothes: uint8 sRGB `[size, size, 3]`, row 0 at v = 1; colours run on past chart borders."""
+    """Paint the body and its clothes: uint8 sRGB `[size, size, 3]`, row 0 at v = 1; colours run past chart borders."""
     rng = np.random.default_rng(seed)
     texels = locate(body, size)
     grain = _grain(rng, size)[texels.rows, texels.columns]

@@ -1,0 +1,234 @@
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ash.dataset import (
+    Capture,
+    image_path,
+    load_capture,
+    pixels_path,
+    read_template_truth,
+    surface_path,
+    verify_capture,
+)
+from ash.files import InputError, read_arrays, sha256_of
+from synth import presets, render
+from synth.capture import make_capture, render_views, splits, wanted_views
+from synth.motion import Clip
+from synth.posing import dual_quaternion_skinning, skinning_transforms
+from synth.render import find_libllvm, llvm_version, probe
+from synth.scene import Outfit, Rig, Scene
+
+
+def small_scene(**changes) -> Scene:
+    """A mannequin at 64 x 64: four cameras, three frames to train and two to test."""
+    base = replace(
+        presets.scene("mannequin", size="ci"),
+        rig=Rig(cameras=4, held_out=1, width=64, height=64),
+        train=(Clip(generator="walk", frames=3),),
+        test=(Clip(generator="dance", frames=2),),
+        samples=4,
+        texture=256,
+        novel_view_stride=2,
+    )
+    return replace(base, **changes)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_capture(small_scene(), tmp_path_factory.mktemp("capture") / "small", workers=1)
+
+
+@pytest.fixture(scope="module")
+def capture(folder: Path) -> Capture:
+    return load_capture(folder)
+
+
+def _surface(capture: Capture, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    faces = read_arrays(capture.folder / "truth" / "surface.npz", expected=("faces",))["faces"]
+    return read_arrays(surface_path(capture.folder, frame), expected=("vertices",))["vertices"].astype(
+        np.float64
+    ), faces
+
+
+def test_the_capture_is_whole(capture: Capture):
+    assert verify_capture(capture.folder) == []
+    pairs = {pair for split in capture.splits.values() for pair in split.views}
+    assert len(pairs) == 3 * 3 + 1 * 1 + 1 * 2
+    assert {(path.parent.name, int(path.stem)) for path in (capture.folder / "frames").rglob("*.png")} == pairs
+    train, view, pose = (capture.splits[name] for name in ("train", "novel_view", "novel_pose"))
+    assert not set(train.cameras) & set(view.cameras) and set(view.frames) <= set(train.frames)
+    assert not set(pose.frames) & set(train.frames) and pose.cameras == view.cameras
+
+
+def test_every_pixel_knows_what_it_sees(capture: Capture):
+    """Triangle and barycentrics, projected by our own camera, land in the middle of their pixel."""
+    for camera, frame in capture.splits["train"].views:
+        vertices, faces = _surface(capture, frame)
+        truth = read_arrays(pixels_path(capture.folder, camera, frame), expected=("triangle", "barycentric", "noise"))
+        seen = truth["triangle"] >= 0
+        rest = truth["barycentric"][seen].astype(np.float64)
+        weights = np.concatenate([1 - rest.sum(axis=1, keepdims=True), rest], axis=1)
+        points = np.einsum("nk,nka->na", weights, vertices[faces[truth["triangle"][seen]]])
+        pixels, depth = capture.cameras[camera].project(points)
+        rows, columns = np.nonzero(seen)
+        assert np.abs(pixels - np.stack([columns + 0.5, rows + 0.5], axis=1)).max() < 0.02
+        assert (depth > 0.5).all()
+        alpha = capture.image(camera, frame)[..., 3]
+        assert (seen == (alpha > 127)).mean() > 0.99
+        assert (truth["noise"][alpha > 0] >= 0).all() and truth["noise"][alpha > 127].mean() < 0.02
+
+
+def test_visible_vertices_hit_depth_and_mask(capture: Capture):
+    """Vertices that nothing hides project into the mask, at the depth that the picture's own truth tells."""
+    camera, frame = capture.splits["train"].views[0]
+    vertices, faces = _surface(capture, frame)
+    view = capture.cameras[camera]
+    truth = read_arrays(pixels_path(capture.folder, camera, frame), expected=("triangle", "barycentric"))
+    seen = truth["triangle"] >= 0
+    points = vertices[faces[truth["triangle"][seen]]]
+    _, corner_depth = view.project(points)
+    nearest, farthest = np.zeros(seen.shape), np.zeros(seen.shape)
+    nearest[seen], farthest[seen] = corner_depth.min(axis=1), corner_depth.max(axis=1)
+    corners = np.unique(faces[truth["triangle"][seen]])
+    pixels, depth = view.project(vertices[corners])
+    columns, rows = np.clip(np.floor(pixels).astype(int), 0, 63).T
+    inside = seen[rows, columns]
+    assert inside.mean() > 0.9  # The rest lies on the silhouette.
+    visible = inside & (depth < farthest[rows, columns] + 0.02)
+    assert (depth[visible] > nearest[rows, columns][visible] - 0.06).mean() > 0.99
+
+
+def test_the_person_fills_the_frame(capture: Capture):
+    for camera in capture.cameras:
+        heights = []
+        for split in capture.splits.values():
+            for name, frame in split.views:
+                if name == camera:
+                    alpha = capture.image(name, frame)[..., 3]
+                    assert not alpha[[0, -1]].any() and not alpha[:, [0, -1]].any()
+                    heights.append(np.flatnonzero(alpha.any(axis=1)))
+        assert max(np.ptp(rows) + 1 for rows in heights) >= 0.75 * 64
+
+
+def test_skinned_template_is_wrong_only_by_what_the_scene_adds(tmp_path: Path, capture: Capture):
+    def error(outfit: Outfit) -> np.ndarray:
+        from synth import cloth
+        from synth.mannequin import mannequin
+        from synth.motion import make_motion
+
+        body = mannequin(skirt=outfit.skirt)
+        motion = make_motion(body.skeleton, (Clip(generator="walk", frames=3),), fps=12.0, seed=0)
+        truth = cloth.true_surface(body, motion, outfit, seed=1)[:, body.kept]
+        template = body.template()
+        transforms = skinning_transforms(body.skeleton, motion.dofs)
+        skinned = [dual_quaternion_skinning(template.vertices, template.skin_weights, frame) for frame in transforms]
+        return np.linalg.norm(np.stack(skinned) - truth, axis=-1)
+
+    assert error(Outfit(skirt=True)).max() < 1e-12
+    folds = error(Outfit(skirt=True, folds_mm=5.0))
+    assert 0.001 < np.sqrt(np.mean(folds**2)) < 0.005 and folds.max() < 0.03
+    assert error(Outfit(skirt=True, swing=1.0)).max() > 0.02
+    truth = read_template_truth(capture)
+    assert truth.shape == (5, len(capture.template.vertices), 3)
+
+
+def test_bytes_do_not_depend_on_order_or_sharding(tmp_path: Path, folder: Path):
+    """Two shards that render the frames backwards, one image at a time, make the same images."""
+    other = tmp_path / "other"
+    shutil.copytree(folder, other)
+    scene = small_scene()
+    views = wanted_views(scene)
+    for view in views:
+        image_path(other, view.camera, view.frame).unlink()
+        pixels_path(other, view.camera, view.frame).unlink()
+    for shard in (views[1::2], views[0::2]):
+        for view in reversed(shard):
+            assert render_views(scene, other, probe(), [view]) == 1
+    assert verify_capture(other) == []
+
+
+def test_a_killed_capture_resumes_to_the_same_manifest(tmp_path: Path, folder: Path):
+    program = (
+        "from pathlib import Path; import sys\n"
+        "from test_capture import small_scene; from synth.capture import make_capture\n"
+        "if __name__ == '__main__': make_capture(small_scene(), Path(sys.argv[1]))\n"
+    )
+    script = tmp_path / "make.py"
+    script.write_text(program)
+    target = tmp_path / "killed"
+    environment = dict(os.environ, PYTHONPATH=os.pathsep.join([str(Path(__file__).parent), *sys.path]))
+    process = subprocess.Popen([sys.executable, str(script), str(target)], env=environment)
+    deadline = time.monotonic() + 60
+    while len(list(target.rglob("*.png"))) < 4 and time.monotonic() < deadline:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    (target / ".half-written.png.x1").write_bytes(b"left by a kill")
+    with pytest.raises(InputError, match="unfinished"):
+        load_capture(target)
+    make_capture(small_scene(), target)
+    assert sha256_of(target / "manifest.json") == sha256_of(folder / "manifest.json")
+    assert verify_capture(target) == []
+
+
+def test_a_finished_capture_returns_at_once_and_a_lost_image_comes_back(tmp_path: Path, folder: Path):
+    other = tmp_path / "other"
+    shutil.copytree(folder, other)
+    told: list[tuple[int, int]] = []
+    make_capture(small_scene(), other, progress=lambda done, total: told.append((done, total)))
+    assert told == []
+    lost = next(other.rglob("frames/*/*.png"))
+    lost.unlink()
+    make_capture(small_scene(), other, progress=lambda done, total: told.append((done, total)))
+    assert told[0] == (11, 12) and told[-1] == (12, 12)
+    assert sha256_of(other / "manifest.json") == sha256_of(folder / "manifest.json")
+
+
+def test_wrong_folders_are_refused(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch):
+    with pytest.raises(InputError, match="other parameters"):
+        make_capture(small_scene(seed=1), folder)
+    (tmp_path / "letters.txt").write_text("mine")
+    with pytest.raises(InputError, match="empty folder"):
+        make_capture(small_scene(), tmp_path)
+    (tmp_path / "file").write_text("a file")
+    with pytest.raises(InputError, match="cannot be written"):
+        make_capture(small_scene(), tmp_path / "file" / "below")
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(presets.shutil, "disk_usage", lambda path: usage._replace(free=1000))
+    with pytest.raises(InputError, match="GB free"):
+        make_capture(small_scene(), tmp_path / "full")
+
+
+def test_names_and_sizes_are_checked():
+    with pytest.raises(InputError, match=r"expected one of .*mannequin"):
+        presets.scene("mannekin", size="ci")
+    with pytest.raises(InputError, match="expected one of ci, quick"):
+        presets.scene("loose", size="huge")
+    with pytest.raises(InputError, match="held out"):
+        Rig(cameras=4, held_out=4)
+    assert presets.scene("loose", size="quick") == presets.scene("loose", size="quick")
+    assert presets.scene("loose", size="quick").identity != presets.scene("loose", size="quick", seed=1).identity
+
+
+@pytest.mark.parametrize("name", ["ci", "quick"])
+def test_the_estimate_counts_what_is_made(name: str):
+    scene = presets.scene("mannequin", size=name)
+    assert presets.estimate(scene).images == len(wanted_views(scene))
+    assert len(splits(scene)["novel_view"].views) > 0
+
+
+def test_a_library_that_aborts_the_process_is_never_chosen(monkeypatch: pytest.MonkeyPatch):
+    assert [
+        llvm_version(name) for name in ("libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM-14.0.6.so.1", "libfoo.so")
+    ] == [15, 19, 14, 0]
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/usr/lib/libLLVM-15.so.1")
+    assert all(llvm_version(path) >= render.OLDEST_LLVM for path in find_libllvm())
