@@ -1,12 +1,14 @@
 """The suites: matrices of scenes x methods x seeds, declared here and nowhere else."""
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, entry_points, version
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from ash.files import InputError
 
@@ -113,13 +115,37 @@ def find_suite(name: str, *, seeds: int | None = None) -> Suite:
     return SUITES[name] if seeds is None else replace(SUITES[name], seeds=seeds)
 
 
-def methods() -> dict[str, EntryPoint]:
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Method:
+    """An installed method: where its factory is (`package.module:function`) and which distribution brought it."""
+
+    name: str
+    target: str
+    distribution: str
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether its sources are among those that are hashed."""
+        return self.target.split(".")[0] in DECIDING_PACKAGES
+
+    def load(self) -> Callable[..., Any]:
+        """Import the factory."""
+        module, _, function = self.target.partition(":")
+        factory: Callable[..., Any] = getattr(import_module(module), function)
+        return factory
+
+
+def methods() -> dict[str, Method]:
     """All installed methods, ours and anyone's."""
-    return {entry.name: entry for entry in sorted(entry_points(group=METHOD_GROUP), key=lambda entry: entry.name)}
+    found = {}
+    for entry in sorted(entry_points(group=METHOD_GROUP), key=lambda entry: entry.name):
+        distribution = f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else ""
+        found[entry.name] = Method(name=entry.name, target=entry.value, distribution=distribution)
+    return found
 
 
-def find_method(name: str) -> EntryPoint:
-    """A method's entry point by name."""
+def find_method(name: str) -> Method:
+    """An installed method by name."""
     known = methods()
     if name not in known:
         raise InputError(f"unknown method {name!r}, expected one of {', '.join(known) or '(none installed)'}")
@@ -135,9 +161,9 @@ def code_version(method: str) -> str:
         root = _package_folder(package)
         _add_files(digest, root, sorted(path for path in root.rglob("*") if path.suffix in SOURCE_SUFFIXES))
     _add_files(digest, benchmarks, [benchmarks / name for name in DECIDING_MODULES])
-    entry = find_method(method)
-    if entry.value.split(".")[0] not in DECIDING_PACKAGES and entry.dist is not None:
-        digest.update(f"{entry.value} {entry.dist.name} {entry.dist.version}".encode())
+    found = find_method(method)
+    if not found.is_ours:
+        digest.update(f"{found.target} {found.distribution}".encode())
     return digest.hexdigest()[:16]
 
 
