@@ -174,13 +174,17 @@ def linear_axis(values: Sequence[float], *, start: float, end: float, pad: float
 
 
 def log_axis(values: Sequence[float], *, start: float, end: float, tight: bool = False) -> Axis:
-    """A logarithmic axis with ticks at 1, 2, 5 times powers of ten."""
+    """A logarithmic axis with ticks at 1, 2, 5 times powers of ten, closer ones where that leaves fewer than three."""
     positive = [max(value, 1e-3) for value in values]
     low, high = min(positive), max(positive)
-    room = 1.02 if tight else max(1.5, (high / low) ** 0.14)
+    room = 1.02 if tight else max(1.5, (high / low) ** 0.14, (4 * low / high) ** 0.5)
     low, high = low / room, high * room
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    ticks = tuple(m * 10.0**p for p in powers for m in (1, 2, 5) if low <= m * 10.0**p <= high)
+    ticks: tuple[float, ...] = ()
+    for multiples in ((1, 2, 5), (1, 2, 3, 5, 7), tuple(range(1, 10))):
+        ticks = tuple(m * 10.0**p for p in powers for m in multiples if low <= m * 10.0**p <= high)
+        if len(ticks) >= 3:
+            break
     return Axis(low, high, start, end, True, ticks)
 
 

@@ -31,6 +31,16 @@ examples:
 exit codes: 0 done, 1 a cell or check failed, 2 wrong input, 130 interrupted (the same command goes on)"""
 
 
+ON_A_CLUSTER = """\
+on a cluster whose machines share a disk, as a Slurm array of 20 jobs, each one core:
+  ash-bench synth tight && ash-bench synth loose                once, before the array
+  sbatch --array=1-20 --cpus-per-task=1 --wrap 'ash-bench run table --out runs/table --workers 1 \\
+      --shard $SLURM_ARRAY_TASK_ID/20'                         all into one folder; each resumes if started again
+  ash-bench report runs/table
+without a shared disk, give each shard its own --out and put them together with `ash-bench merge`;
+on a Dask cluster, ash-bench run table --executor dask://HOST:8786"""
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run a verb and return the exit code."""
     arguments = _parser().parse_args(argv)
@@ -269,6 +279,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_run(verbs: Any) -> None:
     verb = _verb(verbs, run, "run", "run a suite: capture, train, evaluate, report")
+    verb.formatter_class = argparse.RawDescriptionHelpFormatter
+    verb.epilog = ON_A_CLUSTER
     verb.add_argument("suite", nargs="?", default="quick", metavar="SUITE", help="quick (default), ci, ...")
     verb.add_argument("--out", type=Path, metavar="DIR", help="where results go (default: runs/SUITE)")
     verb.add_argument(

@@ -78,6 +78,8 @@ class Suite:
 
 MAIN_METHODS = ("ash", "ddc", "wo_disp", "wo_mot", "ash_truth", "ddc_truth")
 
+ABLATIONS = ("mlp", "res_128", "res_512", "cams_12", "cams_30", "cams_60")
+
 SUITES = {
     suite.name: suite
     for suite in (
@@ -90,6 +92,16 @@ SUITES = {
             preset="cpu",
             seeds=1,
             cell_minutes=2.5,
+        ),
+        Suite(
+            name="table",
+            about="the paper's two comparisons and two ablations on both outfits, three seeds",
+            scenes=("tight", "loose"),
+            size="quick",
+            methods=(*MAIN_METHODS[:4], *ABLATIONS, *MAIN_METHODS[4:]),
+            preset="cpu",
+            seeds=3,
+            cell_minutes=3.0,
         ),
         Suite(
             name="ci",
