@@ -52,6 +52,9 @@ def main(argv: list[str] | None = None) -> int:
             return verb(arguments)
     except InputError as error:
         return _refuse(str(error))
+    except BrokenPipeError:  # Whoever read our output has seen enough (`| head`).
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
     except OSError as error:
         line = disk_problem(error)
         if line is None:
@@ -69,6 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     from benchmarks.runs import RunOptions, failures, results_of, run_suite
 
     suite = find_suite(arguments.suite, seeds=arguments.seeds)
+    _use_lpips(arguments.lpips_weights)
     options = RunOptions(
         out=arguments.out or Path("runs") / suite.name,
         data=arguments.data,
@@ -167,6 +171,7 @@ def rescore(arguments: argparse.Namespace) -> int:
     """Recompute every quality of a run from the stored predictions."""
     from benchmarks.run import rescore_cell
 
+    _use_lpips(arguments.lpips_weights)
     return _again(arguments.run, rescore_cell)
 
 
@@ -262,6 +267,7 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument("run", type=Path, metavar="RUN")
     verb = _verb(verbs, rescore, "rescore", "recompute every quality from a run's stored predictions")
     verb.add_argument("run", type=Path, metavar="RUN")
+    _add_lpips(verb)
     verb = _verb(verbs, report, "report", "write the report of a run again")
     verb.add_argument("run", type=Path, metavar="RUN")
     _add_gate(verbs)
@@ -290,8 +296,25 @@ def _add_run(verbs: Any) -> None:
     verb.add_argument("--workers", type=_positive, metavar="N", help="cells side by side (default: all cores)")
     verb.add_argument("--executor", default="local", help="local (default), or dask://HOST:PORT for a cluster")
     verb.add_argument("--shard", metavar="i/n", help="do only every n-th cell, from the i-th; for job arrays")
+    _add_lpips(verb)
     verb.add_argument("--retry-failed", action="store_true", help="run cells again that failed before")
     verb.add_argument("--dry-run", action="store_true", help="print cells, hours and gigabytes, and do nothing")
+
+
+def _add_lpips(verb: argparse.ArgumentParser) -> None:
+    about = "AlexNet's weights of torchvision, for LPIPS (default: torch's cache; without them LPIPS is n/a)"
+    verb.add_argument("--lpips-weights", type=Path, metavar="FILE", help=about)
+
+
+def _use_lpips(weights: Path | None) -> None:
+    """Hand the user's weights on to the cells' processes, once they are known to load."""
+    if weights is None:
+        return
+    from benchmarks.lpips import Lpips
+    from benchmarks.weights import ENVIRONMENT
+
+    os.environ[ENVIRONMENT] = str(weights.resolve())
+    Lpips(weights)
 
 
 def _add_gate(verbs: Any) -> None:

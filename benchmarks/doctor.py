@@ -12,7 +12,6 @@ import psutil
 from ash.files import InputError
 from benchmarks import provenance
 
-ALEXNET = Path.home() / ".cache" / "torch" / "hub" / "checkpoints" / "alexnet-owt-7be5be79.pth"
 QUICK_RUN_GB = 2.0
 
 
@@ -93,8 +92,14 @@ def _gpu() -> Finding:
 
 
 def _lpips() -> Finding:
-    if ALEXNET.exists():
-        return Finding(what="LPIPS weights", found=str(ALEXNET), consequence="LPIPS can be computed")
+    from benchmarks.weights import weights_file
+
+    try:
+        path = weights_file()
+    except InputError as error:
+        return Finding(what="LPIPS weights", found=str(error), consequence="LPIPS cannot be computed", good=False)
+    if path is not None:
+        return Finding(what="LPIPS weights", found=str(path), consequence="LPIPS is computed")
     return Finding(what="LPIPS weights", found="none", consequence="LPIPS is n/a; FLIP is the perceptual metric")
 
 

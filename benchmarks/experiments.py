@@ -19,7 +19,7 @@ ORACLES = frozenset({"ash_truth", "ddc_truth", "oracle_texture"})
 
 # Sources of ours that decide a cell's outcome; a change in any other file (a report, say) leaves results valid.
 DECIDING_PACKAGES = ("ash", "baselines")
-DECIDING_MODULES = ("cells.py", "metrics.py", "run.py", "timing.py", "views.py")
+DECIDING_MODULES = ("cells.py", "lpips.py", "metrics.py", "run.py", "timing.py", "views.py")
 SOURCE_SUFFIXES = {".py", ".cpp", ".hpp", ".h", ".inc"}
 
 

@@ -67,7 +67,9 @@ def compare(capture: Capture, cells: Sequence[Cell], results: Sequence[CellResul
         stored_prediction(cell, capture, View(split=view.split, camera=view.camera, frame=view.frame)) for cell in cells
     ]
     crop = _crop([truth, *predictions])
-    images = [Tile(caption="Truth", score=f"camera {view.camera}, frame {view.frame}", pixels=_on_paper(truth[crop]))]
+    ceiling = view.scores.get(("foreground", "noise_ceiling"))
+    noise = "" if ceiling is None else f"noise ceiling {ceiling:.1f} dB"
+    images = [Tile(caption="Truth", score=noise, pixels=_on_paper(truth[crop]))]
     errors = []
     for cell, result, prediction in zip(cells, results, predictions, strict=True):
         scores = next(

@@ -317,7 +317,7 @@ def _pictures(run: Run, scores: Scores, scene: str) -> tuple[list[Comparison], s
 
 
 def _running_median(values: Sequence[float]) -> list[float]:
-    half = SMOOTH // 2
+    half = min(SMOOTH // 2, len(values) // 12)  # A short log is shown as it is.
     windows = [sorted(values[max(0, i - half) : i + half + 1]) for i in range(len(values))]
     return [window[len(window) // 2] for window in windows]
 

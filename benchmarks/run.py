@@ -12,6 +12,7 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import cast
@@ -41,6 +42,7 @@ from benchmarks.experiments import ORACLES, find_method
 from benchmarks.metrics import IMAGE_SPLITS, VIEW_SCORES
 from benchmarks.timing import time_frames
 from benchmarks.views import View, evaluated_views
+from benchmarks.weights import weights_file
 
 CHECKPOINT = "model.safetensors"
 GEOMETRY_FRAMES = 4
@@ -204,6 +206,9 @@ def _finished(cell: Cell) -> CellResult:
 def _score(cell: Cell, capture: Capture, view: View, prediction: np.ndarray) -> ViewScore:
     truth = metrics.on_black(capture.image(view.camera, view.frame))
     scores = metrics.score_view(prediction, truth)
+    perceptual = _perceptual()
+    if perceptual is not None:
+        scores["full", "lpips"] = perceptual(prediction[..., :3], truth[..., :3])
     noise = pixels_path(capture.folder, view.camera, view.frame)
     if noise.exists():
         variance = read_arrays(noise, expected=("noise",))["noise"]
@@ -212,12 +217,23 @@ def _score(cell: Cell, capture: Capture, view: View, prediction: np.ndarray) -> 
     return ViewScore(split=view.split, camera=view.camera, frame=view.frame, prediction=digest, scores=scores)
 
 
+@cache
+def _perceptual() -> Callable[[np.ndarray, np.ndarray], float] | None:
+    """LPIPS, where the user gave its weights."""
+    path = weights_file()
+    if path is None:
+        return None
+    from benchmarks.lpips import Lpips
+
+    return Lpips(path)
+
+
 def _image_summary(scored: list[ViewScore]) -> tuple[Summary, ...]:
     """Means over the images of each split."""
     rows = []
     for split in IMAGE_SPLITS:
         views = [view for view in scored if view.split == split]
-        for region, metric in (*VIEW_SCORES, ("foreground", "noise_ceiling")):
+        for region, metric in (*VIEW_SCORES, ("full", "lpips"), ("foreground", "noise_ceiling")):
             values = [view.scores[region, metric] for view in views if (region, metric) in view.scores]
             if values:
                 rows.append(Summary(split=split, region=region, metric=metric, value=float(np.mean(values))))

@@ -1,0 +1,91 @@
+"""LPIPS with AlexNet (Zhang et al. 2018): the user's backbone weights, the heads of the `lpips` package's files.
+
+Neither `torchvision` nor `lpips` is imported: beside a CPU build of torch the former does not import, and so the latter
+neither. Without the backbone's weights there is no LPIPS, and no stand-in under its name.
+"""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ash.files import InputError
+
+TAPS = (1, 4, 7, 9, 11)  # The layers of AlexNet whose activations are compared: after each ReLU.
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+
+
+class Lpips:
+    """Distance of two images; small is alike."""
+
+    def __init__(self, backbone: Path) -> None:
+        self.trunk = _trunk(_load(backbone), backbone)
+        heads = _load(_heads_file())
+        self.heads = [heads[f"lin{i}.model.1.weight"] for i in range(len(TAPS))]
+
+    def __call__(self, predicted: np.ndarray, truth: np.ndarray) -> float:
+        """LPIPS x 1000 of uint8 images `[h, w, 3]`, whole frame."""
+        with torch.no_grad():
+            pair = [_activations(self.trunk, _prepared(image)) for image in (predicted, truth)]
+            terms = [(((a - b) ** 2) * head).sum(1).mean() for a, b, head in zip(*pair, self.heads, strict=True)]
+        return 1000 * float(torch.stack(terms).sum())
+
+
+def _prepared(image: np.ndarray) -> Float[Tensor, "1 3 h w"]:
+    values = torch.from_numpy(image.astype(np.float32) / 127.5 - 1).permute(2, 0, 1)[None]
+    return (values - torch.tensor(SHIFT).view(1, 3, 1, 1)) / torch.tensor(SCALE).view(1, 3, 1, 1)
+
+
+def _activations(trunk: nn.Sequential, image: Float[Tensor, "1 3 h w"]) -> list[Tensor]:
+    """Activations at the taps, each pixel's vector of channels scaled to unit length."""
+    found = []
+    for index, layer in enumerate(trunk):
+        image = layer(image)
+        if index in TAPS:
+            found.append(image / (image.pow(2).sum(1, keepdim=True).sqrt() + 1e-10))
+    return found
+
+
+def _trunk(weights: dict[str, Tensor], path: Path) -> nn.Sequential:
+    """AlexNet's convolutional part (Krizhevsky 2014), up to its last ReLU."""
+    trunk = nn.Sequential(
+        nn.Conv2d(3, 64, 11, stride=4, padding=2),
+        nn.ReLU(),
+        nn.MaxPool2d(3, stride=2),
+        nn.Conv2d(64, 192, 5, padding=2),
+        nn.ReLU(),
+        nn.MaxPool2d(3, stride=2),
+        nn.Conv2d(192, 384, 3, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(384, 256, 3, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(256, 256, 3, padding=1),
+        nn.ReLU(),
+    )
+    own = {name.removeprefix("features."): tensor for name, tensor in weights.items() if name.startswith("features.")}
+    try:
+        trunk.load_state_dict(own)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise InputError(f"{path}: expected torchvision's AlexNet weights ({reason})") from error
+    return trunk.eval()
+
+
+def _load(path: Path) -> dict[str, Tensor]:
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises half a dozen kinds for a damaged file
+        raise InputError(f"{path}: expected a file of tensors ({type(error).__name__})") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: expected a dictionary of tensors, got {type(content).__name__}")
+    return content
+
+
+def _heads_file() -> Path:
+    spec = find_spec("lpips")
+    if spec is None or spec.origin is None:
+        raise InputError("LPIPS needs the files of the package lpips: pip install --no-deps lpips")
+    return Path(spec.origin).parent / "weights" / "v0.1" / "alex.pth"
