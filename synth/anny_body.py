@@ -16,7 +16,7 @@ import numpy as np
 
 from ash.dataset import Skeleton
 from ash.files import InputError, read_arrays, write_arrays
-from synth.motion import JOINTS, SIDES, SIGNS
+from synth.plans import JOINTS, SIDES, SIGNS
 from synth.posing import bone_frames, linear_blend_skinning, rotation_between, rotmat_to_rotvec, rotvec_to_rotmat
 
 FORMAT = 3

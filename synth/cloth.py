@@ -20,6 +20,7 @@ FOLDING_JOINTS = (
     *(f"{n}_{s}" for n in ("upper_arm", "forearm", "thigh", "shin") for s in ("left", "right")),
 )
 GRAVITY = 9.81
+SWAY, TWIST = 0.18, 0.3  # most that air and cloth let a skirt swing (of its length) and lag (radians)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -143,12 +144,13 @@ def _with_swing(body: Body, motion: Motion, posed: np.ndarray, strength: float) 
 def _over_thighs(body: Body, frames: np.ndarray, upright: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """The skirt's rest points `[v, 3]`, its front raised with thighs that swing forward, its back with the others."""
     names, heads = body.skeleton.names, body.skeleton.heads
-    pitch, hips = [], []
+    pitch, roll, hips = [], [], []
     for side in ("left", "right"):
         hip, knee = names.index(f"thigh_{side}"), names.index(f"shin_{side}")
         thigh = (frames[knee, :3, 3] - frames[hip, :3, 3]) @ upright
         straight = heads[knee] - heads[hip]
         pitch.append(np.arctan2(thigh[2], -thigh[1]) - np.arctan2(straight[2], -straight[1]))
+        roll.append(np.arctan2(thigh[0], -thigh[1]) - np.arctan2(straight[0], -straight[1]))
         hips.append(heads[hip])
     left = 0.5 + 0.5 * np.tanh(rest[:, 0] / 0.06)
     hip = np.mean(hips, axis=0) * [0, 1, 1]
@@ -157,8 +159,8 @@ def _over_thighs(body: Body, frames: np.ndarray, upright: np.ndarray, rest: np.n
     back = left * min(pitch[0], 0) + (1 - left) * min(pitch[1], 0)
     below = np.clip((hip[1] + 0.06 - rest[:, 1]) / 0.12, 0, 1)
     angle = below * (front * forward + (1 - front) * back)
-    zero = np.zeros_like(angle)
-    turned = rotvec_to_rotmat(np.stack([-angle, zero, zero], axis=1))
+    sideways = 0.8 * below * np.clip(left * roll[0] + (1 - left) * roll[1], -0.5, 0.5)
+    turned = rotvec_to_rotmat(np.stack([-angle, np.zeros_like(angle), sideways], axis=1))
     return hip + np.einsum("vab,vb->va", turned, rest - hip)
 
 
@@ -187,9 +189,9 @@ def pendulum(
         states.append(state[0].copy())
     swung = np.array(states)
     sway = np.stack(
-        [0.35 * np.tanh(swung[:, 0] / 0.35), np.zeros(len(swung)), 0.35 * np.tanh(swung[:, 1] / 0.35)], axis=1
+        [SWAY * np.tanh(swung[:, 0] / SWAY), np.zeros(len(swung)), SWAY * np.tanh(swung[:, 1] / SWAY)], axis=1
     )
-    return sway, 0.8 * np.tanh(swung[:, 2] / 0.8), turn(times, 1)
+    return sway, TWIST * np.tanh(swung[:, 2] / TWIST), turn(times, 1)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -211,7 +213,7 @@ def leg_profiles(body: Body, bins: int = 8) -> list[LegProfile]:
             own = (body.skin_weights[:, start] > 0.5) & ~body.surface.vertices_of("skirt")
             along, radius, _ = _cylindrical(body.surface.vertices[own], heads[start], heads[end])
             place = np.clip((along * bins).astype(int), 0, bins - 1)
-            radii = np.array([np.quantile(radius[place == k], 0.9) if (place == k).any() else 0 for k in range(bins)])
+            radii = np.array([np.quantile(radius[place == k], 0.6) if (place == k).any() else 0 for k in range(bins)])
             profiles.append(LegProfile(start=start, end=end, radii=radii))
     return profiles
 
@@ -233,7 +235,7 @@ def clear_legs(
     vertices: np.ndarray,
     *,
     cloth: np.ndarray,
-    margin: float = 0.015,
+    margin: float = 0.01,
 ) -> None:
     """Move cloth that has legs inside or outside of it outwards, in place, along its own normals until it clears them.
 

@@ -15,7 +15,7 @@ from synth import body, mesh, tubes
 from synth.anny_body import bake_key, baked_body, cache_folder
 from synth.body import PARTS, Body, Face, Surface, neighbour_mean, vertex_normals
 from synth.mesh import Charted, decimate, pack, subdivide, uv_charts
-from synth.motion import JOINTS, SIDES, make_skeleton
+from synth.plans import JOINTS, SIDES, make_skeleton
 from synth.tubes import Tube, chain_weights, chart_uvs, grid_faces, lattice, skirt_weights
 
 TEMPLATE_VERTICES = 7000
@@ -213,7 +213,8 @@ def _shoe(skeleton: Skeleton, side: str) -> Tube:
     rings = np.array(
         [
             (0.107, 0.028, 0.002, 0.002), (0.104, 0.028, 0.016, 0.012), (0.09, 0.030, 0.034, 0.022),
-            (0.04, 0.034, 0.050, 0.031), (-0.02, 0.039, 0.050, 0.038), (-0.09, 0.050, 0.043, 0.049), (-0.15, 0.066, 0.042, 0.066),
+            (0.04, 0.034, 0.050, 0.031), (-0.02, 0.039, 0.050, 0.038),
+            (-0.09, 0.050, 0.043, 0.049), (-0.15, 0.066, 0.042, 0.066),
             (-0.195, 0.064, 0.038, 0.062),
             (-0.218, 0.055, 0.02, 0.04), (-0.223, 0.052, 0.002, 0.003),
         ]

@@ -3,7 +3,7 @@
 import numpy as np
 
 from synth.body import PARTS, Body, Face, Surface
-from synth.motion import SIDES, SIGNS, make_skeleton
+from synth.plans import SIDES, SIGNS, make_skeleton
 from synth.tubes import Tube, chain_weights, chart_uvs, grid_faces, lattice, skirt_weights
 
 ATLAS = 1.87  # metres of cloth along the side of the UV square

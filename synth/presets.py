@@ -2,7 +2,8 @@
 
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from ash.files import InputError
@@ -30,7 +31,7 @@ def _size(name: str) -> Size:
         rig = Rig(cameras=6, held_out=2, width=128, height=128)
         return Size(rig=rig, repeats=1, frames=4, test_frames=3, stride=3, samples=16, texture=512)
     if name == "quick":
-        return Size(rig=Rig(), repeats=1, frames=10, test_frames=12, stride=5, samples=48, texture=2048)
+        return Size(rig=Rig(), repeats=1, frames=10, test_frames=12, stride=5, samples=56, texture=2048)
     if name == "table":
         rig = Rig(cameras=34, held_out=4, width=512, height=512)
         return Size(rig=rig, repeats=4, frames=20, test_frames=80, stride=20, samples=128, texture=4096)
@@ -67,7 +68,7 @@ def mannequin(*, size: str, seed: int) -> Scene:
 
 def loose(*, size: str, seed: int) -> Scene:
     """A realistic body in loose clothes and a swinging skirt, everything on: the default of the main job."""
-    outfit = Outfit(skirt=True, folds_mm=7.0, slack_mm=12.0, swing=1.0, scan_mm=4.0)
+    outfit = Outfit(skirt=True, folds_mm=7.0, slack_mm=12.0, swing=0.6, scan_mm=4.0)
     return _base("loose", size, seed, body="anny", outfit=outfit)
 
 
@@ -76,7 +77,50 @@ def tight(*, size: str, seed: int) -> Scene:
     return _base("tight", size, seed, body="anny", outfit=Outfit(folds_mm=3.0, scan_mm=1.0))
 
 
-SCENES: dict[str, Callable[..., Scene]] = {"mannequin": mannequin, "loose": loose, "tight": tight}
+def skinned(*, size: str, seed: int) -> Scene:
+    """Articulation only: the template with the true skinning is exact. The scene that every rung adds to.
+
+    At size `ci` the body is the mannequin, so that all rungs together take minutes and need no body model.
+    """
+    amount = _size(size)
+    kinds = ("walk", "squat") if size == "ci" else ("walk", "reach", "run", "squat")
+    base = _base("skinned", size, seed, body="mannequin" if size == "ci" else "anny", outfit=Outfit(skirt=True))
+    clips = tuple(Clip(generator=kind, frames=amount.frames) for kind in kinds * amount.repeats)
+    return replace(base, train=clips)
+
+
+def rung(name: str, *, size: str, seed: int = 0, strength: float = 1.0) -> Scene:
+    """A rung: `skinned` with one phenomenon, whose strength 0 gives the images of `skinned` back bit for bit."""
+    base = replace(skinned(size=size, seed=seed), name=name)
+    if name == "wrinkles":
+        return replace(base, outfit=replace(base.outfit, folds_mm=7.0 * strength))
+    if name == "swing":
+        return replace(base, outfit=replace(base.outfit, swing=strength))
+    if name == "lit":
+        return replace(base, light=replace(base.light, falloff=strength))
+    if name == "glossy":
+        return replace(base, light=replace(base.light, gloss=strength))
+    if name == "turning":
+        return replace(base, test=tuple(replace(clip, yaw=2.4 * strength) for clip in base.test))
+    raise InputError(f"unknown rung {name!r}, expected one of {', '.join(RUNGS)}")
+
+
+def still(*, size: str, seed: int) -> Scene:
+    """One pose: the textured body, path-traced. Static Gaussians suffice."""
+    base = skinned(size=size, seed=seed)
+    train, test = (Clip(generator="stand", frames=frames) for frames in (4, 2))
+    return replace(base, name="still", train=(train,), test=(test,), novel_view_stride=2)
+
+
+RUNGS = ("wrinkles", "swing", "lit", "glossy", "turning")
+SCENES: dict[str, Callable[..., Scene]] = {
+    "mannequin": mannequin,
+    "still": still,
+    "skinned": skinned,
+    **{name: partial(rung, name) for name in RUNGS},
+    "tight": tight,
+    "loose": loose,
+}
 
 
 def scene(name: str, *, size: str, seed: int = 0) -> Scene:

@@ -147,6 +147,7 @@ class Studio:
     def _lights(self, light: Light) -> dict[str, Any]:
         mi = self.mi
 
+        # Lamps stand far away, so that light does not vary over the floor unless `falloff` asks for it.
         # Sampling weights: the sky is sampled by the material, so lamps get the light samples (+1 dB at equal cost).
         def panel(
             position: tuple[float, ...], size: float, radiance: float, tint: tuple[float, ...], weight: float
@@ -160,9 +161,9 @@ class Studio:
         sky = {"type": "constant", "radiance": {"type": "rgb", "value": light.sky}, "sampling_weight": 0.1}
         lights = {"sky": mi.load_dict(sky)}
         if light.area > 0:
-            lights["key"] = panel((2.6, 3.6, 3.2), 1.3, 4.8 * light.area, (1.0, 0.95, 0.87), 2.0)
-            lights["fill"] = panel((-3.4, 2.2, 1.6), 1.5, 1.8 * light.area, (0.86, 0.93, 1.0), 1.0)
-            lights["rim"] = panel((-0.6, 3.6, -3.6), 1.2, 3.2 * light.area, (1.0, 0.97, 0.93), 1.3)
+            lights["key"] = panel((10.4, 11.4, 12.8), 5.2, 4.8 * light.area, (1.0, 0.95, 0.87), 2.0)
+            lights["fill"] = panel((-13.6, 5.8, 6.4), 6.0, 1.8 * light.area, (0.86, 0.93, 1.0), 1.0)
+            lights["rim"] = panel((-2.4, 11.4, -14.4), 4.8, 3.2 * light.area, (1.0, 0.97, 0.93), 1.3)
         if light.falloff > 0:
             lights["lamp"] = panel((1.7, 1.5, 0.2), 0.25, 12.0 * light.falloff, (1.0, 0.85, 0.65), 2.0)
         return lights

@@ -53,13 +53,15 @@ def chain_weights(tube: Tube, along: np.ndarray, names: tuple[str, ...]) -> np.n
 
 
 def skirt_weights(points: np.ndarray, names: tuple[str, ...], *, top: float, length: float) -> np.ndarray:
-    """As a scan-based template would: the waist follows the pelvis, the hem half the nearer thigh."""
+    """As a scan-based template would: the waist follows the pelvis, the hem the nearer thigh, more so in front."""
     depth = np.clip((top - points[:, 1]) / length, 0, 1)
     left = 0.5 + 0.5 * np.tanh(points[:, 0] / 0.05)
+    front = 0.5 + 0.5 * np.tanh(points[:, 2] / 0.05)
+    share = (0.2 + 0.6 * front) * depth
     weights = np.zeros((len(points), len(names)))
-    weights[:, names.index("pelvis")] = 1 - 0.5 * depth
-    weights[:, names.index("thigh_left")] = 0.5 * depth * left
-    weights[:, names.index("thigh_right")] = 0.5 * depth * (1 - left)
+    weights[:, names.index("pelvis")] = 1 - share
+    weights[:, names.index("thigh_left")] = share * left
+    weights[:, names.index("thigh_right")] = share * (1 - left)
     return weights
 
 

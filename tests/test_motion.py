@@ -2,8 +2,10 @@ import numpy as np
 import pytest
 
 from ash.files import InputError
+from synth.generators import GENERATORS
 from synth.mannequin import heads, mannequin
-from synth.motion import GENERATORS, Clip, Step, feet_tracks, make_motion, make_skeleton, solve, standing
+from synth.motion import Clip, make_motion
+from synth.plans import Step, feet_tracks, make_skeleton, solve, standing
 from synth.posing import bone_frames, linear_blend_skinning, skinning_transforms
 
 SKELETON = make_skeleton(heads())
@@ -48,10 +50,10 @@ def test_a_planted_foot_does_not_slide():
 
 @pytest.mark.parametrize("name", sorted(GENERATORS))
 def test_motions_are_smooth_and_stay_on_a_small_floor(name: str):
-    motion = make_motion(SKELETON, (Clip(generator=name, frames=40),), fps=24.0, seed=5)
+    motion = make_motion(SKELETON, (Clip(generator=name, frames=48),), fps=30.0, seed=5)
     assert np.abs(motion.dofs[:, [0, 2]]).max() < 0.6
     change = np.abs(np.diff(motion.dofs[:, 3:], axis=0)).max()
-    assert change < 0.45, f"a joint turns by {change:.2f} rad between frames"
+    assert change < 0.55, f"a joint turns by {change:.2f} rad between frames"
     assert np.isfinite(motion.dofs).all()
 
 
