@@ -121,6 +121,8 @@ def run_in_process(folder: str, limits: Limits) -> str:
     Self-contained, so that an executor may carry it to another machine that sees the same folder.
     """
     cell = read_cell(Path(folder))
+    for path in cell.folder.rglob(".*.*"):  # What a killed process left half-written.
+        path.unlink(missing_ok=True)
     start = time.monotonic()
     with (cell.folder / "output.log").open("ab") as log, _starting:
         if _stopping.is_set():
