@@ -89,6 +89,8 @@ def make_capture_in(spec: CaptureSpec, folder: Path, *, workers: int) -> None:
     from synth.capture import make_capture as render
 
     progress = Progress(f"images of {spec.name}", 0, expected_s=0.0, workers=workers)
+    if not (folder / "cameras.json").exists():  # Written last before the images.
+        progress.say(f"preparing {spec.name}: body, motion, clothes, texture (takes a minute or two)")
     render(scene(spec.scene, size=spec.size, seed=spec.seed), folder, workers=workers, progress=progress.advance)
     progress.close()
 
