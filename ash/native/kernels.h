@@ -16,7 +16,6 @@ constexpr int TILE = 32;
 constexpr int BLOCK = 4;
 constexpr int BLOCKS = TILE / BLOCK;
 constexpr int LANES = BLOCK * BLOCK;
-constexpr int TILE_PIXELS = TILE * TILE;
 
 // The splats' parameters as the blend wants them ("packed", one row per camera and Gaussian). With dx, dy in pixels from the
 // centre, u = a dx + b dy and v = e dy:  log2 alpha = l - u^2 - v^2.
@@ -50,19 +49,24 @@ struct Splat {
     float half_width;
 };
 
-struct Entry {
+struct Entry {  // a splat in a tile, and where its gradient in that tile goes
     uint32_t splat, slot;
-    uint64_t blocks;  // those the forward pass found touched
 };
+
+// Entries are blended 64 at a time: one bit of a 64-bit mask per entry.
+constexpr int CHUNK = 64;
 
 struct Tile {
     int camera, x, y;  // upper left pixel
-    int64_t first, count, done;  // entries; those before the tile was finished
+    int64_t first, count;  // entries
+    int64_t chunks;        // first mask: for every chunk of entries one mask per block
+    int64_t done;          // entries looked at before the tile was finished
 };
 
 struct BlendArgs {
     const Splat* splats;
-    Entry* entries;
+    const Entry* entries;
+    uint64_t* masks;  // which entries of a chunk a block sees; written by the forward pass
     int width, height;
     float background[3];
     float *rgb, *alpha, *depth;                               // [c, h, w, 3], [c, h, w], [c, h, w]

@@ -29,6 +29,7 @@ _SIGNATURES: dict[str, tuple[type | None, list[type]]] = {
     "ash_blend": (_P, [_P, _P, _P, c_int64, c_int, c_int, c_int, POINTER(c_float), c_int, _P, _P, _P]),
     "ash_blend_backward": (c_int, [_P, _P, _P, _P, _P, _P, _P, c_int, _P, _P]),
     "ash_release": (None, [_P]),
+    "ash_stage_seconds": (None, [POINTER(c_double)]),
     "ash_l1_ssim": (c_int, [_P] * 5 + [c_int] * 4 + [c_float] * 2 + [c_int, _P, POINTER(c_double)]),
     "ash_rasterize": (c_int, [_P, _P, c_int64, c_int, c_int, c_double, c_int, _P, _P, _P]),
 }
@@ -93,6 +94,16 @@ def instruction_set() -> str:
 def use_instruction_set(name: str) -> bool:
     """Use avx512, avx2 or plain from now on; False, and no change, if this machine cannot."""
     return load().ash_use_instruction_set(name.encode()) == 0
+
+
+STAGES = ("project", "list", "blend", "blend_backward", "gather", "project_backward")
+
+
+def stage_ms() -> dict[str, float]:
+    """Milliseconds that each stage of the last splat and its backward pass took."""
+    seconds = (c_double * len(STAGES))()
+    load().ash_stage_seconds(seconds)
+    return {stage: 1e3 * second for stage, second in zip(STAGES, seconds, strict=True)}
 
 
 def fma_peak(threads: int) -> float:

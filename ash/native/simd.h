@@ -48,6 +48,14 @@ inline V reciprocal(V a) {
 inline V fraction(V a) { return {_mm512_reduce_ps(a.x, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)}; }
 inline V scale_by_floor(V mantissa, V a) { return {_mm512_scalef_ps(mantissa.x, a.x)}; }
 inline float sum(V a) { return _mm512_reduce_add_ps(a.x); }
+// to[i] = the sum of v[i], for four vectors.
+inline void sums_of_four(const V* v, float* to) {
+    auto pair = [](__m512 a, __m512 b) { return _mm512_add_ps(_mm512_unpacklo_ps(a, b), _mm512_unpackhi_ps(a, b)); };
+    __m512d ab = _mm512_castps_pd(pair(v[0].x, v[1].x)), cd = _mm512_castps_pd(pair(v[2].x, v[3].x));
+    __m512 all4 = _mm512_add_ps(_mm512_castpd_ps(_mm512_unpacklo_pd(ab, cd)), _mm512_castpd_ps(_mm512_unpackhi_pd(ab, cd)));
+    __m256 half = _mm256_add_ps(_mm512_castps512_ps256(all4), _mm512_extractf32x8_ps(all4, 1));
+    _mm_storeu_ps(to, _mm_add_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps(half, 1)));
+}
 
 #elif defined(__AVX2__)
 
@@ -92,6 +100,10 @@ inline float sum(V a) {
     __m128 s = _mm_add_ps(_mm256_castps256_ps128(a.x), _mm256_extractf128_ps(a.x, 1));
     s = _mm_add_ps(s, _mm_movehl_ps(s, s));
     return _mm_cvtss_f32(_mm_add_ss(s, _mm_shuffle_ps(s, s, 1)));
+}
+inline void sums_of_four(const V* v, float* to) {
+    __m256 all4 = _mm256_hadd_ps(_mm256_hadd_ps(v[0].x, v[1].x), _mm256_hadd_ps(v[2].x, v[3].x));
+    _mm_storeu_ps(to, _mm_add_ps(_mm256_castps256_ps128(all4), _mm256_extractf128_ps(all4, 1)));
 }
 
 #else
@@ -139,10 +151,14 @@ inline Bits floor_of(V a) {
 inline V fraction(V a) { return {a.x - __builtin_convertvector(floor_of(a), Lanes)}; }
 inline V scale_by_floor(V mantissa, V a) { return {(Lanes)((Bits)mantissa.x + (floor_of(a) << 23))}; }
 inline float sum(V a) { return (a.x[0] + a.x[2]) + (a.x[1] + a.x[3]); }
+inline void sums_of_four(const V* v, float* to) {
+    for (int i = 0; i < 4; ++i) to[i] = sum(v[i]);
+}
 
 #endif
 
 inline V operator-(V a) { return all(0.0f) - a; }
+inline V magnitude(V a) { return max(a, -a); }
 
 // 2^a for a in [-126, 1): a polynomial of degree 5 on [0, 1), relative error 2e-7.
 inline V exp2_of(V a) {

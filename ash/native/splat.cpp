@@ -44,6 +44,7 @@ struct Drawing {
     Buffer<Splat> splats;
     Buffer<int64_t> offsets, fill;  // first slot per splat; next entry per tile
     Buffer<Entry> entries;
+    Buffer<uint64_t> masks;
     Buffer<Ranked> ranked, spare;
     Buffer<float> slots;
     std::vector<Tile> tiles;
@@ -140,13 +141,14 @@ void list_entries(Drawing& d, const double* depths) {
     offsets[d.count] = slots;
     if (slots > int64_t(0xffffffff)) throw std::bad_alloc();
     Entry* entries = d.entries.reserve(slots);
-    int64_t first = 0;
+    int64_t first = 0, chunks = 0;
     for (int camera = 0; camera < d.cameras; ++camera) {
         for (int tile = 0; tile < columns * rows; ++tile) {
             int64_t count = counts[size_t(camera) * columns * rows + tile];
             fill[tile] = first;
-            d.tiles.push_back({camera, tile % columns * TILE, tile / columns * TILE, first, count, 0});
+            d.tiles.push_back({camera, tile % columns * TILE, tile / columns * TILE, first, count, chunks, 0});
             first += count;
+            chunks += (count + CHUNK - 1) / CHUNK * CHUNK;
         }
         int64_t drawn = order_by_depth(d, depths + camera * per_camera, camera * per_camera, per_camera);
         for (int64_t i = 0; i < drawn; ++i) {
@@ -154,9 +156,10 @@ void list_entries(Drawing& d, const double* depths) {
             Rect r = tiles_of(d.splats.get()[splat], columns, rows);
             uint32_t slot = uint32_t(offsets[splat]);
             for (int y = r.top; y < r.bottom; ++y)
-                for (int x = r.left; x < r.right; ++x) entries[fill[y * columns + x]++] = {splat, slot++, 0};
+                for (int x = r.left; x < r.right; ++x) entries[fill[y * columns + x]++] = {splat, slot++};
         }
     }
+    d.masks.reserve(chunks);
     // The long ones first, so that no thread is left with one at the end.
     std::stable_sort(d.tiles.begin(), d.tiles.end(), [](const Tile& a, const Tile& b) { return a.count > b.count; });
 }
@@ -176,6 +179,7 @@ int64_t ash_project(const float* means, const float* quats, const float* scales,
     args.viewmats = viewmats, args.Ks = Ks, args.count = count, args.cameras = cameras, args.coefficients = coefficients;
     args.width = width, args.height = height, args.compensate = compensate, args.dilation = dilation, args.near = near;
     args.means2d = means2d, args.packed = packed, args.depths = depths;
+    Stopwatch watch(STAGE_PROJECT);
     std::atomic<int64_t> fault{INT64_MAX};
     in_parallel(threads, ranges(count), [&](int64_t range) {
         int64_t found = kernels().project(args, range * RANGE, std::min(count, (range + 1) * RANGE));
@@ -198,6 +202,7 @@ int ash_project_backward(const float* means, const float* quats, const float* sc
     args.packed = const_cast<float*>(packed), args.grad_means2d = grad_means2d, args.grad_packed = grad_packed;
     args.grad_means = grad_means, args.grad_quats = grad_quats, args.grad_scales = grad_scales;
     args.grad_opacities = grad_opacities, args.grad_sh = grad_sh;
+    Stopwatch watch(STAGE_PROJECT_BACKWARD);
     std::vector<double> partial(size_t(ranges(count)) * cameras * 12, 0.0);
     in_parallel(threads, ranges(count), [&](int64_t range) {
         kernels().project_backward(args, range * RANGE, std::min(count, (range + 1) * RANGE),
@@ -219,13 +224,17 @@ void* ash_blend(const float* means2d, const float* packed, const double* depths,
     Drawing& d = *drawing;
     d.count = count * cameras, d.cameras = cameras, d.width = width, d.height = height;
     std::copy(background, background + 3, d.background);
-    d.splats.reserve(d.count);
-    in_parallel(threads, ranges(d.count), [&](int64_t range) {
-        kernels().prepare(means2d, packed, d.splats.get(), range * RANGE, std::min(d.count, (range + 1) * RANGE));
-    });
-    list_entries(d, depths);
+    {
+        Stopwatch watch(STAGE_LIST);
+        d.splats.reserve(d.count);
+        in_parallel(threads, ranges(d.count), [&](int64_t range) {
+            kernels().prepare(means2d, packed, d.splats.get(), range * RANGE, std::min(d.count, (range + 1) * RANGE));
+        });
+        list_entries(d, depths);
+    }
+    Stopwatch watch(STAGE_BLEND);
     BlendArgs args{};
-    args.splats = d.splats.get(), args.entries = d.entries.get(), args.width = width, args.height = height;
+    args.splats = d.splats.get(), args.entries = d.entries.get(), args.masks = d.masks.get(), args.width = width, args.height = height;
     std::copy(background, background + 3, args.background);
     args.rgb = rgb, args.alpha = alpha, args.depth = depth;
     in_parallel(threads, int64_t(d.tiles.size()), [&](int64_t tile) { kernels().blend(args, d.tiles[tile]); });
@@ -239,11 +248,15 @@ int ash_blend_backward(void* handle, const float* rgb, const float* alpha, const
                        const float* grad_alpha, const float* grad_depth, int threads, float* grad_means2d, float* grad_packed) try {
     Drawing& d = *static_cast<Drawing*>(handle);
     BlendArgs args{};
-    args.splats = d.splats.get(), args.entries = d.entries.get(), args.width = d.width, args.height = d.height;
+    args.splats = d.splats.get(), args.entries = d.entries.get(), args.masks = d.masks.get(), args.width = d.width, args.height = d.height;
     args.rgb = const_cast<float*>(rgb), args.alpha = const_cast<float*>(alpha), args.depth = const_cast<float*>(depth);
     args.grad_rgb = grad_rgb, args.grad_alpha = grad_alpha, args.grad_depth = grad_depth;
     args.slots = d.slots.reserve(size_t(d.offsets.get()[d.count]) * SLOT);
-    in_parallel(threads, int64_t(d.tiles.size()), [&](int64_t tile) { kernels().blend_backward(args, d.tiles[tile]); });
+    {
+        Stopwatch watch(STAGE_BLEND_BACKWARD);
+        in_parallel(threads, int64_t(d.tiles.size()), [&](int64_t tile) { kernels().blend_backward(args, d.tiles[tile]); });
+    }
+    Stopwatch watch(STAGE_GATHER);
     in_parallel(threads, ranges(d.count), [&](int64_t range) {
         kernels().gather(d.splats.get(), d.slots.get(), d.offsets.get(), range * RANGE, std::min(d.count, (range + 1) * RANGE),
                          grad_means2d, grad_packed);
@@ -251,6 +264,11 @@ int ash_blend_backward(void* handle, const float* rgb, const float* alpha, const
     return 0;
 } catch (const std::bad_alloc&) {
     return 1;
+}
+
+// The six stages' seconds in the last calls: project, list, blend, blend_backward, gather, project_backward.
+void ash_stage_seconds(double* seconds) {
+    for (int i = 0; i < STAGES; ++i) seconds[i] = stage_seconds[i];
 }
 
 void ash_release(void* handle) {

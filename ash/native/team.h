@@ -2,6 +2,7 @@
 // Starting and joining a thread costs about 20 microseconds (benchmarks: native/README.md).
 #pragma once
 #include <atomic>
+#include <chrono>
 #include <cstdint>
 #include <system_error>
 #include <thread>
@@ -25,5 +26,16 @@ template <class Work> void in_parallel(int threads, int64_t parts, const Work& w
     run();
     for (auto& other : others) other.join();
 }
+
+// Seconds that the stages of the last calls took, for benchmarks. Calls at the same time mix their numbers.
+enum Stage { STAGE_PROJECT, STAGE_LIST, STAGE_BLEND, STAGE_BLEND_BACKWARD, STAGE_GATHER, STAGE_PROJECT_BACKWARD, STAGES };
+inline std::atomic<double> stage_seconds[STAGES];
+
+struct Stopwatch {
+    Stage stage;
+    std::chrono::steady_clock::time_point start = std::chrono::steady_clock::now();
+    explicit Stopwatch(Stage s) : stage(s) {}
+    ~Stopwatch() { stage_seconds[stage] = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count(); }
+};
 
 }  // namespace ash
