@@ -90,7 +90,7 @@ def make_capture_in(spec: CaptureSpec, folder: Path, *, workers: int) -> None:
 
     progress = Progress(f"images of {spec.name}", 0, expected_s=0.0, workers=workers)
     if not (folder / "cameras.json").exists():  # Written last before the images.
-        progress.say(f"preparing {spec.name}: body, motion, clothes, texture (takes a minute or two)")
+        progress.say(f"preparing {spec.name}: body, motion, clothes, texture (up to two minutes)")
     render(scene(spec.scene, size=spec.size, seed=spec.seed), folder, workers=workers, progress=progress.advance)
     progress.close()
 

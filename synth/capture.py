@@ -37,6 +37,7 @@ from synth.motion import make_motion
 from synth.presets import require_space
 from synth.render import Renderer, Studio, probe
 from synth.rig import held_out, make_cameras
+from synth.rig import names as camera_names
 from synth.scene import Scene, stream
 
 Progress = Callable[[int, int], None]
@@ -80,6 +81,11 @@ def make_capture(
                 done += count
                 if progress:
                     progress(done, len(views))
+        except BaseException:
+            if own:  # Files are whole or absent, so nobody needs to wait for the frames that are under way.
+                for process in list(own._processes.values()):
+                    process.terminate()
+            raise
         finally:
             if own:
                 own.shutdown(wait=True, cancel_futures=True)
@@ -133,7 +139,7 @@ def _manifest(scene: Scene, *, files: dict[str, str], complete: bool, made_with:
 
 def splits(scene: Scene) -> dict[str, Split]:
     """Training views; held-out cameras on some training frames; held-out cameras on the test motion."""
-    names = [f"cam{k:03d}" for k in range(scene.rig.cameras)]
+    names = camera_names(scene.rig)
     apart = tuple(names[k] for k in held_out(scene.rig))
     training = sum(clip.frames for clip in scene.train)
     return {
