@@ -1,13 +1,15 @@
 """What is measured, and how: one list that tables, chart and gate read, and the locked arithmetic behind it.
 
 Protocol "1". Before anything is compared, both images are composited on black and quantised to uint8 sRGB.
-Three regions:
+Regions, ours first, then those of others' conventions:
 
 - `foreground`: pixels whose true alpha is above one half. The number to look at: background only dilutes it.
 - `full`: the whole frame.
 - `release_crop`: as the released ASH code validates: mask eroded by 3x3, both images composited on white by that mask,
   a window of 600x496 (height x width at 1285x940, scaled to the frame, never smaller than the subject) centred on it.
-  Errors outside the silhouette are invisible to it.
+  Errors outside the silhouette are invisible to it. SSIM there is scikit-image's default, a 7x7 box.
+- `white_frame`: as AnimatableGaussians scores: the whole frame on white, the truth cut out by its mask, the prediction
+  composited by its own alpha; SSIM with the 7x7 box.
 """
 
 from dataclasses import dataclass
@@ -81,8 +83,11 @@ VIEW_SCORES = (  # (region, metric) of every evaluated image
     ("foreground", "psnr"),
     ("full", "psnr"),
     ("release_crop", "psnr"),
+    ("white_frame", "psnr"),
     ("foreground", "ssim"),
     ("full", "ssim"),
+    ("release_crop", "ssim"),
+    ("white_frame", "ssim"),
     ("foreground", "flip"),
     ("full", "flip"),
     ("full", "iou"),
@@ -158,15 +163,29 @@ def silhouette_iou(predicted: np.ndarray, truth: np.ndarray) -> float:
     return float((predicted & truth).sum()) / union if union else 1.0
 
 
-def release_crop_psnr(predicted: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """PSNR in dB by the convention of the released ASH code (the module's docstring says which)."""
+def release_crop(predicted: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """The pair of images that the released ASH code would compare, or None where the eroded mask is empty."""
     mask = ndimage.binary_erosion(mask, np.ones((3, 3)))
     if not mask.any():
-        return 0.0
-    white = [np.where(mask[..., None], image, 255).astype(np.uint8) for image in (predicted, truth)]
+        return None
     rows, columns = mask.any(axis=1), mask.any(axis=0)
     window = _window(np.asarray(rows), RELEASE_WINDOW[0]), _window(np.asarray(columns), RELEASE_WINDOW[1])
-    return psnr(white[0][window], white[1][window])
+    white = [np.where(mask[..., None], image, 255).astype(np.uint8) for image in (predicted, truth)]
+    return white[0][window], white[1][window]
+
+
+def white_frame(predicted: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The pair of images that AnimatableGaussians would compare, from uint8 RGBA `[h, w, 4]`, colour on black."""
+    on_white = predicted[..., :3].astype(np.uint16) + 255 - predicted[..., 3:]
+    cut_out = np.where(foreground(truth)[..., None], truth[..., :3], 255)
+    return np.minimum(on_white, 255).astype(np.uint8), cut_out.astype(np.uint8)
+
+
+def box_ssim(predicted: np.ndarray, truth: np.ndarray) -> float:
+    """SSIM with scikit-image's defaults: a 7x7 box window and sample covariance."""
+    if min(truth.shape[:2]) < 7:
+        return 1.0 if np.array_equal(predicted, truth) else 0.0
+    return float(structural_similarity(truth, predicted, data_range=255, channel_axis=2))
 
 
 def _window(occupied: np.ndarray, fraction: float) -> slice:
@@ -186,12 +205,16 @@ def score_view(predicted: np.ndarray, truth: np.ndarray) -> dict[tuple[str, str]
     region = mask if mask.any() else np.ones_like(mask)
     colours = predicted[..., :3], truth[..., :3]
     similarity, difference = ssim_map(*colours), flip_map(*colours)
+    crop, white = release_crop(*colours, mask), white_frame(predicted, truth)
     return {
         ("foreground", "psnr"): psnr(*colours, region),
         ("full", "psnr"): psnr(*colours),
-        ("release_crop", "psnr"): release_crop_psnr(*colours, mask),
+        ("release_crop", "psnr"): psnr(*crop) if crop else 0.0,
+        ("white_frame", "psnr"): psnr(*white),
         ("foreground", "ssim"): float(similarity[region].mean()),
         ("full", "ssim"): float(similarity.mean()),
+        ("release_crop", "ssim"): box_ssim(*crop) if crop else 0.0,
+        ("white_frame", "ssim"): box_ssim(*white),
         ("foreground", "flip"): float(difference[region].mean()),
         ("full", "flip"): float(difference.mean()),
         ("full", "iou"): silhouette_iou(foreground(predicted), mask),

@@ -11,11 +11,11 @@ from markupsafe import Markup
 
 from ash.dataset import load_capture
 from ash.files import InputError, write_atomic
-from benchmarks import charts, contrasts, findings, pareto, tables
+from benchmarks import charts, contrasts, conventions, findings, pareto, tables
 from benchmarks.cells import Cell, CellResult
 from benchmarks.charts import Bar, Line, Panel, Point
 from benchmarks.contrasts import Contrast
-from benchmarks.metrics import PROTOCOL
+from benchmarks.metrics import METRICS, PROTOCOL
 from benchmarks.names import EXACT, is_oracle, look_of
 from benchmarks.pictures import Comparison, comparisons_of, contact_sheet, missing_pictures, png
 from benchmarks.results import tidy, write_csv
@@ -54,6 +54,7 @@ class SceneReport:
     exact: tuple[Exact, ...]
     contrasts: tuple[Contrast, ...]
     frontier: tuple[str, ...]
+    conventions: tuple[conventions.Comparison, ...]
     comparisons: tuple[Comparison, ...]
     no_pictures: str
     curves: str
@@ -96,6 +97,7 @@ def scene_report(run: Run, scores: Scores, scene: str) -> SceneReport:
         exact=tuple(_exact_pairs(scores, scene)),
         contrasts=contrasts.contrasts(scores, scene),
         frontier=findings.frontier(scores, scene),
+        conventions=_conventions(scores, scene),
         comparisons=tuple(comparisons),
         no_pictures=no_pictures,
         curves=training_curves(scores, scene),
@@ -154,6 +156,7 @@ def html_of(run: Run, results: Sequence[CellResult], scenes: Sequence[SceneRepor
         facts=provenance_facts(results),
         protocol=PROTOCOL,
         missing=len(run.cells) - len(results),
+        ways=conventions.CONVENTIONS,
     )
 
 
@@ -247,6 +250,13 @@ def _more_tables(scores: Scores, scene: str) -> tuple[Table, ...]:
         ),
     ]
     return tuple(table for table in found if table.columns)
+
+
+def _conventions(scores: Scores, scene: str) -> tuple[conventions.Comparison, ...]:
+    asked = [(split, metric) for split in ("novel_view", "novel_pose") for metric in ("psnr", "ssim")]
+    titles = [f"{tables.SPLIT_TITLES[split]}, {METRICS[metric].title}" for split, metric in asked]
+    found = [conventions.compare(scores, scene, *pair, title=t) for pair, t in zip(asked, titles, strict=True)]
+    return tuple(comparison for comparison in found if comparison is not None)
 
 
 def _panel(scores: Scores, scene: str, split: str, title: str) -> Panel:

@@ -71,7 +71,7 @@ def test_release_crop_is_blind_outside_the_silhouette(pair) -> None:
     mask = metrics.foreground(truth)
     outside = predicted.copy()
     outside[~mask] = 255
-    same = [metrics.release_crop_psnr(image[..., :3], truth[..., :3], mask) for image in (predicted, outside)]
+    same = [metrics.psnr(*metrics.release_crop(i[..., :3], truth[..., :3], mask)) for i in (predicted, outside)]
     assert same[0] == pytest.approx(same[1])
     assert metrics.psnr(outside[..., :3], truth[..., :3]) < metrics.psnr(predicted[..., :3], truth[..., :3]) - 3
 
@@ -82,8 +82,21 @@ def test_release_crop_has_the_release_window_at_the_release_size() -> None:
     mask = metrics.foreground(truth)
     predicted = truth.copy()
     predicted[600, 450, :3] = 100  # One wrong pixel: its share of the window tells the window's size.
-    error = metrics.release_crop_psnr(predicted[..., :3], truth[..., :3], mask)
+    pair = metrics.release_crop(predicted[..., :3], truth[..., :3], mask)
+    assert pair[0].shape == (600, 496, 3)
+    error = metrics.psnr(*pair)
     assert error == pytest.approx(-10 * np.log10((100 / 255) ** 2 / (600 * 496)), abs=1e-6)
+
+
+def test_white_frame_sees_what_spills_over_the_silhouette(pair) -> None:
+    predicted, truth = pair
+    ours, theirs = metrics.white_frame(predicted, truth)
+    assert (theirs[~metrics.foreground(truth)] == 255).all() and (ours[predicted[..., 3] == 0] == 255).all()
+    inside = predicted.copy()
+    inside[~metrics.foreground(truth)] = 0
+    assert metrics.psnr(*metrics.white_frame(inside, truth)) > metrics.psnr(ours, theirs) + 3
+    half = np.array([[[100, 50, 0, 128]]], np.uint8)
+    np.testing.assert_array_equal(metrics.white_frame(half, half)[0], [[[227, 177, 127]]])
 
 
 def test_silhouette_iou() -> None:
@@ -152,8 +165,11 @@ LOCKED = {
     ("foreground", "psnr"): 26.55212,
     ("full", "psnr"): 32.50943,
     ("release_crop", "psnr"): 27.61230,
+    ("white_frame", "psnr"): 13.90351,
     ("foreground", "ssim"): 0.97690,
     ("full", "ssim"): 0.99049,
+    ("release_crop", "ssim"): 0.97857,
+    ("white_frame", "ssim"): 0.79088,
     ("foreground", "flip"): 0.10538,
     ("full", "flip"): 0.02919,
     ("full", "iou"): 0.84827,

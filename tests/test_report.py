@@ -233,3 +233,31 @@ def test_the_page_works_in_a_browser(run: Run, tmp_path: Path) -> None:
     values = [float(value) for value in told["up"] if value]
     assert values == sorted(values) and len(values) == 3
     assert sorted(told["after"]) == sorted(told["before"]) and told["after"][0] == "fake_good"
+
+
+def test_conventions_move_the_ranking_and_say_how_far() -> None:
+    from scipy.stats import kendalltau
+
+    from benchmarks.conventions import CONVENTIONS, compare, kendall
+
+    def scored_so(method: str, values: tuple[float, ...]) -> CellResult:
+        regions = [convention.region for convention in CONVENTIONS]
+        rows = [
+            Summary(split="novel_view", region=region, metric="psnr", value=value)
+            for region, value in zip(regions, values, strict=True)
+        ]
+        return CellResult(config=config(method, 0), status="done", summary=tuple(rows))
+
+    results = [
+        scored_so("ash", (27.0, 30.0, 25.0, 36.0)),
+        scored_so("ddc", (25.0, 31.0, 24.0, 37.0)),
+        scored_so("mlp", (24.0, 28.0, 26.0, 35.0)),
+        scored_so("ash_truth", (40.0, 40.0, 40.0, 40.0)),
+    ]
+    found = compare(Scores(results), "loose", "novel_view", "psnr", title="t")
+    assert found is not None and [s.name for s in found.standings] == ["ASH", "DDC", "w/ MLP"]
+    assert [s.ranks for s in found.standings] == [(1, 2, 2, 2), (2, 1, 3, 1), (3, 3, 1, 3)]
+    assert found.agreement == pytest.approx((1, 1 / 3, -1 / 3, 1 / 3))
+    a, b = [1.0, 4.0, 2.0, 3.0], [2.0, 3.0, 1.0, 4.0]
+    assert kendall(a, b) == pytest.approx(kendalltau(a, b).statistic)
+    assert compare(Scores(results[:1]), "loose", "novel_view", "psnr", title="t") is None
