@@ -104,6 +104,16 @@ SUITES = {
             cell_minutes=3.0,
         ),
         Suite(
+            name="ladder",
+            about="one phenomenon per scene against one missing part per method: what needs what",
+            scenes=("still", "skinned", "wrinkles", "swing", "lit", "glossy", "turning"),
+            size="ci",
+            methods=("ash", "wo_mot", "wo_disp", "mlp", "ddc", "ash_truth", "ddc_truth"),
+            preset="ci",
+            seeds=3,
+            cell_minutes=0.4,
+        ),
+        Suite(
             name="ci",
             about="the same machinery on a small mannequin at 128x128, in about a minute: what the tests run",
             scenes=("mannequin",),

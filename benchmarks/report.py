@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from ash.dataset import load_capture
 from ash.files import InputError, write_atomic
-from benchmarks import charts, contrasts, conventions, findings, pareto, tables
+from benchmarks import charts, contrasts, conventions, findings, necessity, pareto, tables
 from benchmarks.cells import Cell, CellResult
 from benchmarks.charts import Bar, Line, Panel, Point
 from benchmarks.contrasts import Contrast
@@ -148,7 +148,9 @@ def html_of(run: Run, results: Sequence[CellResult], scenes: Sequence[SceneRepor
         lstrip_blocks=True,
     )
     environment.filters["inline"] = Markup
+    scores = Scores(results)
     return environment.get_template("report.html").render(
+        needs=needs_of(scores),
         run=run,
         scenes=scenes,
         results=results,
@@ -160,9 +162,18 @@ def html_of(run: Run, results: Sequence[CellResult], scenes: Sequence[SceneRepor
     )
 
 
+def needs_of(scores: Scores) -> list[necessity.Matrix]:
+    """The necessity matrices of a run over several scenes."""
+    found = [
+        necessity.matrix(scores, split, title=tables.SPLIT_TITLES[split]) for split in ("novel_view", "novel_pose")
+    ]
+    return [matrix for matrix in found if matrix is not None]
+
+
 def markdown_of(run: Run, results: Sequence[CellResult], scenes: Sequence[SceneReport]) -> str:
     """The report for places that show Markdown."""
     parts = [f"# Report of suite {run.suite}", run.about[:1].upper() + run.about[1:] + "."]
+    parts += [_need_rows(matrix) for matrix in needs_of(Scores(results))]
     for scene in scenes:
         parts += [f"## {scene.name}", f"**{scene.headline}**", "\n".join(f"- {remark}" for remark in scene.remarks)]
         parts.append(_contrast_rows(scene.contrasts))
@@ -180,6 +191,15 @@ def markdown_of(run: Run, results: Sequence[CellResult], scenes: Sequence[SceneR
     if run.command:
         parts.append(f"Command: `{run.command}`")
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _need_rows(matrix: necessity.Matrix) -> str:
+    lines = [f"### What each scene needs: {matrix.title}, dB lost without the part", ""]
+    lines += ["| scene | " + " | ".join(matrix.parts) + " |", "|---|" + "---|" * len(matrix.parts)]
+    for row in matrix.rows:
+        cells = ["n/a" if loss is None else f"{loss.text} {loss.verdict}" for loss in row.losses]
+        lines.append(f"| {row.scene} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
 
 def _contrast_rows(found: Sequence[Contrast]) -> str:

@@ -261,3 +261,25 @@ def test_conventions_move_the_ranking_and_say_how_far() -> None:
     a, b = [1.0, 4.0, 2.0, 3.0], [2.0, 3.0, 1.0, 4.0]
     assert kendall(a, b) == pytest.approx(kendalltau(a, b).statistic)
     assert compare(Scores(results[:1]), "loose", "novel_view", "psnr", title="t") is None
+
+
+def test_the_necessity_matrix_says_what_its_intervals_allow() -> None:
+    from dataclasses import replace
+
+    from benchmarks.necessity import matrix
+
+    def scene(name: str, method: str, values: list[float]) -> list[CellResult]:
+        found = [scored(method, view=value, pose=20.0, seed=seed) for seed, value in enumerate(values)]
+        return [replace(result, config=replace(result.config, scene=name)) for result in found]
+
+    results = scene("still", "ash", [27.0, 27.02, 26.98]) + scene("still", "wo_mot", [27.01, 27.0, 27.02])
+    results += scene("swing", "ash", [27.0, 27.1, 26.9]) + scene("swing", "wo_mot", [24.0, 24.1, 23.9])
+    results += scene("lit", "ash", [27.0, 27.1, 26.9]) + scene("lit", "wo_mot", [25.0, 28.0, 26.0])
+    found = matrix(Scores(results), "novel_view", title="t")
+    assert found is not None and found.parts == ("w/o mot.",)
+    assert {row.scene: row.losses[0].verdict for row in found.rows} == {
+        "still": "not needed",
+        "swing": "needed",
+        "lit": "unclear",
+    }
+    assert matrix(Scores(scene("still", "ash", [1.0])), "novel_view", title="t") is None
