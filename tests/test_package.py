@@ -101,9 +101,10 @@ def constraints() -> dict[str, str]:
 
 
 def closure() -> set[str]:
-    """Every distribution that an installation for users and developers brings along, as far as it is installed here."""
+    """Every distribution that an installation with all extras brings along, as far as it is installed here."""
     project = PROJECT["project"]
-    waiting = [*project["dependencies"], *project["optional-dependencies"]["dev"], *PROJECT["build-system"]["requires"]]
+    waiting = [*project["dependencies"], *PROJECT["build-system"]["requires"]]
+    waiting += [requirement for extra in project["optional-dependencies"].values() for requirement in extra]
     found: set[str] = set()
     while waiting:
         requirement = waiting.pop()
