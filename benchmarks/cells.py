@@ -10,7 +10,7 @@ A cell lives in a folder of its own, named by the hash of what went in:
     result.json     what came out; written last, atomically: where it exists, the cell is finished
 """
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -183,11 +183,6 @@ def read_result(folder: Path) -> CellResult | None:
     if result.config.protocol != PROTOCOL:
         raise InputError(f"{path}: expected protocol {PROTOCOL}, got {result.config.protocol}; results do not mix")
     return result
-
-
-def relocate(cell: Cell, capture_folder: Path) -> Cell:
-    """The same cell with its capture at another place."""
-    return replace(cell, capture_folder=capture_folder)
 
 
 def _result_from(content: Any) -> CellResult:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, entry_points, version
+from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -187,14 +187,6 @@ def code_version(method: str) -> str:
     if not found.is_ours:
         digest.update(f"{found.target} {found.distribution}".encode())
     return digest.hexdigest()[:16]
-
-
-def package_version() -> str:
-    """The installed version, or the name of the state where the package runs from a bare checkout."""
-    try:
-        return version("ash-bench")
-    except PackageNotFoundError:
-        return "not installed"
 
 
 def _package_folder(package: str) -> Path:

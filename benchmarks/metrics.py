@@ -44,10 +44,6 @@ class Metric:
         """The direction as readers of tables know it."""
         return {"up": "↑", "down": "↓", "none": ""}[self.direction]
 
-    def better(self, a: float, b: float) -> bool:
-        """Whether `a` beats `b`."""
-        return a > b if self.direction == "up" else a < b
-
 
 METRICS = {
     metric.key: metric

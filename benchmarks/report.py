@@ -79,7 +79,11 @@ def write_report(run: Run) -> list[str]:
     write_atomic(folder / "tables.tex", latex_of(scenes).encode())
     write_atomic(folder / "report.md", markdown_of(run, results, scenes).encode())
     write_atomic(folder / "report.html", html_of(run, results, scenes).encode())
-    lines = [line for scene in scenes for line in (scene.headline, *scene.remarks)]
+    lines = []
+    for scene in scenes:
+        columns = [*tables.quality_columns(("psnr", "flip")), *tables.cost_columns(("frame_ms", "train_s"))]
+        short = tables.build(scores, scene.name, columns, title="")
+        lines += [scene.headline, *(f"- {remark}" for remark in scene.remarks), "", tables.plain(short), ""]
     return [*lines, f"report: {folder / 'report.html'}"]
 
 

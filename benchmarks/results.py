@@ -36,9 +36,3 @@ def tidy(results: Sequence[CellResult]) -> pd.DataFrame:
 def write_csv(path: Path, table: pd.DataFrame) -> None:
     """Write `results.csv`: numbers in full, so that nothing is lost on the way to another tool."""
     write_atomic(path, table.to_csv(index=False, lineterminator="\n").encode())
-
-
-def means(table: pd.DataFrame) -> pd.DataFrame:
-    """Mean, standard deviation and number of seeds per scene, method and quantity, methods in order of appearance."""
-    keys = ["scene", "method", "split", "region", "metric"]
-    return table.groupby(keys, sort=False)["value"].agg(["mean", "std", "count"]).reset_index()

@@ -125,6 +125,27 @@ def markdown(table: Table) -> str:
     return "\n".join(lines)
 
 
+def plain(table: Table) -> str:
+    """Aligned columns for a terminal; the best is starred."""
+    heads = ["", *(column.measure.title for column in table.columns)]
+    units = ["", *(f"{column.measure.unit} {column.measure.arrow}".strip() for column in table.columns)]
+    rows = [[row.name, *(e.whole + ("*" if e.mark == "best" else " ") for e in row.entries)] for row in table.rows]
+    widths = [max(len(line[i]) for line in (heads, units, *rows)) for i in range(len(heads))]
+    lines = [
+        "  ".join(
+            text.ljust(width) if i == 0 else text.rjust(width)
+            for i, (text, width) in enumerate(zip(line, widths, strict=True))
+        )
+        for line in (heads, units, *rows)
+    ]
+    spans, at = " " * widths[0], 0
+    for group, span in table.groups:
+        width = sum(widths[1 + at : 1 + at + span]) + 2 * span
+        spans += group.rjust(width)
+        at += span
+    return "\n".join(line.rstrip() for line in (spans, *lines))
+
+
 def latex(table: Table) -> str:
     """A `booktabs` table; best and second best are coloured as the paper does. Needs booktabs and colortbl."""
     count = len(table.columns)
