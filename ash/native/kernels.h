@@ -49,6 +49,11 @@ struct Splat {
     float half_width;
 };
 
+// The tiles that a splat may reach, the last ones excluded; none: not drawn.
+struct Rect {
+    uint16_t left, top, right, bottom;
+};
+
 struct Entry {  // a splat in a tile, and where its gradient in that tile goes
     uint32_t splat, slot;
 };
@@ -92,7 +97,8 @@ struct Kernels {
     const char* name;
     int64_t (*project)(const ProjectArgs&, int64_t first, int64_t last);  // 0, or fault + 16 * index
     void (*project_backward)(const ProjectArgs&, int64_t first, int64_t last, double* grad_views);  // adds to [c, 12]
-    void (*prepare)(const float* means2d, const float* packed, Splat* splats, int64_t first, int64_t last);
+    void (*prepare)(const float* means2d, const float* packed, int columns, int rows, Splat* splats, Rect* rects, int64_t first,
+                    int64_t last);
     void (*blend)(const BlendArgs&, Tile&);
     void (*blend_backward)(const BlendArgs&, const Tile&);
     void (*gather)(const Splat*, const float* slots, const int64_t* offsets, int64_t first, int64_t last, float* grad_means2d,

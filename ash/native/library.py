@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ash.files import InputError
 
-ABI_VERSION = 1  # of ash/native/dispatch.cpp
+ABI_VERSION = 2  # of ash/native/dispatch.cpp
 LIBRARY_NAME = "libash_native" + (".dylib" if sys.platform == "darwin" else ".so")
 
 _P = c_void_p  # the address of a tensor's numbers

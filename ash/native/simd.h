@@ -48,6 +48,34 @@ inline V reciprocal(V a) {
 inline V fraction(V a) { return {_mm512_reduce_ps(a.x, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)}; }
 inline V scale_by_floor(V mantissa, V a) { return {_mm512_scalef_ps(mantissa.x, a.x)}; }
 inline float sum(V a) { return _mm512_reduce_add_ps(a.x); }
+inline void transpose_4x4(__m512* r) {
+    __m512d a = _mm512_castps_pd(_mm512_unpacklo_ps(r[0], r[1])), b = _mm512_castps_pd(_mm512_unpackhi_ps(r[0], r[1]));
+    __m512d c = _mm512_castps_pd(_mm512_unpacklo_ps(r[2], r[3])), d = _mm512_castps_pd(_mm512_unpackhi_ps(r[2], r[3]));
+    r[0] = _mm512_castpd_ps(_mm512_unpacklo_pd(a, c)), r[1] = _mm512_castpd_ps(_mm512_unpackhi_pd(a, c));
+    r[2] = _mm512_castpd_ps(_mm512_unpacklo_pd(b, d)), r[3] = _mm512_castpd_ps(_mm512_unpackhi_pd(b, d));
+}
+// Four columns of W rows that lie `stride` floats apart: out[c] holds column c.
+inline void load_columns(const float* p, int64_t stride, V* out) {
+    __m512 r[4];
+    for (int j = 0; j < 4; ++j) {
+        r[j] = _mm512_castps128_ps512(_mm_loadu_ps(p + j * stride));
+        r[j] = _mm512_insertf32x4(r[j], _mm_loadu_ps(p + (4 + j) * stride), 1);
+        r[j] = _mm512_insertf32x4(r[j], _mm_loadu_ps(p + (8 + j) * stride), 2);
+        r[j] = _mm512_insertf32x4(r[j], _mm_loadu_ps(p + (12 + j) * stride), 3);
+    }
+    transpose_4x4(r);
+    for (int j = 0; j < 4; ++j) out[j].x = r[j];
+}
+inline void store_columns(const V* in, float* p, int64_t stride) {
+    __m512 r[4] = {in[0].x, in[1].x, in[2].x, in[3].x};
+    transpose_4x4(r);
+    for (int j = 0; j < 4; ++j) {
+        _mm_storeu_ps(p + j * stride, _mm512_castps512_ps128(r[j]));
+        _mm_storeu_ps(p + (4 + j) * stride, _mm512_extractf32x4_ps(r[j], 1));
+        _mm_storeu_ps(p + (8 + j) * stride, _mm512_extractf32x4_ps(r[j], 2));
+        _mm_storeu_ps(p + (12 + j) * stride, _mm512_extractf32x4_ps(r[j], 3));
+    }
+}
 // to[i] = the sum of v[i], for four vectors.
 inline void sums_of_four(const V* v, float* to) {
     auto pair = [](__m512 a, __m512 b) { return _mm512_add_ps(_mm512_unpacklo_ps(a, b), _mm512_unpackhi_ps(a, b)); };
@@ -101,6 +129,27 @@ inline float sum(V a) {
     s = _mm_add_ps(s, _mm_movehl_ps(s, s));
     return _mm_cvtss_f32(_mm_add_ss(s, _mm_shuffle_ps(s, s, 1)));
 }
+inline void transpose_4x4(__m256* r) {
+    __m256d a = _mm256_castps_pd(_mm256_unpacklo_ps(r[0], r[1])), b = _mm256_castps_pd(_mm256_unpackhi_ps(r[0], r[1]));
+    __m256d c = _mm256_castps_pd(_mm256_unpacklo_ps(r[2], r[3])), d = _mm256_castps_pd(_mm256_unpackhi_ps(r[2], r[3]));
+    r[0] = _mm256_castpd_ps(_mm256_unpacklo_pd(a, c)), r[1] = _mm256_castpd_ps(_mm256_unpackhi_pd(a, c));
+    r[2] = _mm256_castpd_ps(_mm256_unpacklo_pd(b, d)), r[3] = _mm256_castpd_ps(_mm256_unpackhi_pd(b, d));
+}
+inline void load_columns(const float* p, int64_t stride, V* out) {
+    __m256 r[4];
+    for (int j = 0; j < 4; ++j)
+        r[j] = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p + j * stride)), _mm_loadu_ps(p + (4 + j) * stride), 1);
+    transpose_4x4(r);
+    for (int j = 0; j < 4; ++j) out[j].x = r[j];
+}
+inline void store_columns(const V* in, float* p, int64_t stride) {
+    __m256 r[4] = {in[0].x, in[1].x, in[2].x, in[3].x};
+    transpose_4x4(r);
+    for (int j = 0; j < 4; ++j) {
+        _mm_storeu_ps(p + j * stride, _mm256_castps256_ps128(r[j]));
+        _mm_storeu_ps(p + (4 + j) * stride, _mm256_extractf128_ps(r[j], 1));
+    }
+}
 inline void sums_of_four(const V* v, float* to) {
     __m256 all4 = _mm256_hadd_ps(_mm256_hadd_ps(v[0].x, v[1].x), _mm256_hadd_ps(v[2].x, v[3].x));
     _mm_storeu_ps(to, _mm_add_ps(_mm256_castps256_ps128(all4), _mm256_extractf128_ps(all4, 1)));
@@ -151,6 +200,13 @@ inline Bits floor_of(V a) {
 inline V fraction(V a) { return {a.x - __builtin_convertvector(floor_of(a), Lanes)}; }
 inline V scale_by_floor(V mantissa, V a) { return {(Lanes)((Bits)mantissa.x + (floor_of(a) << 23))}; }
 inline float sum(V a) { return (a.x[0] + a.x[2]) + (a.x[1] + a.x[3]); }
+inline void load_columns(const float* p, int64_t stride, V* out) {
+    for (int c = 0; c < 4; ++c) out[c].x = Lanes{p[c], p[stride + c], p[2 * stride + c], p[3 * stride + c]};
+}
+inline void store_columns(const V* in, float* p, int64_t stride) {
+    for (int j = 0; j < W; ++j)
+        for (int c = 0; c < 4; ++c) p[j * stride + c] = in[c].x[j];
+}
 inline void sums_of_four(const V* v, float* to) {
     for (int i = 0; i < 4; ++i) to[i] = sum(v[i]);
 }

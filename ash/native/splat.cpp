@@ -42,6 +42,7 @@ struct Drawing {
     int cameras = 0, width = 0, height = 0;
     float background[3];
     Buffer<Splat> splats;
+    Buffer<Rect> rects;
     Buffer<int64_t> offsets, fill;  // first slot per splat; next entry per tile
     Buffer<Entry> entries;
     Buffer<uint64_t> masks;
@@ -62,6 +63,10 @@ std::unique_ptr<Drawing> take_drawing() {
     return drawing;
 }
 
+int64_t tiles_in(Rect r) {
+    return r.right > r.left && r.bottom > r.top ? int64_t(r.right - r.left) * (r.bottom - r.top) : 0;
+}
+
 // Splats in front of the camera, nearest first, equal depths in the order given.
 int64_t order_by_depth(Drawing& d, const double* depths, int64_t first, int64_t count) {
     Ranked *from = d.ranked.reserve(count), *to = d.spare.reserve(count);
@@ -73,7 +78,7 @@ int64_t order_by_depth(Drawing& d, const double* depths, int64_t first, int64_t 
     uint64_t lowest = ~uint64_t(0), highest = 0;
     int64_t drawn = 0;
     for (int64_t i = 0; i < count; ++i) {
-        if (!(d.splats.get()[first + i].reach >= 0)) continue;
+        if (tiles_in(d.rects.get()[first + i]) == 0) continue;
         from[drawn++].splat = uint32_t(first + i);
         lowest = std::min(lowest, bits(depths[i])), highest = std::max(highest, bits(depths[i]));
     }
@@ -103,22 +108,6 @@ int64_t order_by_depth(Drawing& d, const double* depths, int64_t first, int64_t 
     return drawn;
 }
 
-struct Rect {
-    int left, top, right, bottom;  // tiles, the last ones excluded
-};
-
-Rect tiles_of(const Splat& s, int columns, int rows) {
-    auto tile = [](float x, int limit) { return x <= 0 ? 0 : (x >= float(limit * TILE) ? limit : int(x / TILE)); };
-    constexpr float SLACK = 0.05f;
-    Rect r;
-    r.left = tile(s.x - s.half_width - SLACK, columns);
-    r.top = tile(s.y - s.half_height - SLACK, rows);
-    r.right = std::min(columns, tile(s.x + s.half_width + SLACK, columns) + 1);
-    r.bottom = std::min(rows, tile(s.y + s.half_height + SLACK, rows) + 1);
-    if (s.x + s.half_width + SLACK <= 0 || s.y + s.half_height + SLACK <= 0) r.right = r.left;
-    return r;
-}
-
 // Entries of every tile, nearest splat first; slots numbered splat by splat.
 void list_entries(Drawing& d, const double* depths) {
     const int columns = (d.width + TILE - 1) / TILE, rows = (d.height + TILE - 1) / TILE;
@@ -130,13 +119,11 @@ void list_entries(Drawing& d, const double* depths) {
     std::vector<int64_t> counts(size_t(d.cameras) * columns * rows, 0);
     for (int64_t i = 0; i < d.count; ++i) {
         offsets[i] = slots;
-        const Splat& s = d.splats.get()[i];
-        if (!(s.reach >= 0)) continue;
-        Rect r = tiles_of(s, columns, rows);
+        const Rect r = d.rects.get()[i];
         int64_t* count = counts.data() + (i / per_camera) * columns * rows;
         for (int y = r.top; y < r.bottom; ++y)
             for (int x = r.left; x < r.right; ++x) ++count[y * columns + x];
-        if (r.right > r.left && r.bottom > r.top) slots += int64_t(r.right - r.left) * (r.bottom - r.top);
+        slots += tiles_in(r);
     }
     offsets[d.count] = slots;
     if (slots > int64_t(0xffffffff)) throw std::bad_alloc();
@@ -153,7 +140,7 @@ void list_entries(Drawing& d, const double* depths) {
         int64_t drawn = order_by_depth(d, depths + camera * per_camera, camera * per_camera, per_camera);
         for (int64_t i = 0; i < drawn; ++i) {
             uint32_t splat = d.ranked.get()[i].splat;
-            Rect r = tiles_of(d.splats.get()[splat], columns, rows);
+            const Rect r = d.rects.get()[splat];
             uint32_t slot = uint32_t(offsets[splat]);
             for (int y = r.top; y < r.bottom; ++y)
                 for (int x = r.left; x < r.right; ++x) entries[fill[y * columns + x]++] = {splat, slot++};
@@ -226,9 +213,10 @@ void* ash_blend(const float* means2d, const float* packed, const double* depths,
     std::copy(background, background + 3, d.background);
     {
         Stopwatch watch(STAGE_LIST);
-        d.splats.reserve(d.count);
+        d.splats.reserve(d.count), d.rects.reserve(d.count);
+        const int columns = (width + TILE - 1) / TILE, rows = (height + TILE - 1) / TILE;
         in_parallel(threads, ranges(d.count), [&](int64_t range) {
-            kernels().prepare(means2d, packed, d.splats.get(), range * RANGE, std::min(d.count, (range + 1) * RANGE));
+            kernels().prepare(means2d, packed, columns, rows, d.splats.get(), d.rects.get(), range * RANGE, std::min(d.count, (range + 1) * RANGE));
         });
         list_entries(d, depths);
     }
