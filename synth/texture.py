@@ -216,7 +216,7 @@ def _stamp(words: str, x: np.ndarray, y: np.ndarray, *, width: float) -> np.ndar
 
 def _shirt(body: Body, texels: Texels, along: np.ndarray, grain: np.ndarray) -> np.ndarray:
     position, normal = texels.position, texels.normal
-    colour = _mix(_plain(len(position), (0.86, 0.84, 0.78)), (0.12, 0.19, 0.42), _stripes(along, 0.044))
+    colour = _mix(_plain(len(position), (0.74, 0.71, 0.64)), (0.3, 0.37, 0.54), _stripes(along, 0.044))
     torso = texels.limb == 0
     chest = body.skeleton.heads[body.skeleton.names.index("chest")]
     y = position[:, 1] - chest[1] - 0.1
@@ -237,7 +237,7 @@ def _trousers(body: Body, texels: Texels, along: np.ndarray, grain: np.ndarray) 
     colour = _plain(len(position), (0.2, 0.27, 0.36))
     around = np.arctan2(position[:, 0] - np.where(position[:, 0] > 0, 0.095, -0.095), position[:, 2]) * 0.07
     lozenge = _stripes(along + around, 0.05, 0.35) * _stripes(along - around, 0.05, 0.35)
-    colour = _mix(colour, (0.78, 0.74, 0.62), 0.85 * lozenge)
+    colour = _mix(colour, (0.5, 0.5, 0.46), 0.85 * lozenge)
     thread = _stripes(along + around, 0.05, 0.06) + _stripes(along - around, 0.05, 0.06)
     colour = _mix(colour, (0.6, 0.25, 0.2), 0.6 * np.clip(thread, 0, 1))
     outer = np.abs(position[:, 0]) - 0.095
@@ -256,10 +256,10 @@ def _skirt(position: np.ndarray, grain: np.ndarray) -> np.ndarray:
     colour = _plain(len(position), (0.55, 0.1, 0.14))
     wide = 0.5 * _stripes(around, 0.08, 0.5) + 0.5 * _stripes(height, 0.08, 0.5)
     colour = _mix(colour, (0.08, 0.2, 0.16), wide)
-    colour = _mix(colour, (0.92, 0.86, 0.7), np.maximum(_stripes(around, 0.08, 0.07), _stripes(height, 0.08, 0.07)))
+    colour = _mix(colour, (0.72, 0.6, 0.45), np.maximum(_stripes(around, 0.08, 0.07), _stripes(height, 0.08, 0.07)))
     twill = 0.06 * np.sin(2 * np.pi * (around + height) / 0.005)
     hem = _edge(0.012 - (height - height.min()), 0.002)
-    colour = _mix(colour, (0.95, 0.85, 0.5), hem)
+    colour = _mix(colour, (0.8, 0.68, 0.42), hem)
     return colour * (1 + twill + 0.03 * grain)[:, None]
 
 
