@@ -23,11 +23,12 @@ def turned(skeleton: Skeleton, dofs: np.ndarray, yaw: float) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Clip:
-    """A generator, how many frames of it to take, and by how much its whole world is turned about the vertical."""
+    """A generator, how many frames of it to take, and where on the floor and facing where."""
 
     generator: str
     frames: int
-    yaw: float = 0.0  # radians
+    yaw: float = 0.0  # radians that the whole clip is turned by about the vertical
+    shift: tuple[float, float] = (0.0, 0.0)  # metres, x and z, that it is then moved by
 
     def __post_init__(self) -> None:
         if self.generator not in GENERATORS:
@@ -42,6 +43,8 @@ def make_motion(skeleton: Skeleton, clips: tuple[Clip, ...], *, fps: float, seed
     for index, clip in enumerate(clips):
         rng = np.random.default_rng([seed, index])
         clip_dofs = solve(skeleton, GENERATORS[clip.generator](np.arange(clip.frames) / fps, rng))
-        dofs.append(turned(skeleton, clip_dofs, clip.yaw) if clip.yaw else clip_dofs)
+        clip_dofs = turned(skeleton, clip_dofs, clip.yaw) if clip.yaw else clip_dofs
+        clip_dofs[:, [0, 2]] += clip.shift
+        dofs.append(clip_dofs)
         sequence.append(np.full(clip.frames, index))
     return Motion(dofs=np.concatenate(dofs), sequence=np.concatenate(sequence), fps=fps)

@@ -89,10 +89,10 @@ def _quat_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     )
 
 
-def dual_quaternion_skinning(vertices: np.ndarray, weights: np.ndarray, transforms: np.ndarray) -> np.ndarray:
-    """Skin rest vertices `[v, 3]` with weights `[v, j]` and one frame's transforms `[j, 4, 4]` to posed `[v, 3]`.
+def blended_dual_quaternions(weights: np.ndarray, transforms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit dual quaternions (real and dual part, each `[v, 4]` wxyz) blended per vertex from `[j, 4, 4]` transforms.
 
-    Every vertex blends unit dual quaternions, their signs aligned with that of its heaviest joint.
+    Signs are aligned with that of each vertex' heaviest joint; the norm of the real part divides both.
     """
     real = rotmat_to_unitquat(transforms[:, :3, :3])
     translation = np.concatenate([np.zeros((len(real), 1)), transforms[:, :3, 3]], axis=1)
@@ -101,10 +101,15 @@ def dual_quaternion_skinning(vertices: np.ndarray, weights: np.ndarray, transfor
     signed = np.where(real @ real.T < 0, -1.0, 1.0)[heaviest] * weights
     blended_real, blended_dual = signed @ real, signed @ dual
     norm = np.linalg.norm(blended_real, axis=1, keepdims=True)
-    blended_real, blended_dual = blended_real / norm, blended_dual / norm
-    w, axis = blended_real[:, :1], blended_real[:, 1:]
+    return blended_real / norm, blended_dual / norm
+
+
+def dual_quaternion_skinning(vertices: np.ndarray, weights: np.ndarray, transforms: np.ndarray) -> np.ndarray:
+    """Skin rest vertices `[v, 3]` with weights `[v, j]` and one frame's transforms `[j, 4, 4]` to posed `[v, 3]`."""
+    real, dual = blended_dual_quaternions(weights, transforms)
+    w, axis = real[:, :1], real[:, 1:]
     rotated = vertices + 2 * np.cross(axis, np.cross(axis, vertices) + w * vertices)
-    shift = 2 * (w * blended_dual[:, 1:] - blended_dual[:, :1] * axis + np.cross(axis, blended_dual[:, 1:]))
+    shift = 2 * (w * dual[:, 1:] - dual[:, :1] * axis + np.cross(axis, dual[:, 1:]))
     return rotated + shift
 
 

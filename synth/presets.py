@@ -36,7 +36,7 @@ def _size(name: str) -> Size:
         rig = Rig(cameras=34, held_out=4, width=512, height=512)
         return Size(rig=rig, repeats=4, frames=20, test_frames=80, stride=20, samples=128, texture=4096)
     if name == "paper":
-        rig = Rig(kind="studio120", cameras=120, held_out=4, width=1285, height=940, radius=4.5)
+        rig = Rig(kind="studio", cameras=120, held_out=4, width=1285, height=940, radius=4.5)
         return Size(rig=rig, repeats=100, frames=50, test_frames=7000, stride=100, samples=64, texture=4096)
     raise InputError(f"unknown size {name!r}, expected one of {', '.join(SIZES)}")
 
@@ -68,7 +68,7 @@ def mannequin(*, size: str, seed: int) -> Scene:
 
 def loose(*, size: str, seed: int) -> Scene:
     """A realistic body in loose clothes and a swinging skirt, everything on: the default of the main job."""
-    outfit = Outfit(skirt=True, folds_mm=7.0, slack_mm=12.0, swing=0.6, scan_mm=4.0)
+    outfit = Outfit(skirt=True, folds_mm=5.0, slack_mm=4.0, swing=0.25, scan_mm=2.0)
     return _base("loose", size, seed, body="anny", outfit=outfit)
 
 

@@ -165,7 +165,7 @@ class Studio:
             lights["fill"] = panel((-13.6, 5.8, 6.4), 6.0, 1.8 * light.area, (0.86, 0.93, 1.0), 1.0)
             lights["rim"] = panel((-2.4, 11.4, -14.4), 4.8, 3.2 * light.area, (1.0, 0.97, 0.93), 1.3)
         if light.falloff > 0:
-            lights["lamp"] = panel((1.7, 1.5, 0.2), 0.25, 12.0 * light.falloff, (1.0, 0.85, 0.65), 2.0)
+            lights["lamp"] = panel((1.7, 1.5, 0.2), 0.25, 40.0 * light.falloff, (1.0, 0.85, 0.65), 2.0)
         return lights
 
     def dress(self, vertices: np.ndarray) -> None:

@@ -1,17 +1,34 @@
 """Camera rigs: where calibrated cameras stand, and how tightly they frame a person who moves."""
 
+import json
+import tempfile
+from pathlib import Path
+
 import numpy as np
 
-from ash.dataset import Camera
+from ash.dataset import Camera, read_cameras
+from ash.files import InputError
 from synth.scene import Rig
+
+GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
 
 def place(rig: Rig) -> np.ndarray:
     """Positions of the cameras, `[n, 3]` metres, before aiming."""
     k = np.arange(rig.cameras)
-    # The golden angle spreads azimuths evenly for any number; heights run from the waist to above the head.
-    azimuth = np.pi * (3 - np.sqrt(5)) * k + 0.2
-    elevation = np.deg2rad(-2 + 47 * ((k * 0.618034 + 0.3) % 1.0) ** 1.5)
+    if rig.kind == "ring":
+        azimuth, elevation = 2 * np.pi * k / rig.cameras + 0.2, np.full(rig.cameras, np.deg2rad(8.0))
+    elif rig.kind == "cap":
+        azimuth = np.deg2rad(60) * np.sqrt((k + 0.5) / rig.cameras) * np.sin(GOLDEN_ANGLE * k)
+        elevation = np.deg2rad(20 + 25 * np.sqrt((k + 0.5) / rig.cameras) * np.cos(GOLDEN_ANGLE * k))
+    elif rig.kind == "studio":
+        # A hall with rings at four heights, most cameras low, as studios are built.
+        rings = np.array([-2.0, 12.0, 28.0, 46.0])[np.minimum(k % 10 // 3, 3)]
+        azimuth, elevation = 2 * np.pi * k / rig.cameras * 7, np.deg2rad(rings)
+    else:
+        # The golden angle spreads azimuths evenly for any number; heights run from the waist to above the head.
+        azimuth = GOLDEN_ANGLE * k + 0.2
+        elevation = np.deg2rad(-2 + 47 * ((k * 0.618034 + 0.3) % 1.0) ** 1.5)
     ring = rig.radius * np.cos(elevation)
     return np.stack([ring * np.sin(azimuth), 0.95 + rig.radius * np.sin(elevation), ring * np.cos(azimuth)], axis=1)
 
@@ -27,15 +44,44 @@ def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
     return viewmat
 
 
+def names(rig: Rig) -> list[str]:
+    """The cameras' names, in order."""
+    if rig.kind == "given":
+        return [row["name"] for row in json.loads(rig.given)["cameras"]]
+    return [f"cam{k:03d}" for k in range(rig.cameras)]
+
+
 def make_cameras(rig: Rig, points: np.ndarray, *, margin: float = 0.04) -> list[Camera]:
     """Aim every camera at the capture volume and choose its focal length so that all `points` `[n, 3]` stay in view.
 
-    `margin` is left free on each side, as a share of the image.
+    `margin` is left free on each side, as a share of the image. The cameras of a given rig are taken as they are.
     """
-    names = [f"cam{k:03d}" for k in range(rig.cameras)]
-    return [
-        _frame(rig, name, position, points, margin=margin) for name, position in zip(names, place(rig), strict=True)
-    ]
+    if rig.kind == "given":
+        return _parse(rig.given)
+    pairs = zip(names(rig), place(rig), strict=True)
+    return [_frame(rig, name, position, points, margin=margin) for name, position in pairs]
+
+
+def rig_from_file(path: Path, *, held_out: int) -> Rig:
+    """A rig of the user's own cameras, all of one size.
+
+    Raises:
+        InputError: the file is not a valid `cameras.json`, or its cameras differ in size.
+    """
+    cameras = list(read_cameras(path).values())
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    if len(sizes) != 1:
+        raise InputError(f"{path}: expected cameras of one size, got {sorted(sizes)}")
+    width, height = sizes.pop()
+    text = json.dumps(json.loads(path.read_text()), sort_keys=True)
+    return Rig(kind="given", given=text, cameras=len(cameras), held_out=held_out, width=width, height=height)
+
+
+def _parse(text: str) -> list[Camera]:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "cameras.json"
+        path.write_text(text)
+        return list(read_cameras(path).values())
 
 
 def _frame(rig: Rig, name: str, position: np.ndarray, points: np.ndarray, *, margin: float) -> Camera:
@@ -59,3 +105,15 @@ def held_out(rig: Rig) -> list[int]:
     """Indices of the cameras kept for novel views, spread evenly over the rig."""
     step = rig.cameras / rig.held_out
     return [int(step * (k + 0.5)) for k in range(rig.held_out)]
+
+
+def spread(positions: np.ndarray, count: int) -> list[int]:
+    """Indices of `count` cameras `[n, 3]` far from each other; a larger subset contains the smaller."""
+    directions = positions - positions.mean(axis=0)
+    directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
+    chosen = [int(np.argmin(positions[:, 1]))]
+    distance = np.linalg.norm(directions - directions[chosen[0]], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(directions - directions[chosen[-1]], axis=1))
+    return chosen

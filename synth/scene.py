@@ -7,6 +7,7 @@ from ash.files import InputError, hash_of
 from synth.motion import Clip
 
 BODIES = ("mannequin", "anny")
+RIGS = ("dome", "ring", "cap", "studio", "given")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -39,7 +40,8 @@ class Light:
 class Rig:
     """Calibrated cameras around the capture volume, framed so that the person never leaves the picture."""
 
-    kind: str = "dome"
+    kind: str = "dome"  # dome, ring, cap (in front only), studio (rings of a hall), given
+    given: str = ""  # the text of a user's cameras.json, for kind "given"
     cameras: int = 16
     held_out: int = 4
     width: int = 256
@@ -47,6 +49,10 @@ class Rig:
     radius: float = 3.4  # metres
 
     def __post_init__(self) -> None:
+        if self.kind not in RIGS:
+            raise InputError(f"unknown rig {self.kind!r}, expected one of {', '.join(RIGS)}")
+        if (self.kind == "given") != bool(self.given):
+            raise InputError("a rig of kind 'given' needs the text of a cameras.json, and only such a rig has one")
         if not 0 < self.held_out < self.cameras <= 1000:
             raise InputError(f"rig: {self.held_out} of {self.cameras} cameras held out, expected 1 to all but one")
         if not (16 <= self.width <= 8192 and 16 <= self.height <= 8192):

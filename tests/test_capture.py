@@ -4,11 +4,11 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scenes import small_capture, small_scene
 
 from ash.dataset import (
     Capture,
@@ -25,26 +25,12 @@ from synth.capture import make_capture, render_views, splits, wanted_views
 from synth.motion import Clip
 from synth.posing import dual_quaternion_skinning, skinning_transforms
 from synth.render import find_libllvm, llvm_version, probe
-from synth.scene import Outfit, Rig, Scene
-
-
-def small_scene(**changes) -> Scene:
-    """A mannequin at 64 x 64: four cameras, three frames to train and two to test."""
-    base = replace(
-        presets.scene("mannequin", size="ci"),
-        rig=Rig(cameras=4, held_out=1, width=64, height=64),
-        train=(Clip(generator="walk", frames=3),),
-        test=(Clip(generator="dance", frames=2),),
-        samples=4,
-        texture=256,
-        novel_view_stride=2,
-    )
-    return replace(base, **changes)
+from synth.scene import Outfit, Rig
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_capture(small_scene(), tmp_path_factory.mktemp("capture") / "small", workers=1)
+def folder() -> Path:
+    return small_capture()
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +145,7 @@ def test_bytes_do_not_depend_on_order_or_sharding(tmp_path: Path, folder: Path):
 def test_a_killed_capture_resumes_to_the_same_manifest(tmp_path: Path, folder: Path):
     program = (
         "from pathlib import Path; import sys\n"
-        "from test_capture import small_scene; from synth.capture import make_capture\n"
+        "from scenes import small_scene; from synth.capture import make_capture\n"
         "if __name__ == '__main__': make_capture(small_scene(), Path(sys.argv[1]))\n"
     )
     script = tmp_path / "make.py"
