@@ -7,6 +7,7 @@ as far as its opacity exceeds 1/255: no fixed number of standard deviations. Equ
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -164,17 +165,22 @@ def _project_naive(
     )
 
 
-def _composite_naive(projected: Tensor, pixels: Tensor) -> Tensor:
-    """Eq. 3 for `[p, 2]` pixel centres: `[p, 5]` = premultiplied colour, depth, alpha.
-
-    `projected` is `[m, 10]`, nearest first: means2d, conics, opacity, colour, depth.
-    """
+def _opacities_naive(projected: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """Of every splat at every pixel, `[m, p]`: alpha' of Eq. 3, and the transmittance behind it, finished or not."""
     dx, dy = (pixels[None, :, i] - projected[:, i, None] for i in range(2))
     a, b, c = (projected[:, i, None] for i in (2, 3, 4))
     power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
     alpha = torch.clamp_max(projected[:, 5, None] * torch.exp(power), ALPHA_MAX)
     alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0.0)
-    left = torch.cumprod(1 - alpha, dim=0)
+    return alpha, torch.cumprod(1 - alpha, dim=0)
+
+
+def _composite_naive(projected: Tensor, pixels: Tensor) -> Tensor:
+    """Eq. 3 for `[p, 2]` pixel centres: `[p, 5]` = premultiplied colour, depth, alpha.
+
+    `projected` is `[m, 10]`, nearest first: means2d, conics, opacity, colour, depth.
+    """
+    alpha, left = _opacities_naive(projected, pixels)
     # `left` never grows, so a finished pixel stays finished.
     alpha = torch.where(left >= TRANSMITTANCE_MIN, alpha, 0.0)
     before = torch.cat([torch.ones_like(left[:1]), left[:-1]])
@@ -225,8 +231,15 @@ def splat_naive(
     return Splatted(rgb=rgb, alpha=alpha, depth=depth, means2d=means2d)
 
 
-def _draw_naive(projected: _Projected, *, width: int, height: int, tile: int) -> Tensor:
-    """One image `[h, w, 5]` from `_composite_naive`, square by square."""
+def _draw_naive(
+    projected: _Projected,
+    *,
+    width: int,
+    height: int,
+    tile: int,
+    composite: Callable[[Tensor, Tensor], Tensor] = _composite_naive,
+) -> Tensor:
+    """One image `[h, w, 5]`, composited square by square."""
     columns, rows = -(-width // tile), -(-height // tile)
     # A hair wider than exact: the threshold on alpha decides, not this box.
     low = (projected.means2d.detach() - projected.extents - 0.6) / tile
@@ -255,7 +268,7 @@ def _draw_naive(projected: _Projected, *, width: int, height: int, tile: int) ->
     squares = []
     for number, entries in enumerate(records):
         corner = torch.tensor([number % columns, number // columns], dtype=record.dtype, device=record.device) * tile
-        squares.append(_composite_naive(entries, lattice + corner) if len(entries) else empty)
+        squares.append(composite(entries, lattice + corner) if len(entries) else empty)
     image = torch.stack(squares).reshape(rows, columns, tile, tile, 5).transpose(1, 2)
     return image.reshape(rows * tile, columns * tile, 5)[:height, :width]
 
