@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import platform
 import signal
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
@@ -67,6 +68,8 @@ def make_capture(
         return folder
     _begin(scene, folder)
     renderer = probe()
+    if not renderer.libllvm:
+        print(renderer.note, file=sys.stderr)
     describe(scene, folder)
     views = wanted_views(scene)
     missing = [view for view in views if not image_path(folder, view.camera, view.frame).is_file()]

@@ -48,3 +48,18 @@ def make_motion(skeleton: Skeleton, clips: tuple[Clip, ...], *, fps: float, seed
         dofs.append(clip_dofs)
         sequence.append(np.full(clip.frames, index))
     return Motion(dofs=np.concatenate(dofs), sequence=np.concatenate(sequence), fps=fps)
+
+
+def pose_novelty(motion: Motion, *, train: tuple[int, ...], test: tuple[int, ...]) -> float:
+    """How far test poses are from the nearest training pose: mean over test frames, degrees rms over joints.
+
+    The root is left out: heading and place are not pose.
+    """
+    rotations = rotvec_to_rotmat(motion.dofs[:, 6:].reshape(len(motion.dofs), -1, 3))
+    known = rotations[list(train)]
+    nearest = []
+    for frame in test:
+        trace = np.einsum("tjab,jab->tj", known, rotations[frame])
+        angles = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+        nearest.append(np.sqrt(np.mean(angles**2, axis=1)).min())
+    return float(np.rad2deg(np.mean(nearest)))

@@ -21,7 +21,7 @@ from synth.body import CLOTHES, PARTS, Surface, vertex_normals
 from synth.scene import Light
 
 OLDEST_LLVM = 17  # 15 and 16 accept the first kernels and then abort the process ("Cannot select fminimum")
-PROBE_SECONDS = 120
+PROBE_SECONDS = 300
 BUCKET = 32  # pictures are cropped to the subject in steps of so many pixels: every new size costs a compilation
 
 

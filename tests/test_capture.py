@@ -153,7 +153,7 @@ def test_a_killed_capture_resumes_to_the_same_manifest(tmp_path: Path, folder: P
     target = tmp_path / "killed"
     environment = dict(os.environ, PYTHONPATH=os.pathsep.join([str(Path(__file__).parent), *sys.path]))
     process = subprocess.Popen([sys.executable, str(script), str(target)], env=environment)
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 240
     while len(list(target.rglob("*.png"))) < 4 and time.monotonic() < deadline:
         time.sleep(0.005)
     process.send_signal(signal.SIGKILL)
