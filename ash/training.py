@@ -33,7 +33,7 @@ class Diverged(FloatingPointError):
     """Training produced NaN or infinity twice. That is a result, and is recorded as one."""
 
 
-class Interrupted(RuntimeError):
+class Interrupted(KeyboardInterrupt):
     """SIGTERM came; the state was saved."""
 
 

@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Captures, cells, report."""
     from benchmarks.experiments import find_suite
     from benchmarks.provenance import cores
-    from benchmarks.runs import RunOptions, failures, results_of, run_suite
+    from benchmarks.runs import RunOptions, failures, finished_results, run_suite
 
     suite = find_suite(arguments.suite, seeds=arguments.seeds)
     _use_lpips(arguments.lpips_weights)
@@ -88,9 +88,13 @@ def run(arguments: argparse.Namespace) -> int:
         print(estimate(suite, options))
         return DONE
     finished = run_suite(suite, options)
-    results = results_of(finished)
+    results = finished_results(finished)
     if len(results) < len(finished.cells):
-        print(f"{len(results)} of {len(finished.cells)} cells are there; the report waits for the other shards")
+        there = f"{len(results)} of {len(finished.cells)} cells are there"
+        if options.shard is None:
+            print(f"{there}, the others were interrupted; the same command goes on", file=sys.stderr)
+            return INTERRUPTED
+        print(f"{there}; the report waits for the other shards")
         return FAILED if failures(results) else DONE
     return _report(finished.folder)
 

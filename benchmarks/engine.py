@@ -24,6 +24,7 @@ AnyCell = TypeVar("AnyCell")
 
 POLL_S = 0.2
 WRONG_INPUT = 2
+INTERRUPTIONS = (130, -signal.SIGINT, -signal.SIGTERM)  # A scheduler's wish: no result, resumed later.
 
 _children: set[subprocess.Popen[bytes]] = set()
 _starting = threading.Lock()  # No child may start between the decision to stop and the end of the children.
@@ -141,7 +142,7 @@ def run_in_process(folder: str, limits: Limits) -> str:
     finally:
         _kill(child)
         _children.discard(child)
-    if _stopping.is_set():
+    if _stopping.is_set() or (failure is None and child.returncode in INTERRUPTIONS):
         return "interrupted"
     return _outcome(cell, child.returncode, failure).status
 

@@ -1,6 +1,7 @@
 """One cell, in a process of its own: train, render, score, time; `python -m benchmarks.run FOLDER`.
 
-Exit codes: 0 a result was written (also that of a method that failed), 2 wrong input or no room to write (on stderr).
+Exit codes: 0 a result was written (also that of a method that failed), 2 wrong input or no room to write (on stderr),
+130 interrupted, without a result.
 """
 
 import argparse
@@ -64,6 +65,9 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         print(disk_problem(error) or _reraise(error), file=sys.stderr)
         return 2
+    except KeyboardInterrupt as interruption:
+        print(f"interrupted {interruption}", file=sys.stderr)
+        return 130
     return 0
 
 

@@ -162,10 +162,15 @@ def results_of(run: Run) -> list[CellResult]:
     Raises:
         InputError: nothing is finished yet, or a result is damaged.
     """
-    results = [result for cell in run.cells if (result := read_result(cell.folder)) is not None]
+    results = finished_results(run)
     if not results:
         raise InputError(f"{run.folder}: no cell is finished, so there is nothing to report")
     return results
+
+
+def finished_results(run: Run) -> list[CellResult]:
+    """The results that are there, in the suite's order; perhaps none."""
+    return [result for cell in run.cells if (result := read_result(cell.folder)) is not None]
 
 
 def failures(results: Sequence[CellResult]) -> list[CellResult]:

@@ -18,7 +18,7 @@ from benchmarks.experiments import CaptureSpec, CellSpec
 from benchmarks.progress import Progress
 from benchmarks.runs import cell_for
 
-LIMITS = Limits(seconds=60.0, memory_mb=4096)
+LIMITS = Limits(seconds=300.0, memory_mb=4096)
 
 
 @pytest.fixture(scope="module")
@@ -147,6 +147,26 @@ def test_interrupting_ends_the_children_and_the_cell_can_be_resumed(capture: Pat
         wait_for(lambda child=child: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE)
         assert read_result(target.folder) is None
         assert len(plan_cells([target]).todo) == 1
+
+
+def test_a_cell_that_was_told_to_stop_is_unfinished_and_not_failed(capture: Path, tmp_path: Path) -> None:
+    target = cell("sleeping", capture, tmp_path)
+    stopper = subprocess.Popen([sys.executable, "-c", STOP_THE_CELL, str(os.getpid()), target.config.key])
+    plan = run([target])
+    stopper.wait()
+    assert len(plan.todo) == 1 and read_result(target.folder) is None
+    assert len(plan_cells([target]).todo) == 1
+
+
+STOP_THE_CELL = """
+import signal, sys, time, psutil
+def cells():
+    return [p for p in psutil.Process(int(sys.argv[1])).children() if sys.argv[2] in ' '.join(p.cmdline())]
+while not cells():
+    time.sleep(0.05)
+time.sleep(1)
+cells()[0].send_signal(signal.SIGTERM)
+"""
 
 
 def test_a_run_in_a_process_leaves_its_log(capture: Path, tmp_path: Path) -> None:
