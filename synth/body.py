@@ -54,7 +54,7 @@ class Body:
         """How far rest points `[n, 3]` lie inside the hair, metres: behind a slanted hairline and not on the ears."""
         x, y, z = (points - self.face.eyes.mean(axis=0)).T
         if not self.face.modelled:
-            return (y - 0.045 - 0.9 * np.clip(z + 0.1, 0.03 - 0.04, 1)) / 1.3
+            return (y - 0.116 - 1.1 * z) / 1.5
         above = (y - 0.062 - 0.98 * z) / 1.4
         ears = np.hypot((y + 0.012) / 1.15, z + 0.088) - 0.038
         return np.where(np.abs(x) > 0.06, np.minimum(above, ears), above)

@@ -160,8 +160,8 @@ def estimate(scene: Scene) -> Estimate:
     novel_views = rig.held_out * (len(range(scene.novel_view_stride // 2, training, scene.novel_view_stride)))
     images = train_views + novel_views + rig.held_out * (scene.frames - training)
     pixels = rig.width * rig.height
-    per_image = 0.05 + 4.5e-8 * pixels * scene.samples
-    fixed = 20.0 + 0.3 * scene.frames
+    per_image = 0.05 + 1.2e-7 * pixels * scene.samples
+    fixed = (40.0 if scene.body == "anny" else 6.0) + 0.25 * scene.frames
     size = int(images * pixels * 1.1 + scene.frames * 1.2e6 + 3 * scene.texture**2)
     return Estimate(images=images, core_seconds=fixed + images * per_image, bytes=size)
 

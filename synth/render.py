@@ -141,7 +141,7 @@ class Studio:
         diffuse = {"type": "diffuse", "reflectance": colour}
         if light.gloss == 0:
             return mi.load_dict({"type": "twosided", "bsdf": diffuse})
-        satin = {"type": "principled", "base_color": colour, "roughness": 0.32, "specular": 0.2 + 0.8 * light.gloss}
+        satin = {"type": "principled", "base_color": colour, "roughness": 0.28, "specular": 0.45 * light.gloss}
         return mi.load_dict({"type": "twosided", "bsdf": satin})
 
     def _lights(self, light: Light) -> dict[str, Any]:
