@@ -18,7 +18,6 @@ import numpy as np
 from ash.dataset import (
     SCHEMA,
     Camera,
-    Motion,
     Split,
     image_path,
     pixels_path,
@@ -292,10 +291,3 @@ def finish(scene: Scene, folder: Path, renderer: Renderer) -> None:
         "machine": platform.machine(),
     }
     write_json(folder / "manifest.json", _manifest(scene, files=files, complete=True, made_with=made_with))
-
-
-def template_error(capture_motion: Motion, skinned: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-    """Mean and root-mean-square distance, metres, of skinned template vertices `[t, v, 3]` from the truth."""
-    del capture_motion
-    distance = np.linalg.norm(skinned - truth, axis=-1)
-    return float(distance.mean()), float(np.sqrt(np.mean(distance**2)))

@@ -17,7 +17,7 @@ import numpy as np
 
 from ash.dataset import Camera
 from ash.files import InputError
-from synth.body import CLOTHES, PARTS, Surface, vertex_normals
+from synth.body import Surface, vertex_normals
 from synth.scene import Light
 
 OLDEST_LLVM = 17  # 15 and 16 accept the first kernels and then abort the process ("Cannot select fminimum")
@@ -285,11 +285,6 @@ class Studio:
         triangle = np.where(valid, triangle, -1).astype(np.int32).reshape(height, width)
         barycentric = np.where(valid[:, None], barycentric, 0).astype(np.float32).reshape(height, width, 2)
         return triangle, barycentric
-
-
-def cloth_faces(surface: Surface) -> np.ndarray:
-    """Which faces are cloth, `[f]` bool."""
-    return np.isin(surface.part, [PARTS.index(part) for part in CLOTHES])
 
 
 def _to_srgb(linear: np.ndarray) -> np.ndarray:
