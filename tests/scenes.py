@@ -1,5 +1,7 @@
 """A tiny scene, and its capture rendered once for all tests."""
 
+import atexit
+import shutil
 import tempfile
 from dataclasses import replace
 from functools import lru_cache
@@ -9,8 +11,6 @@ from synth import presets
 from synth.capture import make_capture
 from synth.motion import Clip
 from synth.scene import Rig, Scene
-
-_FOLDER = tempfile.TemporaryDirectory(prefix="ash-bench-tests-")  # Removed when the interpreter ends.
 
 
 def small_scene(**changes) -> Scene:
@@ -29,5 +29,7 @@ def small_scene(**changes) -> Scene:
 
 @lru_cache(maxsize=1)
 def small_capture() -> Path:
-    """The folder of the small scene's capture. Tests that change it work on a copy."""
-    return make_capture(small_scene(), Path(_FOLDER.name) / "small")
+    """The folder of the small scene's capture, removed when the tests end. Tests that change it work on a copy."""
+    folder = Path(tempfile.mkdtemp(prefix="ash-bench-tests-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return make_capture(small_scene(), folder / "small")
