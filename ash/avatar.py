@@ -15,7 +15,7 @@ from ash.protocol import StageClock
 from ash.skinning import quat_multiply
 from ash.splatting import Splatted, splat
 from ash.template import Template
-from ash.textures import Conditions, TexelLattice, motion_aware_textures, normalised_motion
+from ash.textures import Conditions, TexelLattice, build_lattice, motion_aware_textures, normalised_motion
 
 # Metres per unit of a decoder's output: offsets are centimetres, so that all outputs are of order one.
 OFFSET_UNIT = 0.01
@@ -41,6 +41,7 @@ class AshModel(nn.Module):
         self.config = config
         self.template = template
         self.lattice = lattice
+        self.decoder_lattice = lattice if config.shuffle == 1 else build_lattice(template.mesh, config.decoded_texels)
         self.base = nn.Parameter(initial.clone(), requires_grad=config.base)
         self.decoders = decoders
         self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.light else None
@@ -61,10 +62,10 @@ class AshModel(nn.Module):
 
     def _textures(self, motion: Motion, frame: int) -> Float[Tensor, "c r r"]:
         if self.decoders is None:
-            return torch.zeros(0, self.lattice.resolution, self.lattice.resolution)
+            return torch.zeros(0, 1, 1)
         return motion_aware_textures(
             self.template,
-            self.lattice,
+            self.decoder_lattice,
             motion,
             frame,
             window=self.config.window,

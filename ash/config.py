@@ -24,7 +24,7 @@ class ModelConfig:
     levels: int = 4  # halvings of the U-Nets
     norm: str = "instance"  # "instance" (what the release's BatchNorm at batch 1 computes) or "none"
     shared_trunk: bool = False  # one U-Net for E_geo and E_app together; not in the paper
-    half_resolution: bool = False  # decode at half the lattice and shuffle up; not in the paper
+    shuffle: int = 1  # decode at 1/shuffle of the lattice's resolution and shuffle pixels up; not in the paper
     sh_degree: int = 3
     global_features: bool = True  # Phi, from the root translation, at the bottleneck of E_app
     quat_frame: str = "canonical"  # "canonical": rotations and SH turn with the surface; "world": as released
@@ -32,12 +32,18 @@ class ModelConfig:
     light: bool = False  # colour times exp(SH2 of the posed normal), 27 numbers; not in the paper
     dilation: float = 0.3  # px^2 added to the projected covariance
 
+    @property
+    def decoded_texels(self) -> int:
+        """Resolution at which the motion-aware textures are drawn and decoded."""
+        return self.texels // self.shuffle
+
     def __post_init__(self) -> None:
         """Refuse what cannot be built."""
         one_of("norm", self.norm, ("instance", "none"))
         one_of("quat_frame", self.quat_frame, ("canonical", "world"))
-        if self.texels < 4 or self.texels % 2 ** (self.levels + self.half_resolution):
-            raise InputError(f"texels: expected a multiple of 2^levels, got {self.texels} with {self.levels} levels")
+        if self.shuffle < 1 or self.texels < 4 or self.texels % (self.shuffle * 2**self.levels):
+            unit = f"shuffle {self.shuffle} times 2^levels {2**self.levels}"
+            raise InputError(f"texels: expected a multiple of {unit}, got {self.texels}")
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
         if self.window < 1 or self.width < 1 or self.dilation < 0:

@@ -3,7 +3,7 @@
 from itertools import pairwise
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ash.config import ModelConfig
@@ -88,18 +88,17 @@ class Decoders(nn.Module):
 
     def __init__(self, config: ModelConfig, lattice: TexelLattice) -> None:
         super().__init__()
-        self.lattice = lattice
-        self.half_resolution = config.half_resolution
+        self.register_buffer("rows", _rows_of_texels(lattice, config.shuffle), persistent=False)
         features = GLOBAL_FEATURES if config.global_features else 0
-        shuffle = 4 if config.half_resolution else 1
         outputs = [GEOMETRY_CHANNELS, raw_channels(config) - GEOMETRY_CHANNELS]
         if config.shared_trunk:
             outputs = [sum(outputs)]
         phi_inputs = [0] * (len(outputs) - 1) + [features]  # E_geo does not see Phi, unless the trunk is shared.
+        self.outputs = outputs
         self.nets = nn.ModuleList(
             UNet(
                 6 * config.window,
-                count * shuffle,
+                count * config.shuffle**2,
                 width=config.width,
                 levels=config.levels,
                 norm=config.norm,
@@ -108,14 +107,25 @@ class Decoders(nn.Module):
             for count, phi in zip(outputs, phi_inputs, strict=True)
         )
         self.phi = GlobalFeatures() if config.global_features else None
+        self.to(memory_format=torch.channels_last)
 
     def forward(self, conditions: Conditions) -> Float[Tensor, "n o"]:
         """Decode one frame."""
         x = conditions.textures[None].contiguous(memory_format=torch.channels_last)
-        if self.half_resolution:
-            x = nn.functional.avg_pool2d(x, 2)
         phi = self.phi(conditions.root_translation) if self.phi is not None else None
         decoded = [net(x) for net in self.nets[:-1]] + [self.nets[-1](x, phi)]
-        if self.half_resolution:
-            decoded = [nn.functional.pixel_shuffle(part, 2) for part in decoded]
-        return self.lattice.from_texture(torch.cat(decoded, 1)[0])
+        return torch.cat([self._texels_of(part, count) for part, count in zip(decoded, self.outputs, strict=True)], 1)
+
+    def _texels_of(self, decoded: Float[Tensor, "1 c r r"], count: int) -> Float[Tensor, "n o"]:
+        """The covered texels' outputs. A pixel's channels are its `shuffle x shuffle` texels, `count` values each.
+
+        In the networks' own memory order these are rows to pick from: nothing is shuffled that will not be used.
+        """
+        return decoded.permute(0, 2, 3, 1).reshape(-1, count).index_select(0, self.rows)
+
+
+def _rows_of_texels(lattice: TexelLattice, shuffle: int) -> Int[Tensor, " n"]:
+    """Where the texels of the lattice lie in a texture decoded at 1/shuffle of its resolution."""
+    row, column = lattice.texels // lattice.resolution, lattice.texels % lattice.resolution
+    pixel = (row // shuffle) * (lattice.resolution // shuffle) + column // shuffle
+    return pixel * shuffle**2 + (row % shuffle) * shuffle + column % shuffle

@@ -18,7 +18,7 @@ def ci() -> AshConfig:
         levels=3,
         norm="none",
         shared_trunk=True,
-        half_resolution=True,
+        shuffle=2,
         sh_degree=0,
         base=True,
         light=True,
@@ -41,8 +41,8 @@ def cpu() -> AshConfig:
     base = ci()
     return replace(
         base,
-        model=replace(base.model, texels=128, width=16, levels=4),
-        training=replace(base.training, steps=1500, warmup_steps=300),
+        model=replace(base.model, texels=256, shuffle=4, width=16, levels=3),
+        training=replace(base.training, steps=1100, warmup_steps=250, learning_rate=4e-3, base_learning_rate=2e-2),
     )
 
 

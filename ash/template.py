@@ -74,6 +74,7 @@ class Template:
     KEPT_FRAMES = 4
 
     def __init__(self, mesh: TemplateMesh, skeleton: Skeleton, deformation: Deformation) -> None:
+        self.mesh = mesh
         self.skeleton = skeleton
         self.faces = torch.from_numpy(mesh.faces)
         self.skin: SkinWeights = sparse_skin_weights(torch.from_numpy(mesh.skin_weights).float())

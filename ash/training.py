@@ -26,7 +26,7 @@ from ash.losses import cache_target, l1_ssim_loss
 
 CROP_MARGIN = 12  # Pixels around the subject, so that a Gaussian that strays outside the mask is still seen.
 LOG_EVERY = 50
-FINAL_LEARNING_RATE = 0.05  # Of the initial one, at the end of the cosine.
+FINAL_LEARNING_RATE = 0.02  # Of the initial one, at the end of the cosine.
 
 
 class Diverged(FloatingPointError):

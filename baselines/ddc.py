@@ -31,7 +31,7 @@ from ash.template import PosedTemplate, Template
 from ash.textures import TexelLattice, build_lattice, motion_aware_textures
 from ash.training import fit, load_module, load_training_images, read_safetensors
 
-TEXTURE_FACTOR = 4  # Texture pixels per texel of the lattice, per side: the mesh must not be starved.
+TEXTURE_FACTOR = 2  # Texture pixels per Gaussian of ASH's lattice, per side: the mesh must not be starved.
 SUPERSAMPLING = 2  # Rays per pixel side: antialiased coverage and texture.
 
 
@@ -39,7 +39,8 @@ SUPERSAMPLING = 2  # Rays per pixel side: antialiased coverage and texture.
 class DdcConfig:
     """The texture network sees what ASH's decoders see, at the same resolution and width."""
 
-    texels: int
+    texture: int  # pixels per side
+    texels: int  # resolution of the motion-aware textures, which the network sees
     window: int
     yaw_normalise: bool
     width: int
@@ -55,7 +56,8 @@ def ddc_config(ash: AshConfig, *, seed: int, template: str) -> DdcConfig:
     """DDC with the budget and the conditions of an ASH preset."""
     model: ModelConfig = ash.model
     return DdcConfig(
-        texels=model.texels,
+        texture=TEXTURE_FACTOR * model.texels,
+        texels=model.decoded_texels,
         window=model.window,
         yaw_normalise=model.yaw_normalise,
         width=model.width,
@@ -69,7 +71,7 @@ def ddc_config(ash: AshConfig, *, seed: int, template: str) -> DdcConfig:
 
 
 class DdcModel(nn.Module):
-    """A static texture plus a predicted residual, at `TEXTURE_FACTOR` times the lattice's resolution."""
+    """A static texture plus a residual that is predicted from the motion-aware textures."""
 
     def __init__(
         self, config: DdcConfig, mesh: TemplateMesh, template: Template, lattice: TexelLattice, initial: Tensor
@@ -82,7 +84,7 @@ class DdcModel(nn.Module):
         self.texture = nn.Parameter(initial.clone())
         self.network = UNet(
             6 * config.window,
-            3 * (TEXTURE_FACTOR * 2) ** 2,
+            3 * (config.texture // config.texels) ** 2,
             width=config.width,
             levels=config.levels,
             norm=config.norm,
@@ -101,9 +103,10 @@ class DdcModel(nn.Module):
         )
 
     def dynamic_texture(self, conditions: Float[Tensor, "c r r"]) -> Float[Tensor, "3 t t"]:
-        """The texture of a frame: decoded at half the lattice's resolution and shuffled up."""
-        seen = nn.functional.avg_pool2d(conditions[None], 2).contiguous(memory_format=torch.channels_last)
-        return self.texture + nn.functional.pixel_shuffle(self.network(seen), TEXTURE_FACTOR * 2)[0]
+        """The texture of a frame: decoded at the resolution of the motion-aware textures and shuffled up."""
+        seen = conditions[None].contiguous(memory_format=torch.channels_last)
+        factor = self.config.texture // self.config.texels
+        return self.texture + nn.functional.pixel_shuffle(self.network(seen), factor)[0]
 
     def draw(
         self, texture: Float[Tensor, "3 t t"], posed: PosedTemplate, camera: Camera, background: Tensor
@@ -143,7 +146,7 @@ class DdcAvatar:
         torch.manual_seed(config.seed)
         self.config = config
         self.template = template_of(config.template, capture)
-        fine = build_lattice(capture.template, config.texels * TEXTURE_FACTOR)
+        fine = build_lattice(capture.template, config.texture)
         colours = mean_colours(capture, self.template, fine)
         initial = fine.to_texture(colours - colours.mean(0)) + colours.mean(0)[:, None, None]
         lattice = build_lattice(capture.template, config.texels)

@@ -68,7 +68,7 @@ def mannequin(*, size: str, seed: int) -> Scene:
 
 def loose(*, size: str, seed: int) -> Scene:
     """A realistic body in loose clothes and a swinging skirt, everything on: the default of the main job."""
-    outfit = Outfit(skirt=True, folds_mm=5.0, slack_mm=4.0, swing=0.25, scan_mm=2.0)
+    outfit = Outfit(skirt=True, folds_mm=4.0, slack_mm=3.0, swing=0.2, scan_mm=1.5)
     return _base("loose", size, seed, body="anny", outfit=outfit)
 
 

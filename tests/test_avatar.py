@@ -138,7 +138,7 @@ def test_rotated_normals_reach_the_conditions():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"texels": 50}, "multiple of 2\\^levels"),
+        ({"texels": 50}, "multiple of shuffle 1 times 2"),
         ({"norm": "batch"}, "norm: expected one of instance, none"),
         ({"sh_degree": 4}, "sh_degree: expected 0 to 3"),
         ({"motion": False, "base": False}, "motion=False needs base=True"),

@@ -38,7 +38,7 @@ def test_a_constant_texture_draws_a_flat_silhouette_over_the_background(capture)
     model = avatar(capture).module
     posed = model.template.pose(tube_motion(), 0)
     colour, background = torch.tensor([0.2, 0.5, 0.8]), torch.tensor([1.0, 0.0, 0.0])
-    texture = colour[:, None, None].expand(3, 64, 64)
+    texture = colour[:, None, None].expand(3, 32, 32)
     with torch.no_grad():
         image = model.draw(texture, posed, front_camera(), background)
     coverage = image[..., 3:]
@@ -51,7 +51,7 @@ def test_a_constant_texture_draws_a_flat_silhouette_over_the_background(capture)
 def test_gradients_reach_exactly_the_texture_pixels_that_are_seen(capture):
     model = avatar(capture).module
     posed = model.template.pose(tube_motion(), 0)
-    texture = torch.full((3, 64, 64), 0.5, requires_grad=True)
+    texture = torch.full((3, 32, 32), 0.5, requires_grad=True)
     model.draw(texture, posed, front_camera(), torch.zeros(3))[..., 1].sum().backward()
     assert texture.grad is not None
     assert not texture.grad[[0, 2]].any()
@@ -61,7 +61,7 @@ def test_gradients_reach_exactly_the_texture_pixels_that_are_seen(capture):
 
 def test_a_known_texture_is_recovered_from_its_images(capture, tmp_path):
     known = avatar(capture)
-    known.module.texture.data = torch.rand(3, 16, 16).repeat_interleave(4, 1).repeat_interleave(4, 2)
+    known.module.texture.data = torch.rand(3, 8, 8).repeat_interleave(4, 1).repeat_interleave(4, 2)
     folder = shutil.copytree(capture.folder, tmp_path / "capture")
     for split in capture.splits.values():
         for camera, frame in split.views:

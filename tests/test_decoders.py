@@ -45,11 +45,13 @@ def test_official_width_has_the_published_number_of_parameters():
 
 
 def test_every_parameter_learns_once_the_heads_have_moved():
-    for changes in ({}, {"shared_trunk": True}, {"half_resolution": True, "shared_trunk": True}, {"norm": "none"}):
+    for changes in ({}, {"shared_trunk": True}, {"shuffle": 2, "shared_trunk": True}, {"norm": "none"}):
         decoders = Decoders(config(**changes), LATTICE)
         for net in decoders.nets:
             torch.nn.init.normal_(net.head.weight)
-        decoders(conditions(torch.randn(12, 16, 16))).square().sum().backward()
+        side = 16 // changes.get("shuffle", 1)
+        textures = torch.randn(12, side, side)
+        decoders(conditions(textures)).square().sum().backward()
         assert all(p.grad is not None and p.grad.any() for p in decoders.parameters()), changes
 
 
@@ -61,3 +63,16 @@ def test_global_features_reach_appearance_alone():
     there = replace(here, root_translation=torch.tensor([1.0, 0.0, 2.0]))
     assert torch.equal(decoders(here)[:, :11], decoders(there)[:, :11])
     assert not torch.allclose(decoders(here)[:, 11:], decoders(there)[:, 11:])
+
+
+def test_shuffled_decoding_puts_every_value_on_its_own_texel():
+    """A texture decoded at half resolution holds the four texels of each pixel, row by row."""
+    decoders = Decoders(config(shuffle=2, shared_trunk=True, global_features=False), LATTICE)
+    outputs = decoders.outputs[0]
+    row, column = LATTICE.texels // 16, LATTICE.texels % 16
+    coordinates = torch.stack([row, column], 1).float()
+    decoded = torch.zeros(1, 4 * outputs, 8, 8)
+    for sub in range(4):
+        y, x = torch.meshgrid(2 * torch.arange(8) + sub // 2, 2 * torch.arange(8) + sub % 2, indexing="ij")
+        decoded[0, sub * outputs], decoded[0, sub * outputs + 1] = y, x
+    assert torch.equal(decoders._texels_of(decoded, outputs)[:, :2], coordinates)
