@@ -257,11 +257,14 @@ class _Run:
             return False
         tensors, facts = read_safetensors(self.path)
         load_module(self.learner.module, {n[6:]: t for n, t in tensors.items() if n.startswith("model.")}, self.path)
+        parameters = [p for group in self.optimiser.param_groups for p in group["params"]]
         state: dict[int, dict[str, Tensor]] = {}
         for name, value in tensors.items():
             if name.startswith("adam."):
                 _, index, key = name.split(".")
-                state.setdefault(int(index), {})[key] = value
+                # The fused Adam walks memory: moments must lie as their parameter does (channels last, say).
+                laid = torch.empty_like(parameters[int(index)]).copy_(value) if value.dim() else value
+                state.setdefault(int(index), {})[key] = laid.detach()
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": state, "param_groups": groups})
         self.step, self.seconds = int(facts["step"]), float(facts["seconds"])
