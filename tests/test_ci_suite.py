@@ -25,7 +25,7 @@ def test_every_method_of_the_suite_came_through(scores: Scores) -> None:
 @pytest.mark.parametrize("split", ["novel_view", "novel_pose"])
 @pytest.mark.parametrize(
     ("method", "least_psnr", "least_iou"),
-    [("ash", 16.0, 0.9), ("ddc", 17.0, 0.9), ("ash_truth", 17.0, 0.95), ("ddc_truth", 20.5, 0.96)],
+    [("ash", 17.7, 0.93), ("ddc", 18.5, 0.93), ("ash_truth", 19.0, 0.955), ("ddc_truth", 20.5, 0.955)],
 )
 def test_quality_is_what_working_parts_reach(
     scores: Scores, method: str, split: str, least_psnr: float, least_iou: float
@@ -46,4 +46,4 @@ def test_every_stage_is_timed_and_they_add_up_to_the_frame(scores: Scores) -> No
         stages = [scores.get("mannequin", method, "speed", "", f"stg{i}_ms") for i in range(1, 5)]
         whole = scores.get("mannequin", method, "speed", "", "frame_ms")
         assert all(stage is not None for stage in stages)
-        assert sum(stage.mean for stage in stages) == pytest.approx(whole.mean, rel=0.25)
+        assert sum(stage.mean for stage in stages) == pytest.approx(whole.mean, rel=0.35)
