@@ -1,0 +1,21 @@
+import numpy as np
+
+from synth.checks import penetrations, stretch
+from synth.mannequin import mannequin
+
+BODY = mannequin(skirt=True)
+SKIRT = BODY.surface.vertices_of("skirt")
+
+
+def test_legs_that_poke_through_are_found_and_measured():
+    rest = BODY.surface.vertices
+    tight = rest.copy()
+    tight[SKIRT] *= [0.5, 1, 0.5]  # a skirt of half the width: the thighs stick out at the sides
+    found = penetrations(BODY, np.stack([rest, tight]))
+    assert found.share[0] == 0 and found.deepest[0] < 0.005
+    assert found.share[1] > 0.05 and found.deepest[1] > 0.01
+
+
+def test_stretch_is_relative_to_rest():
+    rest = BODY.surface.vertices
+    np.testing.assert_allclose(stretch(BODY, np.stack([rest, 1.2 * rest]), "skirt"), [1.0, 1.2])
