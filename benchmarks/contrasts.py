@@ -61,7 +61,9 @@ def candidates(scores: Scores, scene: str, split: str) -> tuple[Candidate, ...]:
 
 def _rivals(scores: Scores, scene: str, reference: str) -> list[str]:
     methods = scores.methods(scene)
-    return [m for m in methods if m != reference and not is_oracle(m)] if reference in methods else []
+    if reference not in methods or scores.failed(scene, reference):
+        return []
+    return [m for m in methods if m != reference and not is_oracle(m) and not scores.failed(scene, m)]
 
 
 def _bootstrap(scores: Scores, scene: str, ours: str, theirs: str, split: str) -> tuple[float, float]:

@@ -122,7 +122,7 @@ SUITES = {
             preset="ci",
             seeds=1,
             cell_minutes=0.3,
-            limit_minutes=10.0,
+            limit_minutes=20.0,
         ),
     )
 }

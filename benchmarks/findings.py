@@ -57,6 +57,9 @@ def frontier(scores: Scores, scene: str) -> tuple[str, ...]:
 
 
 def _duel(scores: Scores, scene: str) -> str:
+    fallen = [look_of(method).title for method in ("ash", "ddc") if scores.failed(scene, method)]
+    if fallen:
+        return f"On {scene}, {' and '.join(fallen)} failed, so ASH and DDC cannot be compared."
     parts = []
     for split, where in (("novel_view", "on held-out views"), ("novel_pose", "on held-out motion")):
         ours, theirs = scores.fg(scene, "ash", split), scores.fg(scene, "ddc", split)
@@ -73,6 +76,8 @@ def _standing(ours: Score, theirs: Score) -> str:
 
 
 def _exact(scores: Scores, scene: str) -> str:
+    if any(scores.failed(scene, EXACT[method]) for method in ("ash", "ddc")):
+        return ""
     pairs = [scores.fg(scene, EXACT[method]) for method in ("ash", "ddc")]
     if pairs[0] is None or pairs[1] is None:
         return ""

@@ -320,7 +320,8 @@ def _exact_pairs(scores: Scores, scene: str) -> list[Exact]:
     found = []
     for split, title in list(tables.SPLIT_TITLES.items())[:2]:
         quads = [[scores.fg(scene, name, split) for name in pair] for pair in EXACT.items()]
-        if any(score is None for pair in quads for score in pair):
+        failed = any(scores.failed(scene, name) for pair in EXACT.items() for name in pair)
+        if failed or any(score is None for pair in quads for score in pair):
             continue
         values = [[score.mean for score in pair if score] for pair in quads]
         rows = tuple(

@@ -283,3 +283,14 @@ def test_the_necessity_matrix_says_what_its_intervals_allow() -> None:
         "lit": "unclear",
     }
     assert matrix(Scores(scene("still", "ash", [1.0])), "novel_view", title="t") is None
+
+
+def test_a_failed_method_is_compared_with_nobody() -> None:
+    from benchmarks.contrasts import contrasts
+
+    whole = [scored("ash", view=27.0 + seed, pose=20.0, seed=seed) for seed in range(2)]
+    whole += [scored("ash_truth", view=30.0, pose=29.0), failed_result(config("ddc_truth", 0), "timeout", "slow")]
+    fallen = Scores([*whole, *(failed_result(config("ddc", seed), "crashed", "boom") for seed in range(2))])
+    assert findings.headline(fallen, "loose") == "On loose, DDC failed, so ASH and DDC cannot be compared."
+    assert not any("exact surface, " in remark and "leads" in remark for remark in findings.remarks(fallen, "loose"))
+    assert contrasts(fallen, "loose") == ()
