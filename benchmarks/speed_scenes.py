@@ -87,8 +87,8 @@ def _camera(width: int, height: int, fill: float) -> tuple[Tensor, Tensor]:
 
 
 def body_mesh(pixels: int) -> tuple[Tensor, Tensor]:
-    """The body as triangles, 5,376 of them, projected into a square image: homogeneous pixels and faces."""
-    rings, sectors = 16, 28
+    """The body as triangles, 1,344 of them, projected into a square image: homogeneous pixels and faces."""
+    rings, sectors = 8, 14
     angle = torch.linspace(0, 2 * math.pi, sectors + 1)[:-1]
     vertices: list[Tensor] = []
     faces: list[list[int]] = []
