@@ -15,7 +15,14 @@ from ash.protocol import StageClock
 from ash.skinning import quat_multiply
 from ash.splatting import Splatted, splat
 from ash.template import Template
-from ash.textures import Conditions, TexelLattice, build_lattice, motion_aware_textures, normalised_motion
+from ash.textures import (
+    Conditions,
+    TexelLattice,
+    build_lattice,
+    motion_aware_textures,
+    normalised_motion,
+    texture_statistics,
+)
 
 # Metres per unit of a decoder's output: offsets are centimetres, so that all outputs are of order one.
 OFFSET_UNIT = 0.01
@@ -42,6 +49,10 @@ class AshModel(nn.Module):
         self.template = template
         self.lattice = lattice
         self.decoder_lattice = lattice if config.shuffle == 1 else build_lattice(template.mesh, config.decoded_texels)
+        if decoders is not None and config.standardise:
+            blank = torch.zeros(6 * config.window, config.decoded_texels, config.decoded_texels)
+            self.register_buffer("texture_mean", blank)
+            self.register_buffer("texture_deviation", torch.ones(6 * config.window, 1, 1))
         self.base = nn.Parameter(initial.clone(), requires_grad=config.base)
         self.decoders = decoders
         self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.light else None
@@ -60,9 +71,19 @@ class AshModel(nn.Module):
                 transforms=self.lattice.interpolate_transforms(posed.transforms),
             )
 
+    def observe(self, motion: Motion, frames: tuple[int, ...]) -> None:
+        """Take the statistics of the textures that `standardise` refers to, from training frames."""
+        if self.decoders is not None and self.config.standardise:
+            drawn = [self._raw_textures(motion, frame) for frame in frames]
+            self.texture_mean, self.texture_deviation = texture_statistics(drawn)
+
     def _textures(self, motion: Motion, frame: int) -> Float[Tensor, "c r r"]:
         if self.decoders is None:
             return torch.zeros(0, 1, 1)
+        textures = self._raw_textures(motion, frame)
+        return (textures - self.texture_mean) / self.texture_deviation if self.config.standardise else textures
+
+    def _raw_textures(self, motion: Motion, frame: int) -> Float[Tensor, "c r r"]:
         return motion_aware_textures(
             self.template,
             self.decoder_lattice,

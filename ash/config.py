@@ -28,6 +28,7 @@ class ModelConfig:
     sh_degree: int = 3
     global_features: bool = True  # Phi, from the root translation, at the bottleneck of E_app
     quat_frame: str = "canonical"  # "canonical": rotations and SH turn with the surface; "world": as released
+    standardise: bool = False  # decoders see deviations from the mean training texture, in its units; not in the paper
     base: bool = False  # learned static texels with the decoders as residual; not in the paper
     light: bool = False  # colour times exp(SH2 of the posed normal), 27 numbers; not in the paper
     dilation: float = 0.3  # px^2 added to the projected covariance

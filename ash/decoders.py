@@ -45,6 +45,8 @@ class UNet(nn.Module):
         self.up = nn.ModuleList(nn.ConvTranspose2d(a, b, 2, stride=2) for a, b in pairs)
         self.merge = nn.ModuleList(ConvBlock(2 * b, b, norm) for _, b in pairs)
         self.head = nn.Conv2d(width, outputs, 1)
+        if norm == "none":
+            self.apply(_keep_variance)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
 
@@ -61,6 +63,19 @@ class UNet(nn.Module):
         for up, merge in zip(self.up, self.merge, strict=True):
             x = merge(torch.cat([up(x), skips.pop()], 1))
         return self.head(x)
+
+
+def _keep_variance(layer: nn.Module) -> None:
+    """He et al. 2015. Without a norm, torch's own start shrinks features layer by layer; nothing is left at the head.
+
+    A transposed convolution of stride 2 and size 2 has one tap per output pixel, so its fan is its input channels.
+    """
+    if isinstance(layer, nn.Conv2d):
+        nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+    elif isinstance(layer, nn.ConvTranspose2d):
+        nn.init.normal_(layer.weight, std=layer.in_channels**-0.5)
+    if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d) and layer.bias is not None:
+        nn.init.zeros_(layer.bias)
 
 
 class GlobalFeatures(nn.Module):

@@ -40,6 +40,7 @@ class AshAvatar:
         self.analytic = initial_gaussians(config.model, capture, self.template, self.lattice)
         decoders = make_decoders(config.model, self.lattice) if config.model.motion else None
         self.module = AshModel(config.model, self.template, self.lattice, self._start(capture), decoders)
+        self.module.observe(capture.motion, capture.splits["train"].frames)
         self._conditions: dict[int, Conditions] = {}
         self._motion = capture.motion
 

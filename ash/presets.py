@@ -20,6 +20,7 @@ def ci() -> AshConfig:
         shared_trunk=True,
         shuffle=2,
         sh_degree=0,
+        standardise=True,
         base=True,
         light=True,
         dilation=0.05,
@@ -42,7 +43,7 @@ def cpu() -> AshConfig:
     return replace(
         base,
         model=replace(base.model, texels=256, shuffle=4, width=16, levels=3),
-        training=replace(base.training, steps=1100, warmup_steps=250, learning_rate=4e-3, base_learning_rate=2e-2),
+        training=replace(base.training, steps=1100, warmup_steps=200, learning_rate=1e-3, base_learning_rate=2e-2),
     )
 
 

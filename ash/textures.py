@@ -140,6 +140,18 @@ def motion_aware_textures(
     return lattice.to_texture(lattice.interpolate(channels))
 
 
+@torch.no_grad()
+def texture_statistics(textures: list[Float[Tensor, "c r r"]]) -> tuple[Float[Tensor, "c r r"], Float[Tensor, "c 1 1"]]:
+    """Mean texture over frames, and per channel the standard deviation from it over frames and covered texels.
+
+    A body's positions differ by a metre between texels and by centimetres between frames; only the latter is motion.
+    """
+    mean = torch.stack(textures).mean(0)
+    covered = (mean != 0).any(0)
+    deviations = torch.stack([(texture - mean)[:, covered] for texture in textures])
+    return mean, deviations.square().mean((0, 2)).sqrt().clamp(min=1e-3)[:, None, None]
+
+
 def _in_root_frame(posed: PosedTemplate, root: Tensor, unturn: Tensor) -> Float[Tensor, "v 6"]:
     turn = unturn.expand(len(posed.vertices), 4)
     return torch.cat([rotate(turn, posed.normals), rotate(turn, posed.vertices - root)], dim=-1)

@@ -28,7 +28,7 @@ from ash.presets import named
 from ash.protocol import StageClock
 from ash.rasterizing import project_vertices, rasterize_mesh
 from ash.template import PosedTemplate, Template
-from ash.textures import TexelLattice, build_lattice, motion_aware_textures
+from ash.textures import TexelLattice, build_lattice, motion_aware_textures, texture_statistics
 from ash.training import fit, load_module, load_training_images, read_safetensors
 
 TEXTURE_FACTOR = 2  # Texture pixels per Gaussian of ASH's lattice, per side: the mesh must not be starved.
@@ -46,6 +46,7 @@ class DdcConfig:
     width: int
     levels: int
     norm: str
+    standardise: bool
     light: bool
     training: TrainingConfig
     template: str
@@ -63,6 +64,7 @@ def ddc_config(ash: AshConfig, *, seed: int, template: str) -> DdcConfig:
         width=model.width,
         levels=model.levels,
         norm=model.norm,
+        standardise=model.standardise,
         light=model.light,
         training=ash.training,
         template=template,
@@ -90,9 +92,21 @@ class DdcModel(nn.Module):
             norm=config.norm,
         )
         self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.light else None
+        self.register_buffer("texture_mean", torch.zeros(6 * config.window, config.texels, config.texels))
+        self.register_buffer("texture_deviation", torch.ones(6 * config.window, 1, 1))
+
+    def observe(self, motion: Motion, frames: tuple[int, ...]) -> None:
+        """Take the statistics of the textures that `standardise` refers to, from training frames."""
+        if self.config.standardise:
+            drawn = [self._raw_conditions(motion, frame) for frame in frames]
+            self.texture_mean, self.texture_deviation = texture_statistics(drawn)
 
     def conditions(self, motion: Motion, frame: int) -> Float[Tensor, "c r r"]:
-        """The motion-aware textures of a frame."""
+        """The motion-aware textures of a frame, as the network sees them."""
+        textures = self._raw_conditions(motion, frame)
+        return (textures - self.texture_mean) / self.texture_deviation
+
+    def _raw_conditions(self, motion: Motion, frame: int) -> Float[Tensor, "c r r"]:
         return motion_aware_textures(
             self.template,
             self.lattice,
@@ -151,6 +165,7 @@ class DdcAvatar:
         initial = fine.to_texture(colours - colours.mean(0)) + colours.mean(0)[:, None, None]
         lattice = build_lattice(capture.template, config.texels)
         self.module = DdcModel(config, capture.template, self.template, lattice, initial)
+        self.module.observe(capture.motion, capture.splits["train"].frames)
         self._motion = capture.motion
         self._conditions: dict[int, Tensor] = {}  # The template is frozen: each training frame is posed once.
         self._posed: dict[int, PosedTemplate] = {}

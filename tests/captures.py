@@ -1,4 +1,4 @@
-"""A small capture for tests: a bending tube with known texel Gaussians, drawn by the splatter itself (no model error)."""
+"""A small capture for tests: a bending tube with known texel Gaussians, drawn by the splatter itself."""
 
 from pathlib import Path
 

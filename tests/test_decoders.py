@@ -76,3 +76,15 @@ def test_shuffled_decoding_puts_every_value_on_its_own_texel():
         y, x = torch.meshgrid(2 * torch.arange(8) + sub // 2, 2 * torch.arange(8) + sub % 2, indexing="ij")
         decoded[0, sub * outputs], decoded[0, sub * outputs + 1] = y, x
     assert torch.equal(decoders._texels_of(decoded, outputs)[:, :2], coordinates)
+
+
+def test_features_reach_the_head_at_the_size_of_the_input():
+    """Decoders whose features have died away learn nothing but constants."""
+    torch.manual_seed(0)
+    for norm in ("none", "instance"):
+        net = UNet(12, 5, width=8, levels=3, norm=norm)
+        seen = []
+        net.head.register_forward_pre_hook(lambda _, inputs, seen=seen: seen.append(inputs[0]))
+        net(torch.randn(1, 12, 32, 32))
+        assert 0.2 < float(seen[0].detach().std()) < 5, norm
+        assert float(seen[0].detach().std(dim=(2, 3)).mean()) > 0.1, norm

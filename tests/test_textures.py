@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from ash.dataset import Motion
 from ash.skinning import RigidTransforms, rotvec_to_unitquat
 from ash.template import RestDeformation, Template
-from ash.textures import build_lattice, motion_aware_textures, normalised_motion
+from ash.textures import build_lattice, motion_aware_textures, normalised_motion, texture_statistics
 
 RESOLUTION = 16
 
@@ -117,3 +117,14 @@ def test_normalised_motion_ignores_where_the_person_stands_and_faces():
     assert not here[0, :3].any()
     unchanged = torch.from_numpy(motion.dofs[[4, 3, 2], 6:]).float()
     assert torch.equal(here[:, 6:], unchanged)
+
+
+def test_statistics_are_of_the_motion_not_of_the_body(template):
+    motion, lattice = tube_motion(), build_lattice(tube_mesh(), RESOLUTION)
+    drawn = [
+        motion_aware_textures(template, lattice, motion, frame, window=2, yaw_normalise=True) for frame in range(6)
+    ]
+    mean, deviation = texture_statistics(drawn)
+    standardised = torch.stack([lattice.from_texture((texture - mean) / deviation) for texture in drawn])
+    torch.testing.assert_close(standardised.mean(0), torch.zeros_like(standardised[0]), atol=1e-4, rtol=0)
+    torch.testing.assert_close(standardised.square().mean((0, 1)).sqrt(), torch.ones(12), atol=1e-3, rtol=0)
