@@ -103,6 +103,7 @@ class Decoders(nn.Module):
 
     def __init__(self, config: ModelConfig, lattice: TexelLattice) -> None:
         super().__init__()
+        self.rows: Tensor
         self.register_buffer("rows", _rows_of_texels(lattice, config.shuffle), persistent=False)
         features = GLOBAL_FEATURES if config.global_features else 0
         outputs = [GEOMETRY_CHANNELS, raw_channels(config) - GEOMETRY_CHANNELS]
@@ -122,7 +123,7 @@ class Decoders(nn.Module):
             for count, phi in zip(outputs, phi_inputs, strict=True)
         )
         self.phi = GlobalFeatures() if config.global_features else None
-        self.to(memory_format=torch.channels_last)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, conditions: Conditions) -> Float[Tensor, "n o"]:
         """Decode one frame."""
