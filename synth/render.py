@@ -274,6 +274,7 @@ class Studio:
             hits = [self.scene.ray_intersect_preliminary(mi.Ray3f(origin, d), False) for d in directions]
             triangle = np.array([h.prim_index if h.is_valid() else -1 for h in hits], dtype=np.int64)
             barycentric = np.array([list(h.prim_uv) for h in hits])
+        barycentric = np.where((triangle >= 0)[:, None], barycentric, 0)  # A miss leaves garbage there.
         # A ray may end at a light: only hits that lie where the person's triangle lies count.
         corners = self.vertices[self.surface.faces[np.clip(triangle, 0, len(self.surface.faces) - 1)]].astype(
             np.float64

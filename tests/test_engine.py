@@ -159,9 +159,10 @@ def test_a_cell_that_was_told_to_stop_is_unfinished_and_not_failed(capture: Path
 
 
 STOP_THE_CELL = """
-import signal, sys, time, psutil
+import os, signal, sys, time, psutil
 def cells():
-    return [p for p in psutil.Process(int(sys.argv[1])).children() if sys.argv[2] in ' '.join(p.cmdline())]
+    others = [p for p in psutil.Process(int(sys.argv[1])).children() if p.pid != os.getpid()]
+    return [p for p in others if sys.argv[2] in ' '.join(p.cmdline())]
 while not cells():
     time.sleep(0.05)
 time.sleep(1)
