@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+import ash.native.mesh
 from ash.dataset import Skeleton
 
 
@@ -110,12 +111,26 @@ def forward_kinematics(skeleton: Skeleton, dofs: Float[Tensor, " d"]) -> RigidTr
     """Skinning transform of every joint, rest to posed (see `ash.dataset.Skeleton` for the convention). Rows: `[j]`."""
     heads = torch.as_tensor(skeleton.heads, dtype=dofs.dtype, device=dofs.device)
     local = rotvec_to_unitquat(dofs[3:].view(-1, 3))
-    quats, origins = local.clone(), heads + dofs[:3]
+    # Two 4x4 matrices per joint, relative to its parent: the product with its quaternion from the left, and its
+    # rotation and translation. Products of both run down the skeleton together, one generation at a time.
+    step = heads.new_zeros(len(heads), 2, 4, 4)
+    step[:, 0] = _left_product(local)
+    step[:, 1, :3, :3] = unitquat_to_rotmat(local)
+    step[:, 1, :3, 3] = heads - heads[torch.from_numpy(np.maximum(skeleton.parents, 0))]
+    step[0, 1, :3, 3] = heads[0] + dofs[:3]
+    step[:, 1, 3, 3] = 1
+    world = step
     for joints, parents in _generations(skeleton.parents):
-        turned = rotate(quats[parents], heads[joints] - heads[parents])
-        origins = origins.index_copy(0, joints, origins[parents] + turned)
-        quats = quats.index_copy(0, joints, quat_multiply(quats[parents], local[joints]))
-    return RigidTransforms(quats=quats, translations=origins - rotate(quats, heads))
+        world = world.index_copy(0, joints, world[parents] @ step[joints])
+    quats = world[:, 0, :, 0]
+    return RigidTransforms(quats=quats, translations=world[:, 1, :3, 3] - rotate(quats, heads))
+
+
+def _left_product(q: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4 4"]:
+    """The matrix of p -> q p."""
+    w, x, y, z = q.unbind(-1)
+    rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
 def _generations(parents: np.ndarray) -> list[tuple[Tensor, Tensor]]:
@@ -143,7 +158,17 @@ def sparse_skin_weights(dense: Float[Tensor, "v j"]) -> SkinWeights:
 
 
 def dual_quaternion_skinning(joints: RigidTransforms, skin: SkinWeights) -> RigidTransforms:
-    """Blend joint transforms into one rigid transform per vertex.
+    """`dual_quaternion_skinning_naive`, by a native kernel where no gradient is needed."""
+    if not ash.native.mesh.takes(joints.quats, joints.translations, skin.weights):
+        return dual_quaternion_skinning_naive(joints, skin)
+    dual = 0.5 * quat_multiply(torch.nn.functional.pad(joints.translations, (1, 0)), joints.quats)
+    joined = torch.cat([joints.quats, dual], -1)
+    quats, translations = ash.native.mesh.skin_vertices(joined, skin.joints, skin.weights)
+    return RigidTransforms(quats=quats, translations=translations)
+
+
+def dual_quaternion_skinning_naive(joints: RigidTransforms, skin: SkinWeights) -> RigidTransforms:
+    """Blend joint transforms into one rigid transform per vertex: the definition, differentiable.
 
     Kavan et al. 2007. Every quaternion is first brought to the hemisphere of the vertex's strongest joint: q and -q
     are the same rotation, but their blend is not.

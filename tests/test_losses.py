@@ -68,6 +68,12 @@ def test_every_instruction_set_is_the_definition(instructions: str) -> None:
     compare(*make_images(45, 51), make_mask("box", 45, 51))
 
 
+@pytest.mark.parametrize("width", [255, 257, 266, 530])
+def test_wide_images_are_done_in_strips_without_seams(width: int, instructions: str) -> None:
+    compare(*make_images(24, width), make_mask("box", 24, width))
+    compare(*make_images(24, width), None)
+
+
 def test_crops_and_images_that_are_not_contiguous() -> None:
     image, target = make_images(60, 80)
     compare(image[10:50, 20:63], target[10:50, 20:63], None)

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from ash.skinning import (
     RigidTransforms,
     dual_quaternion_skinning,
+    dual_quaternion_skinning_naive,
     forward_kinematics,
     linear_blend_skinning,
     quat_conjugate,
@@ -131,3 +132,22 @@ def test_root_yaw_is_the_heading(yaw):
     dofs = torch.zeros(9, dtype=torch.float64)
     dofs[4] = yaw
     assert float(root_yaw(dofs)) == pytest.approx(yaw)
+
+
+def test_the_native_kernel_skins_as_defined():
+    rng = torch.Generator().manual_seed(0)
+    quats = torch.nn.functional.normalize(torch.randn(9, 4, generator=rng), dim=1)
+    joints = RigidTransforms(quats=quats, translations=torch.randn(9, 3, generator=rng))
+    dense = torch.rand(3000, 9, generator=rng) * (torch.rand(3000, 9, generator=rng) < 0.4)
+    dense[:, 0] += 0.1
+    skin = sparse_skin_weights(dense / dense.sum(1, keepdim=True))
+    native, defined = dual_quaternion_skinning(joints, skin), dual_quaternion_skinning_naive(joints, skin)
+    # Blends of random rotations may nearly cancel: there, rounding is all that is left.
+    points = torch.randn(3000, 3, generator=rng)
+    error = (native.apply(points) - defined.apply(points)).norm(dim=1)
+    assert error.median() < 1e-6
+    assert (error < 1e-4).float().mean() > 0.999
+    leaf = quats.clone().requires_grad_()
+    skinned = dual_quaternion_skinning(RigidTransforms(quats=leaf, translations=joints.translations), skin)
+    skinned.translations.sum().backward()
+    assert leaf.grad.any()

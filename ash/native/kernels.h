@@ -90,6 +90,24 @@ struct SsimArgs {
     double* row_ssim;
 };
 
+struct PlaceArgs {
+    const float *vertices, *barycentric;  // [v, 16], [n, 3]
+    const int* corners;                   // [n, 3]
+    float *quats, *translations, *canonical, *normals;
+};
+
+struct PoseArgs {
+    const float *raw, *canonical, *normals, *turns, *translations;  // [n, 11 + 3 k], [n, 3], [n, 3], [n, 4], [n, 3]
+    const float* light;                                             // [9, 3] or null
+    int coefficients;   // k
+    float offset_unit;  // metres per unit of a raw offset; 0: no offset
+    int canonical_frame;  // rotations turn with the surface
+    float *means, *quats, *scales, *opacities, *sh;
+    // Backward only.
+    const float *grad_means, *grad_quats, *grad_scales, *grad_opacities, *grad_sh;
+    float* grad_raw;
+};
+
 // What is wrong with an input, found while it is read. 0: nothing.
 enum Fault : int64_t { FAULT_MEANS = 1, FAULT_QUATS, FAULT_ZERO_QUAT, FAULT_SCALES, FAULT_OPACITIES, FAULT_SH };
 
@@ -106,6 +124,9 @@ struct Kernels {
     void (*ssim_rows)(const SsimArgs&, int first, int last, float* scratch);
     int64_t (*ssim_scratch)(int width);  // floats
     double (*fma_work)(int64_t rounds);  // floating point operations done
+    void (*place_texels)(const PlaceArgs&, int64_t first, int64_t last);
+    void (*pose)(const PoseArgs&, int64_t first, int64_t last);
+    void (*pose_backward)(const PoseArgs&, int64_t first, int64_t last, double* grad_light);  // adds to [9, 3]
 };
 
 extern const Kernels avx512_kernels, avx2_kernels, plain_kernels;

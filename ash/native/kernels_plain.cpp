@@ -3,5 +3,6 @@
 
 namespace ash {
 const Kernels plain_kernels = {"plain", plain::project, plain::project_backward, plain::prepare, plain::blend, plain::blend_backward,
-                               plain::gather, plain::ssim_rows, plain::ssim_scratch, plain::fma_work};
+                               plain::gather, plain::ssim_rows, plain::ssim_scratch, plain::fma_work,
+                               plain::place_texels, plain::pose, plain::pose_backward};
 }

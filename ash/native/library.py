@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ash.files import InputError
 
-ABI_VERSION = 2  # of ash/native/dispatch.cpp
+ABI_VERSION = 4  # of ash/native/dispatch.cpp
 LIBRARY_NAME = "libash_native" + (".dylib" if sys.platform == "darwin" else ".so")
 
 _P = c_void_p  # the address of a tensor's numbers
@@ -31,6 +31,11 @@ _SIGNATURES: dict[str, tuple[type | None, list[type]]] = {
     "ash_release": (None, [_P]),
     "ash_stage_seconds": (None, [POINTER(c_double)]),
     "ash_l1_ssim": (c_int, [_P] * 5 + [c_int] * 4 + [c_float] * 2 + [c_int, _P, POINTER(c_double)]),
+    "ash_skin_vertices": (None, [_P, _P, _P, c_int64, c_int, c_int, _P, _P]),
+    "ash_vertex_normals": (None, [_P, _P, c_int64, c_int64, _P]),
+    "ash_place_texels": (None, [_P, _P, _P, c_int64, c_int, *[_P] * 4]),
+    "ash_pose": (None, [*[_P] * 6, c_int64, c_int, c_float, c_int, c_int, *[_P] * 5]),
+    "ash_pose_backward": (c_int, [*[_P] * 4, c_int64, c_int, c_float, c_int, c_int, *[_P] * 6, POINTER(c_double)]),
     "ash_rasterize": (c_int, [_P, _P, c_int64, c_int, c_int, c_double, c_int, _P, _P, _P]),
 }
 

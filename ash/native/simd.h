@@ -216,16 +216,14 @@ inline void sums_of_four(const V* v, float* to) {
 inline V operator-(V a) { return all(0.0f) - a; }
 inline V magnitude(V a) { return max(a, -a); }
 
-// 2^a for a in [-126, 1): a polynomial of degree 5 on [0, 1), relative error 2e-7.
-inline V exp2_of(V a) {
-    V f = fraction(a);
-    V y = all(1.877576608e-3f);
-    y = fma(y, f, all(8.989340252e-3f));
-    y = fma(y, f, all(5.582631792e-2f));
-    y = fma(y, f, all(2.401536171e-1f));
-    y = fma(y, f, all(6.931530732e-1f));
-    y = fma(y, f, all(9.999999251e-1f));
-    return scale_by_floor(y, a);
+// 2^a for `N` vectors with a in [-126, 1), step by step for all: a polynomial of degree 5 on [0, 1), relative error 2e-7.
+template <int N> inline void exp2_of(const V* a, V* y) {
+    constexpr float COEFFICIENTS[] = {1.877576608e-3f, 8.989340252e-3f, 5.582631792e-2f, 2.401536171e-1f, 6.931530732e-1f, 9.999999251e-1f};
+    V f[N];
+    for (int j = 0; j < N; ++j) f[j] = fraction(a[j]), y[j] = all(COEFFICIENTS[0]);
+    for (int i = 1; i < 6; ++i)
+        for (int j = 0; j < N; ++j) y[j] = fma(y[j], f[j], all(COEFFICIENTS[i]));
+    for (int j = 0; j < N; ++j) y[j] = scale_by_floor(y[j], a[j]);
 }
 
 }  // namespace ASH_ISA

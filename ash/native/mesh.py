@@ -1,0 +1,31 @@
+"""The native kernels of Stg. 1: dual quaternion skinning and vertex normals. No gradients."""
+
+import torch
+from torch import Tensor
+
+from ash.native.library import address, load
+
+
+def takes(*tensors: Tensor) -> bool:
+    """Whether the kernels may be used: float32 on the CPU, and nobody asks for a gradient."""
+    return all(
+        t.dtype == torch.float32 and t.device.type == "cpu" and not (t.requires_grad and torch.is_grad_enabled())
+        for t in tensors
+    )
+
+
+def skin_vertices(joints: Tensor, skin: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Quaternions `[v, 4]` and translations `[v, 3]` from joints' dual quaternions `[j, 8]`, int64 `skin` `[v, k]`."""
+    inputs = joints.contiguous(), skin.contiguous(), weights.contiguous()
+    count, influences = skin.shape
+    skinned = torch.empty(count, 4), torch.empty(count, 3)
+    load().ash_skin_vertices(*map(address, inputs), count, influences, torch.get_num_threads(), *map(address, skinned))
+    return skinned
+
+
+def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Unit normals `[v, 3]`; int64 `faces` `[f, 3]`."""
+    inputs = vertices.contiguous(), faces.contiguous()
+    normals = torch.empty(len(vertices), 3)
+    load().ash_vertex_normals(*map(address, inputs), len(vertices), len(faces), address(normals))
+    return normals
