@@ -3,9 +3,11 @@
 A capture is a folder:
 
     manifest.json        schema, scene, its parameters, seed, versions, splits, SHA-256 of every file, complete or not
-    cameras.json         width, height; per camera: name, K, viewmat (world -> camera, OpenCV axes)
+    cameras.json         width, height; per camera: name, K, viewmat (world -> camera, OpenCV axes); for a lens with
+                         distortion its k1 k2 p1 p2, and then images and truth are those of the distorted picture
     skeleton.json        joints: name, parent, rest position of its head
     template.npz         the template mesh that methods are given: rest vertices, faces, UVs, skin weights
+    body.npz             the same of the body without clothes, as a fitted body model would give it; may be absent
     motion.npz           degrees of freedom per frame, and the sequence each frame belongs to
     frames/CAM/FRAME.png RGBA, uint8 sRGB, straight alpha
     truth/               what no real capture knows; only oracles and the evaluation may read it
@@ -19,13 +21,14 @@ Units are metres, radians and seconds; right-handed, y up; cameras follow OpenCV
 centres at +0.5. NumPy only: this module knows formats, no method and no renderer.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ash.files import InputError, read_arrays, read_image, read_json, sha256_of, write_arrays, write_json
+from ash.lens import distort, undistort
 
 SCHEMA = 1
 SPLITS = ("train", "novel_view", "novel_pose")
@@ -33,24 +36,43 @@ SPLITS = ("train", "novel_view", "novel_pose")
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Camera:
-    """A calibrated pinhole camera. `K` is in pixels; `viewmat` maps world to camera (OpenCV axes, metres)."""
+    """A calibrated camera. `K` is in pixels; `viewmat` maps world to camera (OpenCV axes, metres).
+
+    Methods only ever see pinhole cameras: a capture whose lenses distort is undistorted first
+    (`synth.undistorting`), and `Capture.training_only` refuses the others.
+    """
 
     name: str
     width: int
     height: int
     K: np.ndarray  # [3, 3] float64
     viewmat: np.ndarray  # [4, 4] float64
+    distortion: np.ndarray = field(default_factory=lambda: np.zeros(4))  # [4] k1 k2 p1 p2; zeros: a pinhole
 
     @property
     def position(self) -> np.ndarray:
         """Optical centre in the world, `[3]` metres."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether the lens leaves straight lines straight."""
+        return not self.distortion.any()
+
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """World points `[..., 3]` to pixels `[..., 2]` and depth along the optical axis `[...]` in metres."""
         in_camera = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
-        in_image = in_camera @ self.K.T
-        return in_image[..., :2] / in_image[..., 2:], in_camera[..., 2]
+        if self.is_pinhole:
+            in_image = in_camera @ self.K.T
+            return in_image[..., :2] / in_image[..., 2:], in_camera[..., 2]
+        seen = distort(in_camera[..., :2] / in_camera[..., 2:], self.distortion)
+        return seen @ self.K[:2, :2].T + self.K[:2, 2], in_camera[..., 2]
+
+    def directions(self, pixels: np.ndarray) -> np.ndarray:
+        """World directions `[..., 3]`, of depth 1 and not of length 1, that pixels `[..., 2]` look along."""
+        seen = (pixels - self.K[:2, 2]) @ np.linalg.inv(self.K[:2, :2]).T
+        ideal = seen if self.is_pinhole else undistort(seen, self.distortion)
+        return np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1) @ self.viewmat[:3, :3]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -121,6 +143,7 @@ class Capture:
     skeleton: Skeleton
     template: TemplateMesh
     motion: Motion
+    store: Path | None = None  # where what is derived from the capture may be kept for other methods; None: nowhere
 
     @property
     def identity(self) -> str:
@@ -133,12 +156,34 @@ class Capture:
         return read_image(image_path(self.folder, camera, frame), shape=(view.height, view.width, 4))
 
     def training_only(self) -> "Capture":
-        """What a method may learn from: training cameras, frames and motion; no held-out view and no test motion."""
+        """What a method may learn from: training cameras, frames and motion; no held-out view and no test motion.
+
+        Raises:
+            InputError: a lens distorts, and methods know pinhole cameras only.
+        """
+        bent = [name for name, camera in self.cameras.items() if not camera.is_pinhole]
+        if bent:
+            raise InputError(f"{self.folder}: the lens of {bent[0]} distorts; run ash-bench undistort on it first")
         train = self.splits["train"]
         count = max(train.frames) + 1  # Training sequences come first, so indices stay as they are.
         motion = replace(self.motion, dofs=self.motion.dofs[:count], sequence=self.motion.sequence[:count])
         cameras = {name: self.cameras[name] for name in train.cameras}
         return replace(self, splits={"train": train}, cameras=cameras, motion=motion)
+
+
+def require_pose(motion: Motion, frame: int, skeleton: Skeleton) -> None:
+    """Refuse a frame that a motion lacks, a pose of another skeleton, and a pose with NaN or infinity.
+
+    Raises:
+        InputError: says what was expected and what came.
+    """
+    width = 3 + 3 * len(skeleton.names)
+    if motion.dofs.ndim != 2 or motion.dofs.shape[1] != width:
+        raise InputError(f"motion: expected degrees of freedom of shape [t, {width}], got {motion.dofs.shape}")
+    if not 0 <= frame < len(motion.dofs):
+        raise InputError(f"frame: expected 0 to {len(motion.dofs) - 1}, got {frame}")
+    if not np.isfinite(motion.dofs[frame]).all():
+        raise InputError(f"frame {frame}: expected a pose of finite numbers, got NaN or infinity")
 
 
 def fewer_cameras(capture: Capture, share: float) -> Capture:
@@ -172,9 +217,10 @@ def surface_path(folder: Path, frame: int) -> Path:
 
 
 def write_cameras(path: Path, cameras: list[Camera]) -> None:
-    """Write `cameras.json`."""
+    """Write `cameras.json`; of a pinhole no distortion is mentioned."""
     rows = [
         {"name": c.name, "width": c.width, "height": c.height, "K": c.K.tolist(), "viewmat": c.viewmat.tolist()}
+        | ({} if c.is_pinhole else {"distortion": c.distortion.tolist()})
         for c in cameras
     ]
     write_json(path, {"cameras": rows})
@@ -184,9 +230,10 @@ def read_cameras(path: Path) -> dict[str, Camera]:
     """Read and check `cameras.json`.
 
     Raises:
-        InputError: a field is missing or misshapen, a rotation is not orthonormal, or a name is not a plain file name.
+        InputError: a field is missing or misshapen, a rotation is not orthonormal, a lens folds the picture, or a name
+            is not a plain file name or stands there twice.
     """
-    cameras = {}
+    cameras: dict[str, Camera] = {}
     try:
         for row in read_json(path)["cameras"]:
             camera = Camera(
@@ -195,22 +242,41 @@ def read_cameras(path: Path) -> dict[str, Camera]:
                 height=int(row["height"]),
                 K=_matrix(row["K"], (3, 3)),
                 viewmat=_matrix(row["viewmat"], (4, 4)),
+                distortion=_matrix(row.get("distortion", [0, 0, 0, 0]), (4,)),
             )
-            rotation = camera.viewmat[:3, :3]
-            if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
-                raise ValueError(f"the rotation of camera {camera.name} is not orthonormal and right-handed")
-            if not (0 < camera.width <= 16384 and 0 < camera.height <= 16384):
-                raise ValueError(f"camera {camera.name} has size {camera.width}x{camera.height}, expected 1..16384")
+            _check_camera(camera)
+            if camera.name in cameras:
+                raise ValueError(f"two cameras are called {camera.name}")
             cameras[camera.name] = camera
     except InputError:
         raise
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: expected a list of cameras with name, width, height, K, viewmat ({error})"
         ) from error
     if not cameras:
         raise InputError(f"{path}: expected at least one camera")
     return cameras
+
+
+def _check_camera(camera: Camera) -> None:
+    rotation, K = camera.viewmat[:3, :3], camera.K
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
+        raise ValueError(f"the rotation of camera {camera.name} is not orthonormal and right-handed")
+    if not (0 < camera.width <= 16384 and 0 < camera.height <= 16384):
+        raise ValueError(f"camera {camera.name} has size {camera.width}x{camera.height}, expected 1..16384")
+    if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or (K[2] != [0, 0, 1]).any():
+        raise ValueError(f"camera {camera.name}: K is not [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0")
+    if (camera.viewmat[3] != [0, 0, 0, 1]).any():
+        raise ValueError(f"camera {camera.name}: the last row of viewmat is not 0 0 0 1")
+    if not camera.is_pinhole:
+        try:  # The rim bends most: a lens that has a direction for every pixel there has one for all.
+            across, down = np.linspace(0, camera.width, 65), np.linspace(0, camera.height, 65)
+            rim = [np.stack([across, 0 * across + y], axis=1) for y in (0, camera.height)]
+            rim += [np.stack([0 * down + x, down], axis=1) for x in (0, camera.width)]
+            camera.directions(np.concatenate(rim))
+        except ValueError as error:
+            raise ValueError(f"camera {camera.name}: {error}") from error
 
 
 def write_skeleton(path: Path, skeleton: Skeleton) -> None:
@@ -268,6 +334,14 @@ def read_template(path: Path, *, joints: int) -> TemplateMesh:
     return template
 
 
+def read_body(capture: Capture) -> TemplateMesh:
+    """The body without clothes, for methods that are to do without a scan of the person."""
+    path = capture.folder / "body.npz"
+    if not path.exists():
+        raise InputError(f"{path}: this capture has no bare body; remove the capture and render it again")
+    return read_template(path, joints=len(capture.skeleton.names))
+
+
 def write_motion(path: Path, motion: Motion) -> None:
     """Write `motion.npz`."""
     write_arrays(path, dofs=motion.dofs, sequence=motion.sequence, fps=np.array(motion.fps))
@@ -301,6 +375,32 @@ def read_surface_truth(capture: Capture, frame: int) -> np.ndarray:
     vertices = read_arrays(path, expected=("vertices",))["vertices"]
     _require(path, {"vertices [s, 3]": vertices.ndim == 2 and vertices.shape[1] == 3 and len(vertices) > 0})
     return vertices
+
+
+def scan_path(folder: Path, frame: int) -> Path:
+    """Where the reconstructed surface of a training frame lies, in a capture that has been given to a method."""
+    return folder / "scans" / f"{frame:06d}.npz"
+
+
+def read_scan(capture: Capture, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """What a lab would reconstruct of a training frame: the surface's vertices `[s, 3]` in metres, and faces `[f, 3]`.
+
+    Without any correspondence to the template or between frames that a method could rely on. Here it is the true
+    surface.
+
+    Raises:
+        InputError: there is none of this frame; only training frames have one.
+    """
+    path, shared = scan_path(capture.folder, frame), capture.folder / "scans" / "faces.npz"
+    if not path.exists():
+        path, shared = surface_path(capture.folder, frame), capture.folder / "truth" / "surface.npz"
+    if frame not in capture.splits["train"].frames or not path.exists() or not shared.exists():
+        raise InputError(f"{capture.folder}: expected a scan of training frame {frame}, found none")
+    vertices = read_arrays(path, expected=("vertices",))["vertices"]
+    faces = _widest(read_arrays(shared, expected=("faces",))["faces"])
+    _require(path, {"vertices [s, 3]": vertices.ndim == 2 and vertices.shape[1] == 3 and len(vertices) > 0})
+    _require(shared, {"faces [f, 3] into vertices": _are_indices(faces, len(vertices))})
+    return vertices, faces
 
 
 def load_capture(folder: Path) -> Capture:

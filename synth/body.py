@@ -49,6 +49,8 @@ class Body:
     kept: np.ndarray  # [v] int64: template vertex -> surface vertex
     template_faces: np.ndarray  # [g, 3] int64 into the template's vertices
     template_uv_faces: np.ndarray  # [g, 3] int64 into the surface's uvs
+    cage: np.ndarray  # [k] int64: the surface vertices of loose cloth that are simulated; the others lie between them
+    cage_faces: np.ndarray  # [h, 3] int64 into the cage
 
     def scalp(self, points: np.ndarray) -> np.ndarray:
         """How far rest points `[n, 3]` lie inside the hair, metres: behind a slanted hairline and not on the ears."""

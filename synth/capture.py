@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import platform
+import shutil
 import signal
 import sys
 import threading
@@ -17,12 +18,13 @@ import numpy as np
 
 from ash.dataset import (
     SCHEMA,
-    Camera,
     Split,
     image_path,
     pixels_path,
     read_cameras,
     read_manifest,
+    read_motion,
+    read_skeleton,
     surface_path,
     write_cameras,
     write_motion,
@@ -31,14 +33,18 @@ from ash.dataset import (
 )
 from ash.files import InputError, read_arrays, read_image, sha256_of, write_arrays, write_image, write_json
 from synth import cloth, texture
+from synth.bare import bare_template
 from synth.body import Body, Surface
+from synth.checks import penetrations, stretch
+from synth.code import code_version
 from synth.mannequin import mannequin
-from synth.motion import make_motion
+from synth.motion import make_motion, pose_novelty
 from synth.presets import require_space
-from synth.render import Renderer, Studio, probe
+from synth.render import Picture, Renderer, Studio, probe
 from synth.rig import held_out, make_cameras
 from synth.rig import names as camera_names
 from synth.scene import Scene, stream
+from synth.shutter import shutter_poses
 
 Progress = Callable[[int, int], None]
 
@@ -52,12 +58,19 @@ class View:
 
 
 def make_capture(
-    scene: Scene, folder: Path, *, workers: int = 1, progress: Progress | None = None, executor: Executor | None = None
+    scene: Scene,
+    folder: Path,
+    *,
+    workers: int = 1,
+    progress: Progress | None = None,
+    executor: Executor | None = None,
+    shard: tuple[int, int] = (1, 1),
 ) -> Path:
     """Render a scene into `folder` and return it. What is there already is kept; a finished capture returns at once.
 
     `progress(done, total)` is told about images. With an `executor`, frames are rendered through it (its workers must
-    see the same folder); without one, through `workers` processes.
+    see the same folder); without one, through `workers` processes. Of `shard` (i, n) only every n-th frame from the
+    i-th is rendered; the shard that finds all images there finishes the capture. What other code made is removed first.
 
     Raises:
         InputError: the folder holds another scene, cannot be written, or its disk is too small.
@@ -65,38 +78,42 @@ def make_capture(
     folder = Path(folder)
     if is_finished(scene, folder):
         return folder
-    _begin(scene, folder)
     renderer = probe()
     if not renderer.libllvm:
         print(renderer.note, file=sys.stderr)
-    describe(scene, folder)
+    _begin(scene, folder, alone=shard[1] == 1)
     views = wanted_views(scene)
-    missing = [view for view in views if not image_path(folder, view.camera, view.frame).is_file()]
-    done = len(views) - len(missing)
-    if progress:
-        progress(done, len(views))
-    tasks = _by_frame(missing)
-    if tasks:
-        own = None if executor else _pool(min(workers, len(tasks)))
-        try:
-            for count in _run(executor or own, scene, folder, renderer, tasks):
-                done += count
-                if progress:
-                    progress(done, len(views))
-        except BaseException:
-            if own:  # Files are whole or absent, so nobody needs to wait for the frames that are under way.
-                for process in list(own._processes.values()):
-                    process.terminate()
-            raise
-        finally:
-            if own:
-                own.shutdown(wait=True, cancel_futures=True)
-    finish(scene, folder, renderer)
+    own = None if executor else _pool(max(1, min(workers, scene.frames)))
+    try:
+        describe(scene, folder, executor or own)
+        share = [view for frame in _by_frame(views)[shard[0] - 1 :: shard[1]] for view in frame]
+        missing = [view for view in share if not image_path(folder, view.camera, view.frame).is_file()]
+        tasks = _by_frame(missing)
+        done = len(share) - len(missing)
+        if progress:
+            progress(done, len(share))
+        for count in _run(executor or own, scene, folder, renderer, tasks):
+            done += count
+            if progress:
+                progress(done, len(share))
+    except BaseException:
+        if own:  # Files are whole or absent, so nobody needs to wait for the frames that are under way.
+            for process in list((own._processes or {}).values()):
+                process.terminate()
+        raise
+    finally:
+        if own:
+            own.shutdown(wait=True, cancel_futures=True)
+    if all(image_path(folder, view.camera, view.frame).is_file() for view in views):
+        finish(scene, folder, renderer)
     return folder
 
 
 def is_finished(scene: Scene, folder: Path) -> bool:
-    """Whether `folder` holds this scene, complete, every file in its place; `verify_capture` checks the contents."""
+    """Whether `folder` holds this scene, made by this code, complete, every file in its place.
+
+    `verify_capture` checks the contents.
+    """
     if not (folder / "manifest.json").is_file():
         return False
     manifest = read_manifest(folder)
@@ -104,16 +121,39 @@ def is_finished(scene: Scene, folder: Path) -> bool:
         raise InputError(
             f"{folder}: holds the scene {manifest['scene']} with other parameters, expected an empty folder"
         )
+    if why_stale(scene, folder):
+        return False
     return bool(manifest["complete"]) and all((folder / name).is_file() for name in manifest["files"])
 
 
-def _begin(scene: Scene, folder: Path) -> None:
-    """Claim the folder: sweep what a killed run left half-written, and write a manifest that says unfinished."""
+def why_stale(scene: Scene, folder: Path) -> str:
+    """Why the capture in `folder` is not what this code would make of the scene; empty where it is or none is there."""
+    if not (folder / "manifest.json").is_file():
+        return ""
+    manifest = read_manifest(folder)
+    if "identity" not in manifest:  # Made by hand, as tests do: nobody can make it again.
+        return ""
+    if manifest["identity"] != scene.identity:
+        return f"it holds {manifest['scene']} with other parameters"
+    if manifest.get("code") != code_version():
+        return f"it was made by other code ({manifest.get('code', 'unknown')}, this is {code_version()})"
+    return ""
+
+
+def _begin(scene: Scene, folder: Path, *, alone: bool) -> None:
+    """Claim the folder: sweep what a killed run left half-written, and write a manifest that says unfinished.
+
+    Where other shards may be at work (not `alone`), half-written files may be theirs and stay.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not (folder / "manifest.json").is_file() and any(folder.iterdir()):
             raise InputError(f"{folder}: expected an empty folder or a capture")
-        for path in folder.rglob(".*.*"):
+        if reason := why_stale(scene, folder):
+            print(f"{folder}: {reason}; making it again", file=sys.stderr)
+            for path in folder.iterdir():
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        for path in folder.rglob(".*.*") if alone else ():
             path.unlink()
         require_space(scene, folder)
         write_json(folder / "manifest.json", _manifest(scene, files={}, complete=False, made_with={}))
@@ -128,6 +168,7 @@ def _manifest(scene: Scene, *, files: dict[str, str], complete: bool, made_with:
         "size": scene.size,
         "seed": scene.seed,
         "identity": scene.identity,
+        "code": code_version(),
         "parameters": scene.parameters,
         "splits": {
             name: {"cameras": list(split.cameras), "frames": list(split.frames)}
@@ -168,19 +209,31 @@ def make_body(scene: Scene) -> Body:
     return anny_body(skirt=scene.outfit.skirt)
 
 
-def describe(scene: Scene, folder: Path) -> None:
-    """Write everything but images: motion, surface of every frame, template, cameras, texture. Kept where complete."""
+def describe(scene: Scene, folder: Path, executor: Executor | None = None) -> None:
+    """Write everything but images: motion, surface of every frame, template, cameras, texture. Kept where complete.
+
+    The texture is painted by the `executor` while the cloth moves here.
+    """
     last = folder / "cameras.json"
     if last.is_file():
         return
     body = make_body(scene)
+    painted = executor.submit(paint, scene, folder) if executor else None
     motion = make_motion(body.skeleton, scene.train + scene.test, fps=scene.fps, seed=stream(scene, "motion"))
     surface = cloth.true_surface(body, motion, scene.outfit, seed=stream(scene, "folds"))
     write_skeleton(folder / "skeleton.json", body.skeleton)
     write_motion(folder / "motion.npz", motion)
     offset = cloth.scan_error(body, scene.outfit, seed=stream(scene, "scan"))
     write_template(folder / "template.npz", body.template(offset))
+    write_template(folder / "body.npz", bare_template(scene))
     write_arrays(folder / "truth" / "template.npz", vertices=surface[:, body.kept])
+    poking = penetrations(body, surface)
+    write_arrays(
+        folder / "truth" / "clothes.npz",
+        penetrating=poking.share,
+        penetration_mm=1000 * poking.deepest,
+        stretch=stretch(body, surface, "skirt" if scene.outfit.skirt else "shirt"),
+    )
     # The picture is made of float32 vertices, so these are the exact ones.
     stored = surface.astype(np.float32)
     for frame, vertices in enumerate(stored):
@@ -194,9 +247,15 @@ def describe(scene: Scene, folder: Path) -> None:
         uv_faces=rest.uv_faces.astype(np.int32),
         part=rest.part.astype(np.int32),
     )
-    image = texture.paint(body, size=scene.texture, seed=stream(scene, "texture"))
+    cameras = make_cameras(scene.rig, stored.reshape(-1, 3).astype(np.float64))
+    painted.result() if painted else paint(scene, folder)
+    write_cameras(last, cameras)
+
+
+def paint(scene: Scene, folder: Path) -> None:
+    """Write the texture."""
+    image = texture.paint(make_body(scene), size=scene.texture, seed=stream(scene, "texture"))
     write_image(folder / "truth" / "texture.png", image)
-    write_cameras(last, make_cameras(scene.rig, stored.reshape(-1, 3).astype(np.float64)))
 
 
 def _by_frame(views: list[View]) -> list[list[View]]:
@@ -262,14 +321,36 @@ def render_views(scene: Scene, folder: Path, renderer: Renderer, views: list[Vie
     """Render the views of one frame and write them; the image last, so that its presence means that all is there."""
     studio = _studio(scene, folder, renderer)
     cameras = read_cameras(folder / "cameras.json")
-    studio.dress(read_arrays(surface_path(folder, views[0].frame), expected=("vertices",))["vertices"])
-    for view in views:
-        _write_view(scene, folder, studio, cameras[view.camera], view)
+    pose, during = _poses(scene, folder, views[0].frame)
+    # With an open shutter the person moves once for all cameras; else every image is written as soon as it is there.
+    for group in [[view] for view in views] if len(during) == 1 else [views]:
+        pictures = studio.shoot(
+            pose,
+            [cameras[view.camera] for view in group],
+            samples=scene.samples,
+            seeds=[stream(scene, "pixels", view.camera, view.frame) for view in group],
+            during=during,
+        )
+        for view, picture in zip(group, pictures, strict=True):
+            _write_view(folder, view, picture)
     return len(views)
 
 
-def _write_view(scene: Scene, folder: Path, studio: Studio, camera: Camera, view: View) -> None:
-    picture = studio.picture(camera, samples=scene.samples, seed=stream(scene, "pixels", view.camera, view.frame))
+def _poses(scene: Scene, folder: Path, frame: int) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The surface in a frame, and while the shutter is open around it."""
+    first = 0
+    for clip in scene.train + scene.test:
+        if frame < first + clip.frames:
+            break
+        first += clip.frames
+    # The curve between two frames is bent by the frames beside them.
+    wanted = range(max(first, frame - 2), min(first + clip.frames, frame + 3)) if scene.rig.shutter else [frame]
+    surfaces = [read_arrays(surface_path(folder, k), expected=("vertices",))["vertices"] for k in wanted]
+    at = frame - wanted[0]
+    return surfaces[at], shutter_poses(np.stack(surfaces), at, shutter=scene.rig.shutter)
+
+
+def _write_view(folder: Path, view: View, picture: Picture) -> None:
     write_arrays(
         pixels_path(folder, view.camera, view.frame),
         triangle=picture.triangle,
@@ -290,4 +371,9 @@ def finish(scene: Scene, folder: Path, renderer: Renderer) -> None:
         "variant": renderer.variant,
         "machine": platform.machine(),
     }
-    write_json(folder / "manifest.json", _manifest(scene, files=files, complete=True, made_with=made_with))
+    motion = read_motion(folder / "motion.npz", joints=len(read_skeleton(folder / "skeleton.json").names))
+    parts = splits(scene)
+    novelty = pose_novelty(motion, train=parts["train"].frames, test=parts["novel_pose"].frames)
+    stated = {"pose_novelty_deg": round(novelty, 3)}  # of the test motion, see `pose_novelty`
+    manifest = _manifest(scene, files=files, complete=True, made_with=made_with)
+    write_json(folder / "manifest.json", manifest | stated)

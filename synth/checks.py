@@ -3,40 +3,32 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from synth.body import Body, vertex_normals
+from synth.body import Body
+from synth.layers import layers_of, outside
+from synth.xpbd import edges_of
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Penetrations:
-    """Legs that stick out of the skirt, per frame."""
+    """What sticks out of the garments that should hide it, per frame."""
 
-    share: np.ndarray  # [t] of the leg vertices at the skirt's height, beyond the tolerance
+    share: np.ndarray  # [t] of the hidden vertices that lie near a garment, beyond the tolerance
     deepest: np.ndarray  # [t] metres
 
 
 def penetrations(body: Body, posed: np.ndarray, *, tolerance: float = 0.005) -> Penetrations:
-    """Measure how far legs lie outside of the skirt, against the tangent plane of the nearest cloth, for `[t, s, 3]`.
+    """Measure how far skin and inner garments lie outside of shirt, trousers and skirt, for `[t, s, 3]`.
 
-    Legs nearest to the skirt's open ends are left out: below the hem there is nothing to poke through.
+    Against the tangent plane of the nearest cloth; beside hems nothing is hidden, so nothing counts.
     """
-    surface = body.surface
-    cloth = np.flatnonzero(surface.vertices_of("skirt"))
-    legs = np.flatnonzero(surface.vertices_of("trousers") & ~surface.vertices_of("shoes", "shirt"))
-    faces = surface.faces[np.isin(surface.faces, cloth).all(axis=1)]
-    edges, uses = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
-    at_end = np.zeros(len(surface.vertices), dtype=bool)
-    at_end[edges[uses == 1]] = True
+    layers = layers_of(body)
     share, deepest = [], []
     for vertices in posed:
-        normals = vertex_normals(vertices, faces)
-        distance, place = cKDTree(vertices[cloth]).query(vertices[legs])
-        nearest = cloth[place]
-        beside = ~at_end[nearest] & (distance < 0.1)
-        outside = np.sum((vertices[legs] - vertices[nearest]) * normals[nearest], axis=1)
-        share.append(np.mean(outside[beside] > tolerance) if beside.any() else 0.0)
-        deepest.append(max(float(outside[beside].max()), 0.0) if beside.any() else 0.0)
+        sides = [outside(layer, vertices, reach=0.1) for layer in layers]
+        heights = np.concatenate([np.zeros(0), *(height[near] for height, _, near in sides)])
+        share.append(np.mean(heights > tolerance) if len(heights) else 0.0)
+        deepest.append(max(float(heights.max(initial=0.0)), 0.0))
     return Penetrations(share=np.array(share), deepest=np.array(deepest))
 
 
@@ -45,7 +37,7 @@ def stretch(body: Body, posed: np.ndarray, *parts: str, quantile: float = 0.99) 
     surface = body.surface
     chosen = surface.vertices_of(*parts)
     faces = surface.faces[chosen[surface.faces].all(axis=1)]
-    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    edges = edges_of(faces)
     rest = np.linalg.norm(surface.vertices[edges[:, 0]] - surface.vertices[edges[:, 1]], axis=1)
     lengths = np.linalg.norm(posed[:, edges[:, 0]] - posed[:, edges[:, 1]], axis=-1)
     return np.quantile(lengths / rest, quantile, axis=1)

@@ -1,38 +1,39 @@
-"""Dressing the realistic body at rest: which faces are cloth, how thick it is, hair, shoes and a skirt.
-
-Clothes are the body's own faces pushed outwards, so nothing lies hidden beneath them and nothing can poke through.
-"""
+"""Dressing the realistic body at rest: shirt and trousers as meshes of their own, hair, shoes and a skirt."""
 
 import hashlib
 import inspect
 import sys
+from dataclasses import replace
 
 import numpy as np
 
 from ash.dataset import Skeleton
 from ash.files import InputError, read_arrays, write_arrays
-from synth import body, mesh, tubes
+from synth import body, garments, mesh, tubes
 from synth.anny_body import bake_key, baked_body, cache_folder
-from synth.body import PARTS, Body, Face, Surface, neighbour_mean, vertex_normals
-from synth.mesh import Charted, decimate, pack, subdivide, uv_charts
+from synth.body import PARTS, Body, Face, Surface, neighbour_mean
+from synth.garments import cut_garment, soft_normals
+from synth.mesh import Charted, beside, decimate, joined, pack, select, subdivide, uv_charts
 from synth.plans import JOINTS, SIDES, make_skeleton
 from synth.tubes import Tube, chain_weights, chart_uvs, grid_faces, lattice, skirt_weights
 
 TEMPLATE_VERTICES = 7000
 WAIST = 0.985  # metres above the floor
-ANKLE = 0.085
+UNTUCKED = 0.05  # metres that the shirt hangs over the trousers
+CUFF = 0.17  # height at which the trousers end
+BAND = 3  # rings of faces that the skin goes on beneath a hem
+ANKLE = 0.085  # where the foot is hidden in its shoe
 HAIR = 0.016
-THICKNESS = {"loose": {"shirt": 0.013, "trousers": 0.009}, "tight": {"shirt": 0.005, "trousers": 0.004}}
 DENSITY = {"head": 1.45, "hand": 1.25, "eye": 2.0}
 STORED = (
     "vertices", "weights", "faces", "uvs", "uv_faces", "part", "kept", "template_faces", "template_uv_faces",
-    "heads", "eyes", "mouth",
+    "heads", "eyes", "mouth", "cage", "cage_faces",
 )  # fmt: skip
 
 
 def anny_body(*, skirt: bool) -> Body:
     """The dressed anny body: in loose clothes with a skirt, or in tight clothes without."""
-    modules = (sys.modules[__name__], mesh, tubes, body)
+    modules = (sys.modules[__name__], garments, mesh, tubes, body)
     source = "".join(inspect.getsource(module) for module in modules)
     key = hashlib.sha256(f"{skirt} {bake_key()} {source}".encode()).hexdigest()[:12]
     path = cache_folder() / f"dressed-{key}.npz"
@@ -55,14 +56,15 @@ def _unpack(stored: dict[str, np.ndarray]) -> Body:
         kept=stored["kept"],
         template_faces=stored["template_faces"],
         template_uv_faces=stored["template_uv_faces"],
+        cage=stored["cage"],
+        cage_faces=stored["cage_faces"],
     )
 
 
 def _dress(*, skirt: bool) -> dict[str, np.ndarray]:
     baked = baked_body()
     skeleton = make_skeleton(dict(zip([name for name, _ in JOINTS], baked["heads"], strict=True)))
-    body, chart, density = _body_parts(baked)
-    body = _thicken(body, "loose" if skirt else "tight")
+    body, chart, density = _clothed(baked, "loose" if skirt else "tight")
     tubes = [_shoe(skeleton, side) for side in SIDES]
     if skirt:
         tubes.append(_skirt(body))
@@ -80,6 +82,7 @@ def _dress(*, skirt: bool) -> dict[str, np.ndarray]:
     number = np.full(len(fine.vertices), -1)
     number[used] = np.arange(len(used))
     kept, template = np.unique(template_faces, return_inverse=True)
+    cage, cage_faces = np.unique(body.faces[body.part == PARTS.index("skirt")], return_inverse=True)
     return {
         "vertices": fine.vertices[used],
         "weights": fine.weights[used],
@@ -93,11 +96,49 @@ def _dress(*, skirt: bool) -> dict[str, np.ndarray]:
         "heads": baked["heads"],
         "eyes": baked["eyes"],
         "mouth": baked["mouth"],
+        "cage": number[cage],
+        "cage_faces": cage_faces.reshape(-1, 3),
     }
 
 
-def _body_parts(baked: dict[str, np.ndarray]) -> tuple[Charted, np.ndarray, np.ndarray]:
-    """Split quads, drop what is never seen (mouth, sockets, feet), label parts, and cut the atlas by limbs."""
+def _clothed(baked: dict[str, np.ndarray], fit: str) -> tuple[Charted, np.ndarray, np.ndarray]:
+    """Skin, hair, eyes, shirt and trousers as one mesh, the chart of each face, and each chart's texel density."""
+    bare, kind, group = _bare(baked, feet=False)
+    centre = bare.vertices[bare.faces].mean(axis=1)
+    neck = baked["heads"][[name for name, _ in JOINTS].index("neck")]
+    collar = (np.linalg.norm((centre - neck) * [1, 0.8, 1], axis=1) < 0.085) | (centre[:, 1] > neck[1] + 0.01)
+    trunk = kind == "body"
+    worn = {
+        "shirt": trunk & (centre[:, 1] > WAIST - UNTUCKED) & ~collar,
+        "trousers": trunk & (centre[:, 1] <= WAIST) & (centre[:, 1] > CUFF),
+    }
+    kept = beside(bare.faces, ~(worn["shirt"] | worn["trousers"]), rings=BAND)
+    pieces, groups, kinds = [select(_with_hair(bare), kept)], [group[kept]], [kind[kept]]
+    for layer, (name, faces) in enumerate(worn.items()):
+        piece, source = cut_garment(bare, faces, name=name, fit=fit)
+        pieces.append(piece)
+        groups.append(group[source] + 1000 * (layer + 1))
+        kinds.append(kind[source])
+    mesh = joined(pieces)
+    return mesh, *_charts(mesh, np.concatenate(kinds), np.concatenate(groups))
+
+
+def body_parts(baked: dict[str, np.ndarray]) -> tuple[Charted, np.ndarray, np.ndarray]:
+    """The naked body with its feet, the chart of each face, and each chart's texel density."""
+    mesh, kind, group = _bare(baked, feet=True)
+    return mesh, *_charts(mesh, kind, group)
+
+
+def _charts(mesh: Charted, kind: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    chart = _merge_small(uv_charts(mesh.uv_faces, group), group)
+    return chart, np.array([DENSITY.get(str(kind[chart == k][0]), 1.0) for k in range(chart.max() + 1)])
+
+
+def _bare(baked: dict[str, np.ndarray], *, feet: bool) -> tuple[Charted, np.ndarray, np.ndarray]:
+    """Split quads, drop what is never seen (mouth, sockets, feet in shoes), and label hair and eyes.
+
+    Also what each face is of (body, head, hand, eye, foot), and its limb or original chart, which the atlas is cut by.
+    """
     quads, uv_quads = baked["quads"], baked["uv_quads"]
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     uv_faces = np.concatenate([uv_quads[:, [0, 1, 2]], uv_quads[:, [0, 2, 3]]])
@@ -114,32 +155,18 @@ def _body_parts(baked: dict[str, np.ndarray]) -> tuple[Charted, np.ndarray, np.n
             names[k] = "body" if k == body else "head"
         elif abs(middle[0]) > 0.35:
             names[k] = "hand"
+        elif feet and middle[1] < 2 * ANKLE:
+            names[k] = "foot"
         elif eye < 0.03 and sizes[k] < 200 and middle[2] > baked["eyes"][0, 2]:
             names[k] = "eye"
     kind = names[original]
     part = np.full(len(faces), PARTS.index("skin"))
     part[kind == "eye"] = PARTS.index("eyes")
-    neck = baked["heads"][[name for name, _ in JOINTS].index("neck")]
-    collar = np.linalg.norm((centre - neck) * [1, 0.8, 1], axis=1) < 0.085
-    part[(kind == "body") & (centre[:, 1] > WAIST) & ~collar] = PARTS.index("shirt")
-    part[(kind == "body") & (centre[:, 1] <= WAIST)] = PARTS.index("trousers")
     part[(kind == "head") & _is_scalp(centre)] = PARTS.index("hair")
-    seen = (kind != "none") & ~((kind == "body") & (centre[:, 1] < ANKLE))
-    mesh = Charted(
-        vertices=vertices,
-        weights=weights,
-        faces=faces[seen],
-        uvs=baked["uvs"],
-        uv_faces=uv_faces[seen],
-        part=part[seen],
-    )
-    limb = _limb(weights[faces].mean(axis=1))
-    group = np.where(kind == "body", limb, 10 + original)[seen]
-    chart = _merge_small(uv_charts(mesh.uv_faces, group), group)
-    density = np.ones(chart.max() + 1)
-    for k in range(len(density)):
-        density[k] = DENSITY.get(str(kind[seen][chart == k][0]), 1.0)
-    return mesh, chart, density
+    seen = (kind != "none") & (feet | ~((kind == "body") & (centre[:, 1] < ANKLE)))
+    group = np.where(kind == "body", _limb(weights[faces].mean(axis=1)), 10 + original)
+    mesh = Charted(vertices=vertices, weights=weights, faces=faces, uvs=baked["uvs"], uv_faces=uv_faces, part=part)
+    return select(mesh, seen), kind[seen], group[seen]
 
 
 def _merge_small(chart: np.ndarray, group: np.ndarray) -> np.ndarray:
@@ -168,42 +195,15 @@ def _limb(weights: np.ndarray) -> np.ndarray:
     return np.argmax(shares, axis=1)
 
 
-def _thicken(mesh: Charted, fit: str) -> Charted:
-    """Push clothes and hair outwards along smoothed normals; loose clothes also lose the body's finer shape."""
-    vertices = mesh.vertices
-    rounds = 10 if fit == "loose" else 3
-    depth = np.zeros(len(vertices))
-    cloth = np.zeros(len(vertices), dtype=bool)
-    for name, thickness in (*THICKNESS[fit].items(), ("hair", HAIR)):
-        chosen = mesh.faces[mesh.part == PARTS.index(name)]
-        inner = np.zeros(len(vertices), dtype=bool)
-        inner[chosen] = True
-        inner[mesh.faces[~np.isin(mesh.part, [PARTS.index(p) for p in ("shirt", "trousers", "hair")])]] = False
-        depth[inner] = thickness
-        if name != "hair":
-            cloth |= inner
-    hairy = np.zeros(len(vertices), dtype=bool)
-    hairy[mesh.faces[mesh.part == PARTS.index("hair")]] = True
-    softened = neighbour_mean(depth, mesh.faces, rounds=4)
-    depth = np.where(hairy, softened * hairy, depth)
-    softness = neighbour_mean(cloth.astype(np.float64), mesh.faces, rounds=3)[:, None] * cloth[:, None]
-    smooth = vertices
-    for _ in range(rounds):
-        smooth = smooth + softness * (neighbour_mean(smooth, mesh.faces, rounds=1) - smooth)
-    normals = neighbour_mean(vertex_normals(smooth, mesh.faces), mesh.faces, rounds=4)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    # Smoothing shrinks; what it took along the normal is given back.
-    lost = np.sum((vertices - smooth) * normals, axis=1) * cloth
-    given = neighbour_mean(np.maximum(lost, 0), mesh.faces, rounds=3) * cloth
-    weights = mesh.weights + softness * (neighbour_mean(mesh.weights, mesh.faces, rounds=3) - mesh.weights)
-    return Charted(
-        vertices=smooth + (depth + given)[:, None] * normals,
-        weights=weights / weights.sum(axis=1, keepdims=True),
-        faces=mesh.faces,
-        uvs=mesh.uvs,
-        uv_faces=mesh.uv_faces,
-        part=mesh.part,
-    )
+def _with_hair(mesh: Charted) -> Charted:
+    """Push the scalp outwards, less towards the hairline."""
+    hair = mesh.part == PARTS.index("hair")
+    inner, hairy = np.zeros(len(mesh.vertices), dtype=bool), np.zeros(len(mesh.vertices), dtype=bool)
+    hairy[mesh.faces[hair]] = True
+    inner[mesh.faces[hair]] = True
+    inner[mesh.faces[~hair]] = False
+    depth = neighbour_mean(np.where(inner, HAIR, 0.0), mesh.faces, rounds=4) * hairy
+    return replace(mesh, vertices=mesh.vertices + depth[:, None] * soft_normals(mesh))
 
 
 def _shoe(skeleton: Skeleton, side: str) -> Tube:
@@ -233,7 +233,7 @@ def _skirt(body: Charted) -> Tube:
     points = body.vertices[clothed]
     points = points[(np.abs(points[:, 0]) < 0.3) & (points[:, 1] < 1.05)]
     knots, radii = [], []
-    for height, flare in ((0.52, 0.085), (0.62, 0.065), (0.74, 0.045), (0.86, 0.025), (0.95, 0.01), (1.01, 0.006)):
+    for height, flare in ((0.52, 0.115), (0.62, 0.095), (0.74, 0.072), (0.86, 0.05), (0.95, 0.022), (1.01, 0.006)):
         ring = points[np.abs(points[:, 1] - height) < 0.02]
         low, high = ring.min(axis=0), ring.max(axis=0)
         knots.append([0, height, (low[2] + high[2]) / 2])

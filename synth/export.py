@@ -30,6 +30,7 @@ def export_nerfstudio(capture: Capture, folder: Path) -> Path:
                     "fl_x": float(camera.K[0, 0]), "fl_y": float(camera.K[1, 1]),
                     "cx": float(camera.K[0, 2]), "cy": float(camera.K[1, 2]),
                     "w": camera.width, "h": camera.height,
+                    **dict(zip(("k1", "k2", "p1", "p2"), camera.distortion.tolist(), strict=True)),
                     "transform_matrix": (np.linalg.inv(camera.viewmat) @ flip).tolist(),
                 }
             )  # fmt: skip
@@ -45,7 +46,9 @@ def export_colmap(capture: Capture, folder: Path, *, frame: int | None = None) -
     for index, name in enumerate(train.cameras, start=1):
         camera = capture.cameras[name]
         K = [float(value) for value in camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]]
-        cameras.append(f"{index} PINHOLE {camera.width} {camera.height} " + " ".join(map(repr, K)))
+        model = "PINHOLE" if camera.is_pinhole else "OPENCV"
+        K += [] if camera.is_pinhole else camera.distortion.tolist()
+        cameras.append(f"{index} {model} {camera.width} {camera.height} " + " ".join(map(repr, K)))
         pose = (*rotmat_to_unitquat(camera.viewmat[:3, :3]), *camera.viewmat[:3, 3])
         images += [f"{index} " + " ".join(repr(float(v)) for v in pose) + f" {index} {name}.png", ""]
         write_image(folder / "images" / f"{name}.png", capture.image(name, frame))

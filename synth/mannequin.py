@@ -93,7 +93,7 @@ def mannequin(*, skirt: bool) -> Body:
     """Build the mannequin; the template keeps every second ring and every second segment."""
     skeleton = make_skeleton(heads())
     vertices, weights, uvs, faces, uv_faces, part = [], [], [], [], [], []
-    kept, template_faces, template_uv_faces = [], [], []
+    kept, template_faces, template_uv_faces, template_part = [], [], [], []
     vertex_count = uv_count = kept_count = 0
     for tube in _tubes(skirt=skirt):
         points, along = lattice(tube, 2 * tube.rings - 1, 2 * tube.segments)
@@ -113,6 +113,7 @@ def mannequin(*, skirt: bool) -> Body:
         even_rows, even_columns = (rows + 1) // 2, columns // 2
         kept.append(vertex_count + (2 * np.arange(even_rows)[:, None] * columns + 2 * np.arange(even_columns)).ravel())
         template_faces.append(kept_count + grid_faces(even_rows, even_columns, stride=even_columns, wrap=even_columns))
+        template_part.append(np.full(len(template_faces[-1]), part[-1][0]))
         coarse = grid_faces(even_rows, even_columns, stride=even_columns + 1, wrap=even_columns + 1)
         row, column = np.divmod(coarse, even_columns + 1)
         template_uv_faces.append(uv_count + 2 * row * (columns + 1) + 2 * column)
@@ -126,6 +127,10 @@ def mannequin(*, skirt: bool) -> Body:
         uv_faces=np.concatenate(uv_faces),
         part=np.concatenate(part),
     )
+    triangles = np.concatenate(template_faces)
+    cage, cage_faces = np.unique(
+        triangles[np.concatenate(template_part) == PARTS.index("skirt")], return_inverse=True
+    )  # fmt: skip
     return Body(
         skeleton=skeleton,
         surface=surface,
@@ -134,6 +139,8 @@ def mannequin(*, skirt: bool) -> Body:
             eyes=np.array([[0.03, 1.63, 0.1], [-0.03, 1.63, 0.1]]), mouth=np.array([0, 1.565, 0.1]), modelled=False
         ),
         kept=np.concatenate(kept),
-        template_faces=np.concatenate(template_faces),
+        template_faces=triangles,
         template_uv_faces=np.concatenate(template_uv_faces),
+        cage=np.concatenate(kept)[cage],
+        cage_faces=cage_faces.reshape(-1, 3),
     )

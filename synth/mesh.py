@@ -1,7 +1,7 @@
 """Mesh surgery at rest: finer surfaces, coarser templates, and charts packed into one atlas."""
 
 import heapq
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -69,6 +69,44 @@ def _cut(
     return faces, uv_faces, part
 
 
+def open_sides(faces: np.ndarray) -> np.ndarray:
+    """Sides that only one face has, as 3 face + corner: from that corner to the next."""
+    sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    _, inverse, uses = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
+    return np.flatnonzero(uses[inverse.reshape(-1)] == 1)
+
+
+def open_edges(faces: np.ndarray) -> np.ndarray:
+    """Edges `[e, 2]` that only one face has, in its direction."""
+    return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)[open_sides(faces)]
+
+
+def beside(faces: np.ndarray, chosen: np.ndarray, *, rings: int) -> np.ndarray:
+    """The chosen faces and some rings of faces around them, `[f]` bool."""
+    for _ in range(rings):
+        chosen = np.asarray(np.isin(faces, faces[chosen]).any(axis=1))
+    return chosen
+
+
+def select(mesh: Charted, chosen: np.ndarray) -> Charted:
+    """Only the chosen faces `[f]`; all vertices and UVs stay."""
+    return replace(mesh, faces=mesh.faces[chosen], uv_faces=mesh.uv_faces[chosen], part=mesh.part[chosen])
+
+
+def joined(pieces: list[Charted]) -> Charted:
+    """Several meshes as one; nothing is shared between them."""
+    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
+    uv_starts = np.cumsum([0, *(len(piece.uvs) for piece in pieces)])
+    return Charted(
+        vertices=np.concatenate([piece.vertices for piece in pieces]),
+        weights=np.concatenate([piece.weights for piece in pieces]),
+        faces=np.concatenate([start + piece.faces for start, piece in zip(starts, pieces, strict=False)]),
+        uvs=np.concatenate([piece.uvs for piece in pieces]),
+        uv_faces=np.concatenate([start + piece.uv_faces for start, piece in zip(uv_starts, pieces, strict=False)]),
+        part=np.concatenate([piece.part for piece in pieces]),
+    )
+
+
 def locked_vertices(mesh: Charted) -> np.ndarray:
     """Vertices on a boundary, a chart's border or between two parts, `[s]` bool: a coarser mesh must keep them."""
     locked = np.zeros(len(mesh.vertices), dtype=bool)
@@ -76,9 +114,7 @@ def locked_vertices(mesh: Charted) -> np.ndarray:
     locked |= np.bincount(pairs[:, 0], minlength=len(locked)) > 1
     parts = np.unique(np.stack([mesh.faces.ravel(), np.repeat(mesh.part, 3)], axis=1), axis=0)
     locked |= np.bincount(parts[:, 0], minlength=len(locked)) > 1
-    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    unique, count = np.unique(edges, axis=0, return_counts=True)
-    locked[unique[count != 2]] = True
+    locked[open_edges(mesh.faces)] = True
     return locked
 
 

@@ -1,12 +1,14 @@
-"""Motions: clips of the generators in order, solved for a skeleton, each from its own random stream."""
+"""Motions: clips of generators or of files, in order, solved for a skeleton, each from its own random stream."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from ash.dataset import Motion, Skeleton
-from ash.files import InputError
+from ash.files import InputError, sha256_of
 from synth.generators import GENERATORS
+from synth.importing import import_motion
 from synth.plans import continuous, solve
 from synth.posing import rotmat_to_rotvec, rotvec_to_rotmat
 
@@ -21,18 +23,26 @@ def turned(skeleton: Skeleton, dofs: np.ndarray, yaw: float) -> np.ndarray:
     return result
 
 
+GIVEN = "given"
+FLOOR = 1.2  # metres from the middle of the floor that a motion from a file may reach
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Clip:
     """A generator, how many frames of it to take, and where on the floor and facing where."""
 
-    generator: str
+    generator: str  # one of GENERATORS, or "given" for a motion from a file
     frames: int
     yaw: float = 0.0  # radians that the whole clip is turned by about the vertical
     shift: tuple[float, float] = (0.0, 0.0)  # metres, x and z, that it is then moved by
+    given: str = ""  # SHA-256 of a user's motion file, for "given"
+    path: str = field(default="", compare=False)  # where that file lies; no part of what the clip is
 
     def __post_init__(self) -> None:
-        if self.generator not in GENERATORS:
+        if self.generator not in GENERATORS and self.generator != GIVEN:
             raise InputError(f"unknown motion {self.generator!r}, expected one of {', '.join(GENERATORS)}")
+        if (self.generator == GIVEN) != bool(self.given):
+            raise InputError("a clip of kind 'given' needs the SHA-256 of a motion file, and only such a clip has one")
         if not 2 <= self.frames <= 100_000:
             raise InputError(f"a clip of {self.frames} frames, expected 2 to 100000")
 
@@ -41,8 +51,11 @@ def make_motion(skeleton: Skeleton, clips: tuple[Clip, ...], *, fps: float, seed
     """Generate the clips in order, each a sequence of its own, each from its own random stream."""
     dofs, sequence = [], []
     for index, clip in enumerate(clips):
-        rng = np.random.default_rng([seed, index])
-        clip_dofs = solve(skeleton, GENERATORS[clip.generator](np.arange(clip.frames) / fps, rng))
+        if clip.generator == GIVEN:
+            clip_dofs = _from_file(skeleton, clip, fps=fps)
+        else:
+            rng = np.random.default_rng([seed, index])
+            clip_dofs = solve(skeleton, GENERATORS[clip.generator](np.arange(clip.frames) / fps, rng))
         clip_dofs = turned(skeleton, clip_dofs, clip.yaw) if clip.yaw else clip_dofs
         clip_dofs[:, [0, 2]] += clip.shift
         dofs.append(clip_dofs)
@@ -50,8 +63,45 @@ def make_motion(skeleton: Skeleton, clips: tuple[Clip, ...], *, fps: float, seed
     return Motion(dofs=np.concatenate(dofs), sequence=np.concatenate(sequence), fps=fps)
 
 
+def clip_from_file(path: Path, skeleton: Skeleton, *, fps: float, most: int) -> Clip:
+    """The first frames of a BVH or AMASS file at `fps`, at most `most` of them.
+
+    Raises:
+        InputError: the file is damaged or hostile, too slow or too short, or leaves the floor that cameras see.
+    """
+    path = path.resolve()
+    motion = import_motion(path, skeleton, fps=fps)
+    if motion.fps < fps * 0.999:
+        raise InputError(f"{path}: {motion.fps:.3g} frames per second, expected at least {fps:g}")
+    clip = Clip(generator=GIVEN, frames=max(2, min(most, len(motion.dofs))), given=sha256_of(path), path=str(path))
+    _from_file(skeleton, clip, fps=fps)
+    return clip
+
+
+def _from_file(skeleton: Skeleton, clip: Clip, *, fps: float) -> np.ndarray:
+    """Degrees of freedom of a given clip `[t, 3 + 3 j]`, its path centred on the middle of the floor."""
+    path = Path(clip.path)
+    if not path.is_file() or sha256_of(path) != clip.given:
+        raise InputError(f"{path}: expected the motion file with SHA-256 {clip.given[:12]}")
+    dofs = import_motion(path, skeleton, fps=fps).dofs[: clip.frames].copy()
+    if len(dofs) < clip.frames:
+        raise InputError(f"{path}: {len(dofs)} frames at {fps:g} per second, expected at least {clip.frames}")
+    root = dofs[:, [0, 2]] + skeleton.heads[0, [0, 2]]
+    middle = (root.min(axis=0) + root.max(axis=0)) / 2
+    dofs[:, [0, 2]] -= middle
+    reach = float(np.linalg.norm(root - middle, axis=1).max())
+    if reach > FLOOR:
+        raise InputError(f"{path}: the motion goes {reach:.2f} m from its middle, expected at most {FLOOR} m")
+    return dofs
+
+
 def pose_novelty(motion: Motion, *, train: tuple[int, ...], test: tuple[int, ...]) -> float:
-    """How far test poses are from the nearest training pose: mean over test frames, degrees rms over joints.
+    """How far test poses are from the nearest training pose: mean over test frames, degrees rms over joints."""
+    return float(np.mean(pose_distances(motion, train=train, test=test)))
+
+
+def pose_distances(motion: Motion, *, train: tuple[int, ...], test: tuple[int, ...]) -> list[float]:
+    """Distance of each test pose to the nearest training pose, degrees rms over joints.
 
     The root is left out: heading and place are not pose.
     """
@@ -61,5 +111,5 @@ def pose_novelty(motion: Motion, *, train: tuple[int, ...], test: tuple[int, ...
     for frame in test:
         trace = np.einsum("tjab,jab->tj", known, rotations[frame])
         angles = np.arccos(np.clip((trace - 1) / 2, -1, 1))
-        nearest.append(np.sqrt(np.mean(angles**2, axis=1)).min())
-    return float(np.rad2deg(np.mean(nearest)))
+        nearest.append(float(np.rad2deg(np.sqrt(np.mean(angles**2, axis=1)).min())))
+    return nearest

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from ash.dataset import Camera, Capture, Skeleton, TemplateMesh, read_template_truth
-from ash.files import write_atomic, write_image, write_json
+from ash.files import InputError, write_atomic, write_image, write_json
 from synth.body import vertex_normals
 from synth.mesh import Charted, decimate
 from synth.posing import blended_dual_quaternions, bone_frames, rotvec_to_rotmat, skinning_transforms
@@ -228,6 +228,8 @@ def export_official(capture: Capture, folder: Path, *, subject: str = "Synthetic
     dofs = to_official_dofs(skeleton, capture.motion.dofs)
     windows = np.stack([capture.motion.window(frame, 3) for frame in range(len(dofs))])
     cameras = [capture.cameras[name] for name in capture.splits["train"].cameras]
+    if not all(camera.is_pinhole for camera in cameras):
+        raise InputError(f"{capture.folder}: a lens distorts and the release reads pinholes; run ash-bench undistort")
     training = max(capture.splits["train"].frames) + 1
     nodes, node_faces = _graph(template)
     texts = {

@@ -38,12 +38,13 @@ class Perturbation:
     calibration_px: float = 0.0  # rms shift of training images by wrong extrinsics
     mask_px: int = 0  # training masks dilated (> 0) or eroded (< 0)
     exposure_stops: float = 0.0  # rms drift of brightness between training cameras
+    colour_stops: float = 0.0  # rms drift of each channel's brightness between training cameras
     noise_factor: float = 1.0  # variance of training images' noise as a multiple of the renders' own
     cameras: int | None = None  # how many training cameras are left, spread evenly
     frames: int | None = None  # how many training frames are left, spread evenly over time
 
     def __post_init__(self) -> None:
-        for name in ("tracking_deg", "tracking_mm", "calibration_px", "exposure_stops"):
+        for name in ("tracking_deg", "tracking_mm", "calibration_px", "exposure_stops", "colour_stops"):
             if not 0 <= getattr(self, name) <= 1000:
                 raise InputError(f"perturbation: {name} is {getattr(self, name)}, expected 0 to 1000")
         if not (1 <= self.noise_factor <= 1e6 and abs(self.mask_px) <= 100):
@@ -62,7 +63,7 @@ def perturb(source: Path, folder: Path, perturbation: Perturbation, *, seed: int
     written = dict(_changed_files(capture, changed, folder, perturbation, seed))
     kept = _kept_files(changed)
     for name in kept - set(written):
-        _link(source / name, folder / name)
+        link_or_copy(source / name, folder / name)
     files = {name: written.get(name) or capture.manifest["files"][name] for name in sorted(kept | set(written))}
     manifest = dict(capture.manifest)
     manifest["splits"] = {
@@ -114,7 +115,8 @@ def _changed_files(
         ]
         write_cameras(folder / "cameras.json", cameras)
         yield "cameras.json", sha256_of(folder / "cameras.json")
-    if perturbation.mask_px or perturbation.exposure_stops or perturbation.noise_factor > 1:
+    drifts = perturbation.exposure_stops or perturbation.colour_stops
+    if perturbation.mask_px or drifts or perturbation.noise_factor > 1:
         for camera, frame in capture.splits["train"].views:
             path = image_path(folder, camera, frame)
             write_image(path, _spoil(original, camera, frame, perturbation, seed))
@@ -151,11 +153,10 @@ def _spoil(capture: Capture, camera: str, frame: int, perturbation: Perturbation
         variance = read_arrays(pixels_path(capture.folder, camera, frame), expected=("noise",))["noise"]
         deviation = np.sqrt(np.maximum(variance.astype(np.float64), 0) * (perturbation.noise_factor - 1))
         colour = colour + deviation[..., None] * rng.standard_normal(colour.shape)
-    if perturbation.exposure_stops:
+    if perturbation.exposure_stops or perturbation.colour_stops:
         own = np.random.default_rng([seed, 4, int(hash_of(camera)[:8], 16)])
-        gain = 2 ** (perturbation.exposure_stops * own.standard_normal())
-        colour = np.clip(colour, 0, 1) ** 2.2 * gain
-        colour = np.clip(colour, 0, 1) ** (1 / 2.2)
+        stops = perturbation.exposure_stops * own.standard_normal() + perturbation.colour_stops * own.standard_normal(3)
+        colour = np.clip(np.clip(colour, 0, 1) ** 2.2 * 2**stops, 0, 1) ** (1 / 2.2)
     if perturbation.mask_px:
         alpha = _shift_mask(alpha, perturbation.mask_px)
     rgb = np.round(np.clip(colour, 0, 1) * 255).astype(np.uint8)
@@ -171,7 +172,8 @@ def _shift_mask(alpha: np.ndarray, pixels: int) -> np.ndarray:
     return np.where(binary_erosion(inside, cross, iterations=-pixels), alpha, 0).astype(np.uint8)
 
 
-def _link(source: Path, target: Path) -> None:
+def link_or_copy(source: Path, target: Path) -> None:
+    """Give a file a second name, or a copy where it lies on another disk."""
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(source, target)

@@ -6,8 +6,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from ash.dataset import Skeleton
 from ash.files import InputError
-from synth.motion import Clip
+from synth.motion import Clip, clip_from_file
+from synth.rig import rig_from_file
 from synth.scene import Light, Outfit, Rig, Scene
 
 SIZES = ("ci", "quick", "table", "paper")
@@ -22,7 +24,7 @@ class Size:
     frames: int  # per clip
     test_frames: int
     stride: int
-    samples: int
+    samples: int  # per pixel; halves of n n or n (n + 1) samples fill the strata of the sampler
     texture: int
 
 
@@ -31,13 +33,13 @@ def _size(name: str) -> Size:
         rig = Rig(cameras=6, held_out=2, width=128, height=128)
         return Size(rig=rig, repeats=1, frames=4, test_frames=3, stride=3, samples=16, texture=512)
     if name == "quick":
-        return Size(rig=Rig(), repeats=1, frames=10, test_frames=12, stride=5, samples=56, texture=2048)
+        return Size(rig=Rig(), repeats=1, frames=10, test_frames=12, stride=5, samples=50, texture=2048)
     if name == "table":
         rig = Rig(cameras=34, held_out=4, width=512, height=512)
         return Size(rig=rig, repeats=4, frames=20, test_frames=80, stride=20, samples=128, texture=4096)
     if name == "paper":
         rig = Rig(kind="studio", cameras=120, held_out=4, width=1285, height=940, radius=4.5)
-        return Size(rig=rig, repeats=100, frames=50, test_frames=7000, stride=100, samples=64, texture=4096)
+        return Size(rig=rig, repeats=100, frames=50, test_frames=7000, stride=100, samples=60, texture=4096)
     raise InputError(f"unknown size {name!r}, expected one of {', '.join(SIZES)}")
 
 
@@ -62,7 +64,7 @@ def _base(name: str, size: str, seed: int, *, body: str, outfit: Outfit) -> Scen
 
 def mannequin(*, size: str, seed: int) -> Scene:
     """A procedural humanoid in a swinging skirt: needs no body model; the scene of the tests."""
-    outfit = Outfit(skirt=True, folds_mm=5.0, swing=1.0)
+    outfit = Outfit(skirt=True, folds_mm=5.0, swing=0.2)
     return _base("mannequin", size, seed, body="mannequin", outfit=outfit)
 
 
@@ -83,7 +85,8 @@ def skinned(*, size: str, seed: int) -> Scene:
     At size `ci` the body is the mannequin, so that all rungs together take minutes and need no body model.
     """
     amount = _size(size)
-    kinds = ("walk", "squat") if size == "ci" else ("walk", "reach", "run", "squat")
+    # Nothing that lifts the knees through a skirt that is only skinned.
+    kinds = ("walk", "reach") if size == "ci" else ("walk", "reach", "run", "reach")
     base = _base("skinned", size, seed, body="mannequin" if size == "ci" else "anny", outfit=Outfit(skirt=True))
     clips = tuple(Clip(generator=kind, frames=amount.frames) for kind in kinds * amount.repeats)
     return replace(base, train=clips)
@@ -136,6 +139,21 @@ def scene(name: str, *, size: str, seed: int = 0) -> Scene:
     return SCENES[name](size=size, seed=seed)
 
 
+def with_motion(scene: Scene, skeleton: Skeleton, *, train: Path | None, test: Path | None) -> Scene:
+    """The scene driven by a user's BVH or AMASS files, for as many frames as the scene has; the rest stays."""
+
+    def driven(clips: tuple[Clip, ...], path: Path | None) -> tuple[Clip, ...]:
+        most = sum(clip.frames for clip in clips)
+        return clips if path is None else (clip_from_file(path, skeleton, fps=scene.fps, most=most),)
+
+    return replace(scene, train=driven(scene.train, train), test=driven(scene.test, test))
+
+
+def with_rig(scene: Scene, path: Path) -> Scene:
+    """The scene seen by a user's `cameras.json`: every fourth camera is held out, at least one and at most eight."""
+    return replace(scene, rig=rig_from_file(path))
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Estimate:
     """What a capture will cost, from figures measured on two cores of a 2019 server."""
@@ -160,7 +178,7 @@ def estimate(scene: Scene) -> Estimate:
     novel_views = rig.held_out * (len(range(scene.novel_view_stride // 2, training, scene.novel_view_stride)))
     images = train_views + novel_views + rig.held_out * (scene.frames - training)
     pixels = rig.width * rig.height
-    per_image = 0.05 + 1.2e-7 * pixels * scene.samples
+    per_image = 0.07 + 1.6e-7 * pixels * scene.samples
     fixed = (40.0 if scene.body == "anny" else 6.0) + 0.25 * scene.frames
     size = int(images * pixels * 1.1 + scene.frames * 1.2e6 + 3 * scene.texture**2)
     return Estimate(images=images, core_seconds=fixed + images * per_image, bytes=size)

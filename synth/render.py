@@ -18,11 +18,12 @@ import numpy as np
 from ash.dataset import Camera
 from ash.files import InputError
 from synth.body import Surface, vertex_normals
+from synth.lighting import is_plain, make_integrator, make_lamps, make_sky, sky_and_lamps
 from synth.scene import Light
+from synth.sensing import Window, make_sensor, window_of
 
 OLDEST_LLVM = 17  # 15 and 16 accept the first kernels and then abort the process ("Cannot select fminimum")
 PROBE_SECONDS = 300
-BUCKET = 32  # pictures are cropped to the subject in steps of so many pixels: every new size costs a compilation
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -126,12 +127,15 @@ class Studio:
         self.pairs, corners = np.unique(pairs, axis=0, return_inverse=True)
         self.corners = corners.reshape(-1, 3)
         self.material = self._material(texture, light)
-        self.lights = self._lights(light)
-        # A depth counts path edges: 2 is direct light only, 3 adds one bounce.
-        direct = {"type": "direct", "hide_emitters": True}
-        path = {"type": "path", "max_depth": depth, "hide_emitters": True}
-        self.integrator = self.mi.load_dict(direct if depth <= 2 else path)
+        self.lights = make_lamps(self.mi, light)
+        self.plain = is_plain(light, depth=depth, vectorised=self.vectorised)
+        if self.plain:
+            self.integrator = sky_and_lamps(self.mi, light)
+        else:
+            self.lights["sky"] = make_sky(self.mi, light)
+            self.integrator = make_integrator(self.mi, light, depth=depth)
         self.scene: Any = None
+        self.bare: Any = None
         self.vertices = np.zeros((0, 3))
 
     def _material(self, texture: np.ndarray, light: Light) -> Any:
@@ -141,32 +145,12 @@ class Studio:
         diffuse = {"type": "diffuse", "reflectance": colour}
         if light.gloss == 0:
             return mi.load_dict({"type": "twosided", "bsdf": diffuse})
-        satin = {"type": "principled", "base_color": colour, "roughness": 0.28, "specular": 0.45 * light.gloss}
+        # A coat of low refraction mirrors the lamps and hardly the sky, which would lie like milk on dark cloth.
+        satin = {
+            "type": "roughplastic", "diffuse_reflectance": colour, "specular_reflectance": light.gloss,
+            "int_ior": 1.36, "alpha": 0.1,
+        }  # fmt: skip
         return mi.load_dict({"type": "twosided", "bsdf": satin})
-
-    def _lights(self, light: Light) -> dict[str, Any]:
-        mi = self.mi
-
-        # Lamps stand far away, so that light does not vary over the floor unless `falloff` asks for it.
-        # Sampling weights: the sky is sampled by the material, so lamps get the light samples (+1 dB at equal cost).
-        def panel(
-            position: tuple[float, ...], size: float, radiance: float, tint: tuple[float, ...], weight: float
-        ) -> Any:
-            place = mi.ScalarTransform4f().look_at(origin=list(position), target=[0, 1, 0], up=[0, 1, 0.01])
-            shape = mi.ScalarTransform4f().scale([size, size, 1])
-            colour = {"type": "rgb", "value": [radiance * channel for channel in tint]}
-            emitter = {"type": "area", "radiance": colour, "sampling_weight": weight}
-            return mi.load_dict({"type": "rectangle", "to_world": place @ shape, "emitter": emitter})
-
-        sky = {"type": "constant", "radiance": {"type": "rgb", "value": light.sky}, "sampling_weight": 0.1}
-        lights = {"sky": mi.load_dict(sky)}
-        if light.area > 0:
-            lights["key"] = panel((10.4, 11.4, 12.8), 5.2, 4.8 * light.area, (1.0, 0.95, 0.87), 2.0)
-            lights["fill"] = panel((-13.6, 5.8, 6.4), 6.0, 1.8 * light.area, (0.86, 0.93, 1.0), 1.0)
-            lights["rim"] = panel((-2.4, 11.4, -14.4), 4.8, 3.2 * light.area, (1.0, 0.97, 0.93), 1.3)
-        if light.falloff > 0:
-            lights["lamp"] = panel((1.7, 1.5, 0.2), 0.25, 40.0 * light.falloff, (1.0, 0.85, 0.65), 2.0)
-        return lights
 
     def dress(self, vertices: np.ndarray) -> None:
         """Put the person into the scene with the posed `vertices` `[s, 3]`."""
@@ -192,111 +176,103 @@ class Studio:
         parameters["faces"] = np.ravel(self.corners).astype(np.uint32)
         parameters.update()
         self.scene = mi.load_dict({"type": "scene", "person": mesh, **self.lights})
+        self.bare = mi.load_dict({"type": "scene", "person": mesh})  # No lamp stands between a pixel and its truth.
+        if self.plain:
+            self.integrator.person = self.bare
 
-    def picture(self, camera: Camera, *, samples: int, seed: int) -> Picture:
-        """Render a view in two halves of independent noise, and cast one ray through every pixel's centre."""
-        left, top, width, height = self._window(camera)
-        sensor = self._sensor(camera, left, top, width, height)
-        halves = [self._render(sensor, samples // 2, (seed + k) % 2**32) for k in range(2)]
+    def shoot(
+        self,
+        pose: np.ndarray,
+        cameras: list[Camera],
+        *,
+        samples: int,
+        seeds: list[int],
+        during: list[np.ndarray] | None = None,
+    ) -> list[Picture]:
+        """Render views of a `pose` `[s, 3]`; `during` holds those that the person takes while the shutter is open.
+
+        Light is gathered in two halves of independent noise. One ray through every pixel's centre tells what is there.
+        """
+        poses = during or [pose]
+        moving = np.concatenate(poses)
+        windows = [window_of(camera, moving) for camera in cameras]
+        halves = [[np.zeros((window.height, window.width, 4)) for _ in range(2)] for window in windows]
+        share = -(-samples // 2 // len(poses))
+        for place in poses:
+            self._wear(place)
+            for camera, window, pair, seed in zip(cameras, windows, halves, seeds, strict=True):
+                sensor = make_sensor(self.mi, camera, window, vectorised=self.vectorised)
+                for half in pair:
+                    half += self._render(sensor, share, seed % 2**32) / len(poses)
+                    seed += 1
+            seeds = [seed + 2 for seed in seeds]
+        self._wear(pose)
+        return [self._develop(*view) for view in zip(cameras, windows, halves, strict=True)]
+
+    def _wear(self, pose: np.ndarray) -> None:
+        if pose.shape != self.vertices.shape or not np.array_equal(pose.astype(np.float32), self.vertices):
+            self.dress(pose)
+
+    def _render(self, sensor: Any, samples: int, seed: int) -> np.ndarray:
+        image = self.mi.render(self.scene, sensor=sensor, integrator=self.integrator, spp=samples, seed=seed)
+        return np.array(image, dtype=np.float64)
+
+    def _develop(self, camera: Camera, window: Window, halves: list[np.ndarray]) -> Picture:
+        """The picture from its two halves, and its truth."""
         mean = (halves[0] + halves[1]) / 2
         alpha = np.clip(mean[..., 3:], 0, 1)
         colours = [_to_srgb(half[..., :3] / np.maximum(half[..., 3:], 1e-6)) for half in halves]
         noise = np.mean((colours[0] - colours[1]) ** 2, axis=-1) / 4
         rgba = np.concatenate([_to_srgb(mean[..., :3] / np.maximum(alpha, 1e-6)), alpha], axis=-1)
         rgba = np.where(np.round(255 * alpha) > 0, np.round(255 * rgba), 0).astype(np.uint8)
-        triangle, barycentric = self._cast(camera, left, top, width, height)
         noise = np.where(rgba[..., 3] > 0, noise, 0).astype(np.float32)
+        triangle, barycentric = self._cast(camera, window)
         return Picture(
-            rgba=_paste(rgba, camera, left, top, 0),
-            triangle=_paste(triangle, camera, left, top, -1),
-            barycentric=_paste(barycentric, camera, left, top, 0),
-            noise=_paste(noise, camera, left, top, 0),
+            rgba=window.paste(rgba, camera, 0),
+            triangle=window.paste(triangle, camera, -1),
+            barycentric=window.paste(barycentric, camera, 0),
+            noise=window.paste(noise, camera, 0),
         )
 
-    def _window(self, camera: Camera) -> tuple[int, int, int, int]:
-        """Left, top, width and height of the subject's place in the picture, in steps of a bucket."""
-        pixels, _ = camera.project(self.vertices.astype(np.float64))
-        size = np.array([camera.width, camera.height])
-        low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - 2, 0, size - 1)
-        high = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + 2, low + 1, size)
-        extent = np.minimum(-(-(high - low) // BUCKET) * BUCKET, size)
-        low = np.clip((low + high - extent) // 2, 0, size - extent)
-        return int(low[0]), int(low[1]), int(extent[0]), int(extent[1])
+    def look(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """What each pixel's centre sees of the person: triangle `[h, w]` (-1: none) and barycentrics `[h, w, 2]`."""
+        window = window_of(camera, self.vertices)
+        triangle, barycentric = self._cast(camera, window)
+        return window.paste(triangle, camera, -1), window.paste(barycentric, camera, 0)
 
-    def _sensor(self, camera: Camera, left: int, top: int, width: int, height: int) -> Any:
-        """The camera restricted to a window, by moving its principal point: film offsets would be compiled in."""
-        mi = self.mi
-        focal = camera.K[0, 0]
-        if abs(camera.K[1, 1] - focal) > 1e-9 * focal or camera.K[0, 1] != 0:
-            raise InputError(f"camera {camera.name}: expected square pixels (fx = fy, no skew) for rendering")
-        rotation = camera.viewmat[:3, :3].T @ np.diag([-1.0, -1.0, 1.0])  # Mitsuba's x points left and y up
-        place = np.eye(4)
-        place[:3, :3], place[:3, 3] = rotation, camera.position
-        centre = camera.K[:2, 2] - [left, top]
-        return mi.load_dict(
-            {
-                "type": "perspective",
-                "to_world": mi.ScalarTransform4f(place),
-                "fov": float(np.rad2deg(2 * np.arctan(width / 2 / focal))),
-                "fov_axis": "x",
-                "near_clip": 0.05,
-                "far_clip": 100.0,
-                "principal_point_offset_x": float(0.5 - centre[0] / width),
-                "principal_point_offset_y": float(0.5 - centre[1] / height),
-                "film": {
-                    "type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgba",
-                    "component_format": "float32", "rfilter": {"type": "box"}, "sample_border": False,
-                },
-                "sampler": {"type": "multijitter", "sample_count": 16},
-            }
-        )  # fmt: skip
-
-    def _render(self, sensor: Any, samples: int, seed: int) -> np.ndarray:
-        image = self.mi.render(self.scene, sensor=sensor, integrator=self.integrator, spp=samples, seed=seed)
-        return np.array(image, dtype=np.float64)
-
-    def _cast(self, camera: Camera, left: int, top: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-        mi = self.mi
-        x, y = np.meshgrid(left + np.arange(width) + 0.5, top + np.arange(height) + 0.5)
-        rays = np.stack(
-            [(x - camera.K[0, 2]) / camera.K[0, 0], (y - camera.K[1, 2]) / camera.K[1, 1], np.ones_like(x)], -1
-        )
-        directions = rays.reshape(-1, 3) @ camera.viewmat[:3, :3]
+    def hits(self, origin: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where rays from `origin` `[3]` towards `targets` `[n, 3]` first meet the person, and which triangle (-1)."""
+        directions = targets - origin
         directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
-        origin = camera.position.astype(np.float32)
+        distance, triangle, _ = self._trace(origin.astype(np.float32), directions)
+        return origin + np.where(triangle >= 0, distance, 0)[:, None] * directions, triangle
+
+    def _trace(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distance `[n]`, triangle `[n]` (-1: none) and barycentrics `[n, 2]` of what rays of unit length hit."""
+        mi = self.mi
         if self.vectorised:
             ray = mi.Ray3f(mi.Point3f(origin.tolist()), mi.Vector3f(np.ascontiguousarray(directions.T)))
-            hit = self.scene.ray_intersect_preliminary(ray, False)
-            person = np.array(hit.is_valid()) & (np.array(hit.t) < 1e4)
-            triangle = np.where(person, np.array(hit.prim_index).astype(np.int64), -1)
-            barycentric = np.array(hit.prim_uv).T
-        else:
-            hits = [self.scene.ray_intersect_preliminary(mi.Ray3f(origin, d), False) for d in directions]
-            triangle = np.array([h.prim_index if h.is_valid() else -1 for h in hits], dtype=np.int64)
-            barycentric = np.array([list(h.prim_uv) for h in hits])
-        barycentric = np.where((triangle >= 0)[:, None], barycentric, 0)  # A miss leaves garbage there.
-        # A ray may end at a light: only hits that lie where the person's triangle lies count.
-        corners = self.vertices[self.surface.faces[np.clip(triangle, 0, len(self.surface.faces) - 1)]].astype(
-            np.float64
-        )
-        weights = np.concatenate([1 - barycentric.sum(axis=1, keepdims=True), barycentric], axis=1)
-        points = np.einsum("nk,nka->na", weights, corners) - origin
-        aside = np.linalg.norm(points - np.sum(points * directions, axis=1, keepdims=True) * directions, axis=1)
-        valid = (triangle >= 0) & (aside < 1e-3)
-        triangle = np.where(valid, triangle, -1).astype(np.int32).reshape(height, width)
-        barycentric = np.where(valid[:, None], barycentric, 0).astype(np.float32).reshape(height, width, 2)
-        return triangle, barycentric
+            hit = self.bare.ray_intersect_preliminary(ray, False)
+            triangle = np.where(np.array(hit.is_valid()), np.array(hit.prim_index).astype(np.int64), -1)
+            return np.array(hit.t), triangle, np.array(hit.prim_uv).T
+        found = [self.bare.ray_intersect_preliminary(mi.Ray3f(origin, d), False) for d in directions]
+        triangle = np.array([h.prim_index if h.is_valid() else -1 for h in found], dtype=np.int64)
+        return np.array([h.t for h in found]), triangle, np.array([list(h.prim_uv) for h in found])
+
+    def _cast(self, camera: Camera, window: Window) -> tuple[np.ndarray, np.ndarray]:
+        directions = camera.directions(window.centres)
+        directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
+        origin = camera.position.astype(np.float32)
+        _, triangle, barycentric = self._trace(origin, directions)
+        # A ray that misses leaves garbage in its barycentrics.
+        barycentric = np.where((triangle >= 0)[:, None], barycentric, 0).astype(np.float32)
+        shape = (window.height, window.width)
+        return triangle.astype(np.int32).reshape(shape), barycentric.reshape(*shape, 2)
 
 
 def _to_srgb(linear: np.ndarray) -> np.ndarray:
     linear = np.clip(linear, 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1 / 2.4) - 0.055)
-
-
-def _paste(window: np.ndarray, camera: Camera, left: int, top: int, empty: int) -> np.ndarray:
-    whole = np.full((camera.height, camera.width, *window.shape[2:]), empty, dtype=window.dtype)
-    whole[top : top + window.shape[0], left : left + window.shape[1]] = window
-    return whole
 
 
 def _probe_here(variant: str) -> None:
@@ -312,12 +288,11 @@ def _probe_here(variant: str) -> None:
     texture = np.full((8, 8, 3), 128, dtype=np.uint8)
     renderer = Renderer(variant=variant, libllvm=libllvm, mitsuba="", note="")
     studio = Studio(renderer, surface, texture, Light(), depth=3)
-    studio.dress(surface.vertices)
     viewmat = np.diag([1.0, -1.0, -1.0, 1.0])
     viewmat[:3, 3] = [0, 1, 4]
     K = np.array([[32.0, 0, 16], [0, 32, 16], [0, 0, 1]])
     camera = Camera(name="probe", width=32, height=32, K=K, viewmat=viewmat)
-    picture = studio.picture(camera, samples=8, seed=0)
+    picture = studio.shoot(surface.vertices, [camera], samples=8, seeds=[0])[0]
     if picture.rgba[16, 16, 3] != 255 or picture.triangle[16, 16] < 0 or not 20 < picture.rgba[16, 16, :3].mean() < 250:
         raise SystemExit("the probe picture is wrong")
     print(json.dumps({"mitsuba": studio.mi.__version__}))

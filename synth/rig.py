@@ -5,9 +5,11 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from ash.dataset import Camera, read_cameras
 from ash.files import InputError
+from ash.lens import distort
 from synth.scene import Rig
 
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
@@ -55,26 +57,45 @@ def make_cameras(rig: Rig, points: np.ndarray, *, margin: float = 0.04) -> list[
     """Aim every camera at the capture volume and choose its focal length so that all `points` `[n, 3]` stay in view.
 
     `margin` is left free on each side, as a share of the image. The cameras of a given rig are taken as they are.
+
+    Raises:
+        InputError: a given camera never sees the person, or has a part of it behind.
     """
     if rig.kind == "given":
-        return _parse(rig.given)
+        cameras = _parse(rig.given)
+        for camera in cameras:
+            pixels, depth = camera.project(points)
+            if (depth < 0.05).any() or (pixels.max(axis=0) < 0).any() or (pixels.min(axis=0) > _size(rig)).any():
+                raise InputError(f"camera {camera.name}: expected the person in front of it and in its picture")
+        return cameras
+    corners = points[np.sort(ConvexHull(points).vertices)]  # The others lie between them in every picture.
     pairs = zip(names(rig), place(rig), strict=True)
-    return [_frame(rig, name, position, points, margin=margin) for name, position in pairs]
+    return [_frame(rig, name, position, corners, margin=margin) for name, position in pairs]
 
 
-def rig_from_file(path: Path, *, held_out: int) -> Rig:
-    """A rig of the user's own cameras, all of one size.
+MAX_BYTES = 16 << 20  # of a user's cameras.json
+
+
+def rig_from_file(path: Path, *, held_out: int | None = None) -> Rig:
+    """A rig of the user's own cameras, all of one size; a quarter of them is held out (1 to 8) unless told otherwise.
 
     Raises:
         InputError: the file is not a valid `cameras.json`, or its cameras differ in size.
     """
+    if path.is_file() and path.stat().st_size > MAX_BYTES:
+        raise InputError(f"{path}: {path.stat().st_size} bytes, expected at most {MAX_BYTES}")
     cameras = list(read_cameras(path).values())
     sizes = {(camera.width, camera.height) for camera in cameras}
     if len(sizes) != 1:
         raise InputError(f"{path}: expected cameras of one size, got {sorted(sizes)}")
     width, height = sizes.pop()
     text = json.dumps(json.loads(path.read_text()), sort_keys=True)
+    held_out = min(max(1, len(cameras) // 4), 8) if held_out is None else held_out
     return Rig(kind="given", given=text, cameras=len(cameras), held_out=held_out, width=width, height=height)
+
+
+def _size(rig: Rig) -> np.ndarray:
+    return np.array([rig.width, rig.height])
 
 
 def _parse(text: str) -> list[Camera]:
@@ -86,19 +107,20 @@ def _parse(text: str) -> list[Camera]:
 
 def _frame(rig: Rig, name: str, position: np.ndarray, points: np.ndarray, *, margin: float) -> Camera:
     target = (points.min(axis=0) + points.max(axis=0)) / 2
+    lens, aspect = np.array(rig.distortion), np.array([1.0, rig.pixel_aspect])
     # Aim at the middle of what is seen, which is not the middle of the volume; a few rounds settle it.
     for _ in range(4):
         viewmat = look_at(position, target)
         seen = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-        rays = seen[:, :2] / seen[:, 2:]
+        rays = distort(seen[:, :2] / seen[:, 2:], lens)
         middle = (rays.min(axis=0) + rays.max(axis=0)) / 2
         depth = seen[:, 2].mean()
         target = position + viewmat[:3, :3].T @ np.array([middle[0] * depth, middle[1] * depth, depth])
     half = np.abs(rays).max(axis=0)
-    room = (0.5 - margin) * np.array([rig.width, rig.height])
-    focal = float(np.min(room / half))
-    K = np.array([[focal, 0, rig.width / 2], [0, focal, rig.height / 2], [0, 0, 1.0]])
-    return Camera(name=name, width=rig.width, height=rig.height, K=K, viewmat=viewmat)
+    room = (0.5 - margin) * _size(rig)
+    focal = float(np.min(room / (half * aspect)))
+    K = np.array([[focal, 0, rig.width / 2], [0, focal * rig.pixel_aspect, rig.height / 2], [0, 0, 1.0]])
+    return Camera(name=name, width=rig.width, height=rig.height, K=K, viewmat=viewmat, distortion=lens)
 
 
 def held_out(rig: Rig) -> list[int]:

@@ -17,13 +17,13 @@ class Outfit:
     skirt: bool = False  # wear a skirt; alone it changes the garment, not how it moves
     folds_mm: float = 0.0  # amplitude of pose-dependent folds
     slack_mm: float = 0.0  # how far loose cloth sags and lags over the body
-    swing: float = 0.0  # 1: the skirt swings as its pendulum does; 0: rigidly skinned
+    swing: float = 0.0  # 0..1: 1 hangs the skirt from its waistband, simulated; 0: rigidly skinned
     scan_mm: float = 0.0  # rms of a smooth error of the template's rest shape on clothes, as of a scan
 
     def __post_init__(self) -> None:
-        for name in ("folds_mm", "slack_mm", "swing", "scan_mm"):
-            if not 0 <= getattr(self, name) <= 100:
-                raise InputError(f"outfit: {name} is {getattr(self, name)}, expected 0 to 100")
+        for name, most in (("folds_mm", 100), ("slack_mm", 100), ("swing", 1), ("scan_mm", 100)):
+            if not 0 <= getattr(self, name) <= most:
+                raise InputError(f"outfit: {name} is {getattr(self, name)}, expected 0 to {most}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -34,6 +34,10 @@ class Light:
     area: float = 1.0  # strength of the area lights
     falloff: float = 0.0  # 0: equal everywhere; 1: a lamp close to the floor that lights one side of it only
     gloss: float = 0.0  # 0: diffuse cloth; 1: satin
+
+    def __post_init__(self) -> None:
+        if min(self.sky, self.area, self.falloff, self.gloss) < 0 or self.gloss > 1:
+            raise InputError(f"light: {self}, expected no strength below 0 and gloss up to 1")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -47,6 +51,9 @@ class Rig:
     width: int = 256
     height: int = 256
     radius: float = 3.4  # metres
+    pixel_aspect: float = 1.0  # fy / fx: 1 for square pixels
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # k1 k2 p1 p2 of every lens
+    shutter: float = 0.0  # how long it is open, as a share of the time between frames; 0: no motion blur
 
     def __post_init__(self) -> None:
         if self.kind not in RIGS:
@@ -57,6 +64,12 @@ class Rig:
             raise InputError(f"rig: {self.held_out} of {self.cameras} cameras held out, expected 1 to all but one")
         if not (16 <= self.width <= 8192 and 16 <= self.height <= 8192):
             raise InputError(f"rig: images of {self.width}x{self.height}, expected 16 to 8192 pixels")
+        if not (0.1 <= self.pixel_aspect <= 10 and 0 <= self.shutter <= 1):
+            raise InputError(
+                f"rig: pixel aspect {self.pixel_aspect} and shutter {self.shutter}, expected 0.1 to 10 and 0 to 1"
+            )
+        if self.kind == "given" and (self.pixel_aspect != 1 or any(self.distortion)):
+            raise InputError("a rig of kind 'given' has its own lenses, expected no other pixel aspect or distortion")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -95,8 +108,11 @@ class Scene:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Everything, as JSON."""
-        return asdict(self)
+        """Everything, as JSON. Where a user's files lie is no part of what a scene is; their contents are."""
+        parameters = asdict(self)
+        for clip in (*parameters["train"], *parameters["test"]):
+            del clip["path"]
+        return parameters
 
     @property
     def identity(self) -> str:

@@ -101,8 +101,10 @@ def paint(body: Body, *, size: int, seed: int) -> np.ndarray:
     part = np.where(
         np.isin(part, (SKIN, HAIR)), np.where(_hairline(body, texels.position, grain) > 0, HAIR, SKIN), part
     )
-    throat = (part == SHIRT) & (texels.limb == 0) & (body.collar(texels.position) < 0)
-    part = np.where(throat, SKIN, np.where((part == SKIN) & (np.abs(_past_collar(body, texels)) < 0.03), SHIRT, part))
+    # A modelled collar ends where it ends; a painted one does so by colour alone.
+    throat = (not body.face.modelled) & (part == SHIRT) & (texels.limb == 0) & (body.collar(texels.position) < 0)
+    beyond = (not body.face.modelled) & (part == SKIN) & (np.abs(_past_collar(body, texels)) < 0.03)
+    part = np.where(throat, SKIN, np.where(beyond, SHIRT, part))
     colour = np.empty((len(part), 3))
     painters = {
         "skin": lambda m: _skin(body, texels.position[m], grain[m]),

@@ -1,5 +1,8 @@
 import numpy as np
+from scenes import small_capture
 
+from ash.dataset import surface_path
+from ash.files import read_arrays
 from synth.checks import penetrations, stretch
 from synth.mannequin import mannequin
 
@@ -19,3 +22,16 @@ def test_legs_that_poke_through_are_found_and_measured():
 def test_stretch_is_relative_to_rest():
     rest = BODY.surface.vertices
     np.testing.assert_allclose(stretch(BODY, np.stack([rest, 1.2 * rest]), "skirt"), [1.0, 1.2])
+
+
+def test_a_capture_tells_what_its_clothes_do_in_every_frame():
+    folder = small_capture()
+    told = read_arrays(
+        folder / "truth" / "clothes.npz", expected=("penetrating", "penetration_mm", "stretch")
+    )  # fmt: skip
+    posed = np.stack(
+        [read_arrays(surface_path(folder, t), expected=("vertices",))["vertices"] for t in range(5)]
+    ).astype(np.float64)
+    np.testing.assert_allclose(told["stretch"], stretch(BODY, posed, "skirt"), atol=1e-5)
+    np.testing.assert_allclose(told["penetration_mm"], 1000 * penetrations(BODY, posed).deepest, atol=1e-3)
+    assert told["stretch"].max() < 1.08 and told["penetrating"].max() < 0.01

@@ -169,6 +169,12 @@ def test_a_failed_write_leaves_the_old_content_and_no_litter(tmp_path, monkeypat
     assert [p.name for p in tmp_path.iterdir()] == ["x"]
 
 
+def test_written_files_are_as_readable_as_any(tmp_path):
+    write_atomic(tmp_path / "x", b"content")
+    (tmp_path / "plain").write_bytes(b"content")
+    assert (tmp_path / "x").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
 def test_windows_stop_at_the_start_of_their_sequence():
     motion = tube_motion(6)
     motion.sequence[3:] = 1

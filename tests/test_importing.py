@@ -2,6 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from motion_files import amass_file, bvh_file
 
 from ash.files import InputError
 from synth.importing import import_motion
@@ -10,7 +11,6 @@ from synth.plans import make_skeleton
 from synth.posing import bone_frames
 
 SKELETON = make_skeleton(heads())
-UPRIGHT = [np.pi / 2, 0.0, 0.0]  # AMASS worlds have z up, SMPL's rest pose has y up
 
 
 def _directions(dofs: np.ndarray) -> dict[str, np.ndarray]:
@@ -24,18 +24,8 @@ def _directions(dofs: np.ndarray) -> dict[str, np.ndarray]:
     return result
 
 
-def _amass(path: Path, **changes) -> Path:
-    poses = np.zeros((5, 156))
-    poses[:, :3] = UPRIGHT
-    poses[2:, 4 * 3] = 1.0  # left knee
-    poses[3:, 16 * 3 + 2] = -1.2  # left upper arm, lowered
-    arrays = {"poses": poses, "trans": np.linspace([0, 0, 0.9], [0, -1.0, 0.9], 5), "mocap_framerate": np.array(60.0)}
-    np.savez(path, **{**arrays, **changes})
-    return path
-
-
 def test_amass_poses_become_our_directions(tmp_path: Path):
-    motion = import_motion(_amass(tmp_path / "walk.npz"), SKELETON)
+    motion = import_motion(amass_file(tmp_path / "walk.npz"), SKELETON)
     bones = _directions(motion.dofs)
     assert motion.fps == 60 and len(motion.dofs) == 5
     np.testing.assert_allclose(bones["forearm_left"][0], [1, 0, 0], atol=1e-9)  # T-pose, though ours rests in an A
@@ -52,61 +42,12 @@ def test_amass_poses_become_our_directions(tmp_path: Path):
 
 
 def test_frames_are_taken_at_the_wanted_rate(tmp_path: Path):
-    motion = import_motion(_amass(tmp_path / "walk.npz"), SKELETON, fps=30.0)
+    motion = import_motion(amass_file(tmp_path / "walk.npz"), SKELETON, fps=30.0)
     assert motion.fps == 30 and len(motion.dofs) == 3
 
 
-BVH = """HIERARCHY
-ROOT Hips
-{
- OFFSET 0 90 0
- CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
- JOINT Spine
- {
-  OFFSET 0 10 0
-  CHANNELS 3 Zrotation Xrotation Yrotation
-  End Site
-  {
-   OFFSET 0 40 0
-  }
- }
-%s%s}
-MOTION
-Frames: 2
-Frame Time: 0.04
-"""
-LEG = """ JOINT %sUpLeg
- {
-  OFFSET %d 0 0
-  CHANNELS 3 Zrotation Xrotation Yrotation
-  JOINT %sLeg
-  {
-   OFFSET 0 -40 0
-   CHANNELS 3 Zrotation Xrotation Yrotation
-   JOINT %sFoot
-   {
-    OFFSET 0 -40 0
-    CHANNELS 3 Zrotation Xrotation Yrotation
-    End Site
-    {
-     OFFSET 0 0 12
-    }
-   }
-  }
- }
-"""
-
-
-def _bvh(path: Path, *, frames: str | None = None) -> Path:
-    text = BVH % tuple(LEG % (side, sign * 10, side, side) for side, sign in (("Left", 1), ("Right", -1)))
-    still = ["0"] * 3 + ["0"] * 3 + ["0"] * 3 + ["0"] * 18
-    moved = ["0", "0", "40"] + ["0", "0", "90"] + ["0"] * 3 + ["0"] * 3 + ["0", "60", "0"] + ["0"] * 12
-    path.write_text(text + (frames if frames is not None else " ".join(still) + "\n" + " ".join(moved) + "\n"))
-    return path
-
-
 def test_bvh_turns_and_bends_what_it_says(tmp_path: Path):
-    motion = import_motion(_bvh(tmp_path / "turn.bvh"), SKELETON)
+    motion = import_motion(bvh_file(tmp_path / "turn.bvh"), SKELETON)
     assert motion.fps == pytest.approx(25)
     bones = _directions(motion.dofs)
     np.testing.assert_allclose(bones["shin_left"][0], [0, -1, 0], atol=1e-9)
@@ -139,7 +80,7 @@ def test_broken_bvh_is_refused(tmp_path: Path, text: str, message: str):
 
 
 def test_bvh_that_promises_too_much_is_refused(tmp_path: Path):
-    path = _bvh(tmp_path / "short.bvh", frames="0 0 0\n")
+    path = bvh_file(tmp_path / "short.bvh", frames="0 0 0\n")
     with pytest.raises(InputError, match="3 numbers found"):
         import_motion(path, SKELETON)
     path.write_text(path.read_text().replace("Frames: 2", "Frames: 1000000000"))
@@ -161,8 +102,8 @@ def test_hostile_npz_is_refused(tmp_path: Path):
     }
     for message, changes in bad.items():
         with pytest.raises(InputError, match=message):
-            import_motion(_amass(tmp_path / "bad.npz", **changes), SKELETON)
-    whole = _amass(tmp_path / "cut.npz").read_bytes()
+            import_motion(amass_file(tmp_path / "bad.npz", **changes), SKELETON)
+    whole = amass_file(tmp_path / "cut.npz").read_bytes()
     (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match="npz"):
         import_motion(tmp_path / "cut.npz", SKELETON)

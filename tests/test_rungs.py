@@ -152,3 +152,5 @@ def test_gloss_adds_highlights_and_nothing_to_the_geometry(pool: ProcessPoolExec
     difference = glossy.image(camera, 1)[..., :3].astype(float) - plain.image(camera, 1)[..., :3]
     assert np.abs(difference[before.covered]).mean() > 2
     assert difference.max() > 20
+    ratio = [np.median(c.image(camera, 1)[before.covered][:, 0] / 255.0) for c in (plain, glossy)]
+    assert abs(ratio[1] - ratio[0]) < 0.08  # No milk over the cloth: its typical colour is kept.

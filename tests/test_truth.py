@@ -123,6 +123,23 @@ def test_severities_are_what_they_say(capture: Capture):
     assert 1.2 < np.sqrt(np.mean(np.sum(np.concatenate(shifts) ** 2, axis=-1))) < 3.0
 
 
+def test_colour_drift_tints_cameras_and_brightness_drift_does_not(capture: Capture, tmp_path: Path):
+    def gains(name: str, perturbation: Perturbation) -> np.ndarray:
+        """Linear gain of every training camera's channels, where no channel is clipped."""
+        spoilt = load_capture(perturb(capture.folder, tmp_path / name, perturbation, seed=3))
+        found = []
+        for camera in capture.splits["train"].cameras:
+            before, after = (c.image(camera, capture.splits["train"].frames[0]) for c in (capture, spoilt))
+            plain = (before[..., 3] == 255) & (before[..., :3] > 40).all(-1) & (after[..., :3] < 250).all(-1)
+            found.append(((after[plain, :3] / 255.0) ** 2.2).mean(0) / ((before[plain, :3] / 255.0) ** 2.2).mean(0))
+        return np.array(found)
+
+    grey = gains("grey", Perturbation(exposure_stops=0.3))
+    tinted = gains("tinted", Perturbation(colour_stops=0.3))
+    assert np.ptp(np.log2(grey), axis=1).max() < 0.1 and np.ptp(np.log2(grey), axis=0).min() > 0.2
+    assert np.ptp(np.log2(tinted), axis=1).mean() > 0.2
+
+
 @pytest.mark.parametrize("bad", [{"tracking_deg": -1.0}, {"cameras": 0}, {"noise_factor": 0.5}, {"mask_px": 1000}])
 def test_bad_severities_are_refused(bad: dict):
     with pytest.raises(InputError, match="perturbation"):
@@ -158,7 +175,7 @@ def test_own_cameras_are_taken_as_they_are(capture: Capture, tmp_path: Path):
     path = tmp_path / "cameras.json"
     write_cameras(path, list(capture.cameras.values()))
     rig = rig_from_file(path, held_out=1)
-    for camera, own in zip(make_cameras(rig, np.zeros((1, 3))), read_cameras(path).values(), strict=True):
+    for camera, own in zip(make_cameras(rig, np.array([[0, 1.0, 0]])), read_cameras(path).values(), strict=True):
         assert camera.name == own.name
         np.testing.assert_array_equal(camera.viewmat, own.viewmat)
     write_cameras(path, [replace(camera, width=32 + k) for k, camera in enumerate(capture.cameras.values())])
