@@ -22,14 +22,19 @@ class ModelConfig:
     offset: bool = True  # False: no learned canonical offset d (w/o disp.)
     width: int = 64  # channels of the U-Nets' first level
     levels: int = 4  # halvings of the U-Nets
-    norm: str = "instance"  # "instance" (what the release's BatchNorm at batch 1 computes) or "none"
+    head: str = "unet"  # "unet": the paper's decoders; "blendshapes": local low-rank correctives, not in the paper
+    rank: int = 6  # correctives per body region of the head "blendshapes"
+    norm: str = "none"  # of the U-Nets: "batch-as-released" (always on the statistics of its batch of 1), or "instance"
     shared_trunk: bool = False  # one U-Net for E_geo and E_app together; not in the paper
     shuffle: int = 1  # decode at 1/shuffle of the lattice's resolution and shuffle pixels up; not in the paper
     sh_degree: int = 3
     global_features: bool = True  # Phi, from the root translation, at the bottleneck of E_app
+    global_mlp: str = "paper"  # Phi's layers: 32, 32, 16 wide; "released": 64, 32, 16 on the translation over 1.2
+    offset_unit_m: float = 0.01  # metres per unit of a decoded offset; the release decodes metres
     quat_frame: str = "canonical"  # "canonical": rotations and SH turn with the surface; "world": as released
     standardise: bool = False  # decoders see deviations from the mean training texture, in its units; not in the paper
     base: bool = False  # learned static texels with the decoders as residual; not in the paper
+    refine: bool = False  # images also move the template's vertices, alike in all frames; the paper's future work
     light: bool = False  # colour times exp(SH2 of the posed normal), 27 numbers; not in the paper
     dilation: float = 0.3  # px^2 added to the projected covariance
 
@@ -40,22 +45,26 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be built."""
-        one_of("norm", self.norm, ("instance", "none"))
+        one_of("head", self.head, ("unet", "blendshapes"))
+        one_of("norm", self.norm, ("none", "batch-as-released", "instance"))
+        one_of("global_mlp", self.global_mlp, ("paper", "released"))
         one_of("quat_frame", self.quat_frame, ("canonical", "world"))
         if self.shuffle < 1 or self.texels < 4 or self.texels % (self.shuffle * 2**self.levels):
             unit = f"shuffle {self.shuffle} times 2^levels {2**self.levels}"
             raise InputError(f"texels: expected a multiple of {unit}, got {self.texels}")
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
-        if self.window < 1 or self.width < 1 or self.dilation < 0:
-            raise InputError("window and width must be at least 1 and dilation at least 0")
+        if min(self.window, self.width, self.rank) < 1 or self.dilation < 0 or self.offset_unit_m <= 0:
+            raise InputError("window, width and rank must be at least 1, dilation at least 0, offset_unit_m positive")
+        if self.refine and not self.offset:
+            raise InputError("refine moves Gaussians by their canonical offset and needs offset=True")
         if not (self.motion or self.base):
             raise InputError("without motion the Gaussians are the static base: motion=False needs base=True")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TrainingConfig:
-    """The loop: Adam with a cosine schedule, a warm-up, then L1 + SSIM (ASH Eq. 9)."""
+    """The loop: Adam, a warm-up, then L1 + SSIM (ASH Eq. 9)."""
 
     steps: int
     views_per_step: int  # images of one frame that share one decoding
@@ -66,6 +75,10 @@ class TrainingConfig:
     learning_rate: float  # of the networks
     base_learning_rate: float = 1e-2  # of the static texels
     background: str = "random"  # "random": a new colour every step, so that opacity is learned; "black": the paper's
+    schedule: str = "cosine"  # of the learning rates; "constant": as released
+    crop: bool = True  # draw only around the subject; the release draws whole frames
+    precision: str = "float32"  # of the decoders while they learn; "bfloat16": autocast
+    ema: float = 0.0  # decay of an average of the weights, which is then the result; 0: none
     camera_share: float = 1.0  # of the training cameras, evenly spread
     checkpoint_seconds: float = 60.0
 
@@ -73,10 +86,46 @@ class TrainingConfig:
         """Refuse what cannot be run."""
         one_of("warmup", self.warmup, ("static", "analytic", "fitted", "none"))
         one_of("background", self.background, ("random", "black"))
+        one_of("schedule", self.schedule, ("cosine", "constant"))
+        one_of("precision", self.precision, ("float32", "bfloat16"))
+        if not 0 <= self.ema < 1:
+            raise InputError(f"ema: expected a decay of at least 0 and below 1, got {self.ema}")
         if not 0 < self.camera_share <= 1:
             raise InputError(f"camera_share: expected more than 0 and at most 1, got {self.camera_share}")
         if self.steps < 1 or self.views_per_step < 1 or not 0 <= self.warmup_steps <= self.steps:
             raise InputError("expected steps >= 1, views_per_step >= 1 and 0 <= warmup_steps <= steps")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TemplateConfig:
+    """Which template a method stands on (Stg.1). Equal configs give equal templates, whichever method asks."""
+
+    kind: str = "skinned"  # "skinned": rest mesh, skinned; "learned": deformed as training frames were; "exact"
+    error_mm: float = 0.0  # rms of a smooth error that is planted in the exact surface
+    supervision: str = "chamfer"  # a surface per frame; "vertices": an oracle's; "images": nothing but the videos
+    network: str = "linear"  # a map per node of the embedded graph; "graph": the paper's graph convolutions
+    skinning: str = "direct"  # "graph": the nodes' transforms, blended, as released
+    nodes: int = 400  # of the embedded graph
+    window: int = 2  # frames of motion that are seen
+    weights: str = "shared"  # of the graph convolutions; "per-node": as released
+    dense: bool = False  # one full matrix over the vertices in the displacement network, as released
+    width: int = 16  # of the graph convolutions
+    blocks: int = 2
+    steps: int = 300  # of the graph convolutions' training
+
+    def __post_init__(self) -> None:
+        """Refuse what does not exist."""
+        one_of("template", self.kind, ("skinned", "learned", "exact"))
+        one_of("template supervision", self.supervision, ("chamfer", "vertices", "images"))
+        one_of("template network", self.network, ("linear", "graph"))
+        one_of("template skinning", self.skinning, ("direct", "graph"))
+        one_of("template weights", self.weights, ("shared", "per-node"))
+        if not 0 <= self.error_mm < 1000:
+            raise InputError(f"template error_mm: expected 0 to 1000 mm, got {self.error_mm}")
+        if self.error_mm > 0 and self.kind != "exact":
+            raise InputError(f"template error_mm: a planted error needs the exact surface, got {self.kind!r}")
+        if min(self.nodes, self.window, self.width, self.blocks, self.steps) < 1:
+            raise InputError("template: nodes, window, width, blocks and steps must be at least 1")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -85,12 +134,11 @@ class AshConfig:
 
     model: ModelConfig
     training: TrainingConfig
-    template: str = "skinned"  # "skinned": rest mesh, skinned; "exact": the oracle's
+    template: TemplateConfig = TemplateConfig()
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse an unknown template and a warm-up that the model cannot take."""
-        one_of("template", self.template, ("skinned", "exact"))
+        """Refuse a warm-up that the model cannot take."""
         if self.training.warmup == "static" and not self.model.base:
             raise InputError("warmup='static' trains the base alone and needs base=True")
         if self.training.warmup in ("analytic", "fitted") and not self.model.motion:

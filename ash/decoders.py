@@ -23,6 +23,8 @@ class ConvBlock(nn.Sequential):
             layers.append(nn.Conv2d(channels, outputs, 3, padding=1, bias=norm == "none"))
             if norm == "instance":
                 layers.append(nn.InstanceNorm2d(outputs, affine=True))
+            elif norm == "batch-as-released":
+                layers.append(nn.BatchNorm2d(outputs, track_running_stats=False))
             layers.append(nn.ReLU(inplace=True))
         super().__init__(*layers)
 
@@ -79,16 +81,21 @@ def _keep_variance(layer: nn.Module) -> None:
 
 
 class GlobalFeatures(nn.Module):
-    """Phi: the root translation, positionally encoded, through a 3-layer MLP of width 32 (ASH appendix A)."""
+    """Phi: the root translation, positionally encoded, through a 3-layer MLP of width 32 (ASH appendix A).
 
-    def __init__(self) -> None:
+    The release's first layer is 64 wide, and its translation is divided by 1.2.
+    """
+
+    def __init__(self, layers: str) -> None:
         super().__init__()
+        wide, self.scale = {"paper": (32, 1.0), "released": (64, 1.2)}[layers]
         self.mlp = nn.Sequential(
-            nn.Linear(3 + 6 * OCTAVES, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU(), nn.Linear(32, GLOBAL_FEATURES)
+            nn.Linear(3 + 6 * OCTAVES, wide), nn.ReLU(), nn.Linear(wide, 32), nn.ReLU(), nn.Linear(32, GLOBAL_FEATURES)
         )
 
     def forward(self, translation: Float[Tensor, " 3"]) -> Float[Tensor, " 16"]:
         """Features of a root translation in metres."""
+        translation = translation / self.scale
         angles = translation[:, None] * 2.0 ** torch.arange(OCTAVES, device=translation.device)
         return self.mlp(torch.cat([translation, angles.sin().flatten(), angles.cos().flatten()]))
 
@@ -122,7 +129,7 @@ class Decoders(nn.Module):
             )
             for count, phi in zip(outputs, phi_inputs, strict=True)
         )
-        self.phi = GlobalFeatures() if config.global_features else None
+        self.phi = GlobalFeatures(config.global_mlp) if config.global_features else None
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, conditions: Conditions) -> Float[Tensor, "n o"]:

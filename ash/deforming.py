@@ -1,141 +1,61 @@
-"""The learned deformation of Stg.1: graph convolutions from the motion window to the embedded graph and displacements.
+"""The learned deformation of Stg.1: from the motion window to canonical vertices (ASH appendix, Eq. 10).
 
-ASH appendix A and Habermann et al. 2021 (DDC). Trained on its own and then frozen: the Gaussians and the mesh
-baseline both stand on it.
+Trained on its own and then frozen: the Gaussians and the mesh baseline both stand on it.
 """
-
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from ash.config import TemplateConfig
 from ash.dataset import Motion, Skeleton, TemplateMesh
-from ash.files import InputError
-from ash.graph import EmbeddedGraph, NeighbourMean, build_graph, embedded_deformation
-from ash.skinning import (
-    RigidTransforms,
-    SkinWeights,
-    dual_quaternion_skinning,
-    forward_kinematics,
-    quat_multiply,
-    root_yaw,
-    rotate,
-    rotvec_to_unitquat,
-    sparse_skin_weights,
-)
+from ash.graph import build_graph
+from ash.skinning import RigidTransforms
+from ash.textures import normalised_motion
 
-GRAPH_UNIT = 0.1  # Metres and radians per unit of the graph net's output.
-DISPLACEMENT_UNIT = 0.01  # Metres per unit of the displacement net's output.
+NEIGHBOUR_JOINT = 0.5  # How far a node feels a joint's neighbours in the skeleton, against the joint itself.
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DeformationConfig:
-    """Size of the two graph networks."""
+class LinearDeformation(nn.Module):
+    """Eq. 10 with a linear map per node: T_j from the pose of the joints near node j, A_j = 0, D_i the same always.
 
-    nodes: int = 400
-    window: int = 3
-    width: int = 32
-    blocks: int = 3
-    displacements: bool = True
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be built."""
-        if min(self.nodes, self.window, self.width, self.blocks) < 1:
-            raise InputError("deformation: nodes, window, width and blocks must be at least 1")
-
-
-class GraphConvolution(nn.Module):
-    """y = x W_self + (mean of the neighbours' x) W_neighbour + b."""
-
-    def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__()
-        self.own = nn.Linear(inputs, outputs)
-        self.neighbours = nn.Linear(inputs, outputs, bias=False)
-
-    def forward(self, x: Float[Tensor, "n i"], adjacency: NeighbourMean) -> Float[Tensor, "n o"]:
-        """One hop."""
-        return self.own(x) + self.neighbours(adjacency(x))
-
-
-class GraphNet(nn.Module):
-    """Residual graph convolutions with a head that starts at zero."""
-
-    def __init__(self, inputs: int, outputs: int, *, width: int, blocks: int) -> None:
-        super().__init__()
-        self.first = GraphConvolution(inputs, width)
-        self.blocks = nn.ModuleList(GraphConvolution(width, width) for _ in range(2 * blocks))
-        self.head = nn.Linear(width, outputs)
-        nn.init.zeros_(self.head.weight)
-        nn.init.zeros_(self.head.bias)
-
-    def forward(self, x: Float[Tensor, "n i"], adjacency: NeighbourMean) -> Float[Tensor, "n o"]:
-        """Node features to node outputs."""
-        x = self.first(x, adjacency).relu()
-        for a, b in zip(self.blocks[::2], self.blocks[1::2], strict=True):
-            x = x + b(a(x, adjacency).relu(), adjacency).relu()
-        return self.head(x)
-
-
-class LearnedDeformation(nn.Module):
-    """Motion window -> embedded graph (angles, translations) and displacements -> canonical vertices (Eq. 10).
-
-    Both networks also see the rest positions: their weights are shared by all nodes, which must know where they are.
+    A node sees the degrees of freedom of the motion window weighed by `reach`: the skinning weight of a joint at the
+    node, plus half that of the joint's neighbours. Which folds a sleeve throws is decided at the elbow.
     """
 
-    def __init__(self, config: DeformationConfig, mesh: TemplateMesh, skeleton: Skeleton) -> None:
+    def __init__(self, config: TemplateConfig, mesh: TemplateMesh, skeleton: Skeleton) -> None:
         super().__init__()
-        self.config, self.skeleton = config, skeleton
+        self.config = config
         self.rest = torch.from_numpy(mesh.vertices).float()
-        self.graph: EmbeddedGraph = build_graph(mesh, nodes=config.nodes)
-        self.skin: SkinWeights = sparse_skin_weights(torch.from_numpy(mesh.skin_weights).float())
-        shape = {"width": config.width, "blocks": config.blocks}
-        self.graph_net = GraphNet(7 * config.window + 3, 6, **shape)
-        self.displacement_net = GraphNet(3 * config.window + 3, 3, **shape) if config.displacements else None
+        self.graph = build_graph(mesh, nodes=min(config.nodes, len(mesh.vertices)))
+        near = joint_reach(mesh, skeleton)[self.graph.nodes]
+        per_frame = torch.cat([torch.ones(len(near), 3), near.repeat_interleave(3, 1)], 1)
+        self.reach = per_frame.repeat(1, config.window)
+        nodes, inputs = self.reach.shape
+        self.static = nn.Parameter(torch.zeros_like(self.rest), requires_grad=False)
+        self.maps = nn.Parameter(torch.zeros(nodes, inputs, 3), requires_grad=False)
+        self.mean_window = nn.Parameter(torch.zeros(inputs), requires_grad=False)
 
-    def forward(self, motion: Motion, frame: int) -> Float[Tensor, "v 3"]:
-        """Canonical vertices of a frame; differentiable in the networks' weights."""
-        return self.deform(self.window_transforms(motion, frame))
+    def window(self, motion: Motion, frame: int) -> Float[Tensor, " f"]:
+        """The normalised motion window, in a row: it does not say where the root is or heads."""
+        return normalised_motion(motion, frame, window=self.config.window).flatten()
 
-    def deform(self, transforms: list[RigidTransforms]) -> Float[Tensor, "v 3"]:
-        """Canonical vertices from the window's skinning transforms, newest first."""
-        nodes = self.graph.nodes
-        inputs = [torch.cat([_upper(t.quats[nodes]), t.apply(self.rest)[nodes]], 1) for t in transforms]
-        moved = GRAPH_UNIT * self.graph_net(torch.cat([*inputs, self.rest[nodes]], 1), self.graph.adjacency)
-        displacements = torch.zeros_like(self.rest)
-        if self.displacement_net is not None:
-            skinned = torch.cat([*(t.apply(self.rest) for t in transforms), self.rest], 1)
-            displacements = DISPLACEMENT_UNIT * self.displacement_net(skinned, self.graph.vertex_adjacency)
-        return embedded_deformation(self.rest, self.graph, moved[:, :3], moved[:, 3:], displacements)
-
-    @torch.no_grad()
-    def window_transforms(self, motion: Motion, frame: int) -> list[RigidTransforms]:
-        """Per-vertex skinning of the window's frames, newest first, seen from the newest frame's root and heading."""
-        now = torch.from_numpy(motion.dofs[frame])
-        origin = now[:3] + torch.from_numpy(self.skeleton.heads[0])
-        zero = torch.zeros((), dtype=torch.float64)
-        unturn = rotvec_to_unitquat(torch.stack([zero, -root_yaw(now), zero]))
-        window = []
-        for past in motion.window(frame, self.config.window):
-            joints = forward_kinematics(self.skeleton, torch.from_numpy(motion.dofs[past]))
-            turn = unturn.expand(len(joints.quats), 4)
-            window.append(
-                dual_quaternion_skinning(
-                    RigidTransforms(
-                        quats=quat_multiply(turn, joints.quats).float(),
-                        translations=rotate(turn, joints.translations - origin).float(),
-                    ),
-                    self.skin,
-                )
-            )
-        return window
+    def shift(self, motion: Motion, frame: int) -> Float[Tensor, "v 3"]:
+        """Canonical vertices less those at rest, metres; differentiable in what is learned."""
+        pose = self.window(motion, frame) - self.mean_window
+        translations = torch.einsum("f,gfo->go", pose, self.maps)
+        return self.static + self.graph.spread(translations)
 
     @torch.no_grad()
     def canonical(self, motion: Motion, frame: int, transforms: RigidTransforms) -> Float[Tensor, "v 3"]:
         """The `ash.template.Deformation` protocol."""
-        return self(motion, frame)
+        return self.rest + self.shift(motion, frame)
 
 
-def _upper(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
-    """One of q and -q, always the same: a network should not see two names of one rotation."""
-    return torch.where(quats[:, :1] < 0, -quats, quats)
+def joint_reach(mesh: TemplateMesh, skeleton: Skeleton) -> Float[Tensor, "v j"]:
+    """How much every joint matters at every vertex: its skinning weight, and half its neighbours'."""
+    parents = torch.from_numpy(skeleton.parents)
+    near = torch.eye(len(parents), dtype=torch.float64)
+    child = (parents >= 0).nonzero().squeeze(1)
+    near[child, parents[child]] = near[parents[child], child] = NEIGHBOUR_JOINT
+    return (torch.from_numpy(mesh.skin_weights) @ near).float()

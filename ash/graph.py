@@ -29,6 +29,10 @@ class EmbeddedGraph:
     adjacency: "NeighbourMean"  # of the nodes
     vertex_adjacency: "NeighbourMean"  # of the vertices
 
+    def spread(self, values: Float[Tensor, "g c"]) -> Float[Tensor, "v c"]:
+        """What the nodes have, blended at the vertices."""
+        return (values[self.links] * self.weights[..., None]).sum(1)
+
 
 def build_graph(mesh: TemplateMesh, *, nodes: int) -> EmbeddedGraph:
     """Place about `nodes` nodes by quadric decimation, and link every vertex to its nearest ones along the surface.
@@ -114,6 +118,11 @@ def _to_torch(matrix: scipy.sparse.csr_matrix) -> Tensor:
         return torch.sparse_csr_tensor(
             *indices, torch.from_numpy(matrix.data).float(), size=matrix.shape, check_invariants=True
         )
+
+
+def vertex_neighbours(mesh: TemplateMesh) -> NeighbourMean:
+    """Mean over the vertices that share an edge."""
+    return _mean_over_neighbours(_edge_lengths(mesh.vertices, mesh.faces))
 
 
 def _mean_over_neighbours(edges: scipy.sparse.csr_matrix) -> NeighbourMean:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ash.skinning import quat_conjugate, rotate
+from ash.skinning import unitquat_to_rotmat
 
 SH_C0 = 0.28209479177387814
 
@@ -44,13 +44,12 @@ def rotate_sh(quats: Float[Tensor, "n 4"], sh: Float[Tensor, "n k 3"]) -> Float[
     Degree by degree, each row's coefficients are fitted to its values at a few fixed directions; harmonics of one
     degree are closed under rotation, so that the fit is exact.
     """
-    turned = [sh[:, :1]]
+    turned, matrices = [sh[:, :1]], unitquat_to_rotmat(quats)
     for degree in range(1, _degree_of(sh.shape[1]) + 1):
         directions, fit = _sampling(degree)
         directions, fit = directions.to(sh), fit.to(sh)
         count = 2 * degree + 1
-        inverse = quat_conjugate(quats)[:, None].expand(-1, len(directions), -1)
-        basis = sh_basis(rotate(inverse, directions.expand(len(quats), -1, -1)), degree)[..., -count:]
+        basis = sh_basis(directions @ matrices, degree)[..., -count:]  # d R = R^-1 d
         turned.append(fit @ (basis @ sh[:, degree**2 : (degree + 1) ** 2]))
     return torch.cat(turned, 1)
 

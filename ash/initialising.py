@@ -4,6 +4,7 @@ import math
 
 import torch
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ash.config import ModelConfig
@@ -11,9 +12,9 @@ from ash.dataset import Camera, Capture
 from ash.decoders import raw_channels
 from ash.harmonics import SH_C0
 from ash.rasterizing import project_vertices, rasterize_mesh
-from ash.skinning import rotmat_to_unitquat
+from ash.skinning import quat_conjugate, rotate, rotmat_to_unitquat
 from ash.template import PosedTemplate, Template, vertex_normals
-from ash.textures import TexelLattice
+from ash.textures import Conditions, TexelLattice
 
 DISC_SCALE = 0.6  # Standard deviation in texel pitches: neighbours overlap without blurring each other.
 DISC_THICKNESS = 0.2
@@ -50,6 +51,30 @@ def initial_gaussians(
     return raw
 
 
+def released_gaussians(
+    config: ModelConfig, analytic: Float[Tensor, "n o"], conditions: Conditions
+) -> Float[Tensor, "n o"]:
+    """What the release regresses its decoders to in a frame, before it renders: no fit, but a guess from the mesh.
+
+    Colours as in `analytic`; round, as large as the three nearest posed texels are far (root mean square); turned from
+    +x to the normal; opacity 0.1; no offset.
+    """
+    raw = torch.zeros_like(analytic)
+    raw[:, 11:14] = analytic[:, 11:14]
+    points = conditions.transforms.apply(conditions.canonical).numpy()
+    near = torch.from_numpy(cKDTree(points).query(points, k=4)[0][:, 1:]).float()
+    raw[:, 3:6] = near.square().mean(1).sqrt().clamp(min=1e-4).log()[:, None]
+    normals = conditions.normals
+    if config.quat_frame == "canonical":
+        normals = rotate(quat_conjugate(conditions.transforms.quats), normals)
+    x, y, z = normals.unbind(1)
+    turn = torch.stack([1 + x, torch.zeros_like(x), -z, y], 1)
+    half_turn = torch.tensor([0.0, 0.0, 0.0, 1.0])
+    raw[:, 6:10] = torch.nn.functional.normalize(torch.where(turn.norm(dim=1, keepdim=True) < 1e-3, half_turn, turn))
+    raw[:, 10] = _logit(0.1)
+    return raw
+
+
 def texel_pitch(lattice: TexelLattice, vertices: Float[Tensor, "v 3"]) -> Float[Tensor, " n"]:
     """Distance between neighbouring texels on the surface, metres: the root of a texel's share of its triangle."""
     a, b, c = vertices[lattice.corners].unbind(1)
@@ -58,6 +83,12 @@ def texel_pitch(lattice: TexelLattice, vertices: Float[Tensor, "v 3"]) -> Float[
     per_texel = area / count[triangle]
     # Triangles smaller than a texel own one texel by chance; the median keeps the others from becoming dust.
     return per_texel.sqrt().clamp(min=0.5 * per_texel.sqrt().median(), max=2.0 * per_texel.sqrt().median())
+
+
+def initial_texture(capture: Capture, template: Template, lattice: TexelLattice) -> Float[Tensor, "3 r r"]:
+    """Mean training pixels as a texture; where no triangle lies, their mean."""
+    colours = mean_colours(capture, template, lattice)
+    return lattice.to_texture(colours - colours.mean(0)) + colours.mean(0)[:, None, None]
 
 
 def mean_colours(capture: Capture, template: Template, lattice: TexelLattice) -> Float[Tensor, "n 3"]:

@@ -1,6 +1,6 @@
 """ASH as a method of the suite: builds the model from a capture, warms it up, trains it, renders with it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,14 +11,15 @@ import torch
 from torch import Tensor
 
 from ash.avatar import AshModel
+from ash.blendshapes import LocalBlendshapes
 from ash.config import AshConfig, ModelConfig
-from ash.dataset import Camera, Capture, Motion, fewer_cameras, read_template_truth
+from ash.dataset import Camera, Capture, Motion, fewer_cameras
 from ash.decoders import Decoders
-from ash.files import write_atomic
-from ash.initialising import blank_gaussians, initial_gaussians, texel_pitch
+from ash.files import InputError, write_atomic
+from ash.initialising import blank_gaussians, initial_gaussians, released_gaussians, texel_pitch
 from ash.protocol import StageClock
-from ash.template import Template, exact_template, skinned_template
-from ash.textures import Conditions, TexelLattice, build_lattice
+from ash.templates import template_of
+from ash.textures import Conditions, TexelLattice, build_lattice, normalised_motion
 from ash.training import TrainingImages, draw_batch, fit, load_module, load_training_images, read_safetensors, view_loss
 
 WARMUP_OPACITY_WEIGHT = 0.1  # As in the release.
@@ -31,18 +32,29 @@ MakeDecoders = Callable[[ModelConfig, TexelLattice], torch.nn.Module]
 class AshAvatar:
     """The Avatar protocol (see `ash.protocol`) for ASH and for every ablation that is a configuration of it."""
 
-    def __init__(self, config: AshConfig, capture: Capture, *, make_decoders: MakeDecoders = Decoders) -> None:
+    def __init__(self, config: AshConfig, capture: Capture, *, make_decoders: MakeDecoders | None = None) -> None:
         torch.manual_seed(config.seed)
         capture = fewer_cameras(capture, config.training.camera_share)
         self.config = config
-        self.template = template_of(config.template, capture)
+        self.template = template_of(config.template, capture, seed=config.seed)
         self.lattice = build_lattice(capture.template, config.model.texels)
         self.analytic = initial_gaussians(config.model, capture, self.template, self.lattice)
-        decoders = make_decoders(config.model, self.lattice) if config.model.motion else None
+        decoders = None
+        if config.model.motion:
+            decoders = make_decoders(config.model, self.lattice) if make_decoders else self._decoders()
         self.module = AshModel(config.model, self.template, self.lattice, self._start(capture), decoders)
-        self.module.observe(capture.motion, capture.splits["train"].frames)
+        if self.module.textures is not None:
+            self.module.textures.observe(self.template, capture.motion, capture.splits["train"].frames)
+        if isinstance(decoders, LocalBlendshapes):
+            window, frames = config.model.window, capture.splits["train"].frames
+            decoders.observe([normalised_motion(capture.motion, frame, window=window) for frame in frames])
         self._conditions: dict[int, Conditions] = {}
         self._motion = capture.motion
+
+    def _decoders(self) -> torch.nn.Module:
+        if self.config.model.head == "blendshapes":
+            return LocalBlendshapes(self.config.model, self.lattice, self.template)
+        return Decoders(self.config.model, self.lattice)
 
     def _start(self, capture: Capture) -> Tensor:
         if self.config.model.base:
@@ -71,6 +83,8 @@ class AshAvatar:
             groups.append({"params": list(module.decoders.parameters()), "lr": training.learning_rate})
         if module.base.requires_grad:
             groups.append({"params": [module.base], "lr": training.base_learning_rate})
+        if module.refinement is not None:
+            groups.append({"params": list(module.refinement.parameters()), "lr": training.base_learning_rate})
         if module.light is not None:
             groups.append({"params": [module.light], "lr": training.base_learning_rate})
         return groups
@@ -79,8 +93,17 @@ class AshAvatar:
         """Stages 3 and 4 on cached conditions; the base alone while the static warm-up lasts."""
         static = self.config.training.warmup == "static" and step < self.config.training.warmup_steps
         conditions = self._conditions_of(frame)
-        raw = self.module.decode(conditions, static=static)
-        return self.module.draw(self.module.pose(raw, conditions), cameras, background).rgb
+        raw = self._decode(conditions, static=static)
+        try:
+            return self.module.draw(self.module.pose(raw, conditions), cameras, background).rgb
+        except InputError as error:  # Cameras and background come from the capture: the Gaussians are at fault.
+            raise FloatingPointError(f"Gaussians that cannot be drawn ({error})") from error
+
+    def _decode(self, conditions: Conditions, *, static: bool = False) -> Tensor:
+        """Stage 3 as it learns, in the precision of the configuration."""
+        half = self.config.training.precision == "bfloat16"
+        with torch.autocast("cpu", torch.bfloat16, enabled=half):
+            return self.module.decode(conditions, static=static).float()
 
     def _conditions_of(self, frame: int) -> Conditions:
         """The template is frozen while ASH learns, so each training frame is posed once."""
@@ -93,10 +116,14 @@ class AshAvatar:
         """ASH Eq. 8: regress the decoders to known Gaussians before anything is rendered through them."""
         training = self.config.training
         if training.warmup == "analytic":
-            self._regress({frame: self.analytic for frame in images.frames})
+            self._regress(images.frames, self._released_target)
         elif training.warmup == "fitted":
             chosen = images.frames[:: max(1, len(images.frames) // FITTED_FRAMES)]
-            self._regress({frame: self._fit_frame(images, frame) for frame in chosen})
+            fitted = {frame: self._fit_frame(images, frame) for frame in chosen}
+            self._regress(chosen, fitted.__getitem__)
+
+    def _released_target(self, frame: int) -> Tensor:
+        return released_gaussians(self.config.model, self.analytic, self._conditions_of(frame))
 
     def _fit_frame(self, images: TrainingImages, frame: int) -> Tensor:
         """Pseudo ground truth of one frame: positions stay on the template, everything else is fitted to its views."""
@@ -113,17 +140,16 @@ class AshAvatar:
             optimiser.step()
         return torch.cat([torch.zeros_like(raw[:, :3]), raw[:, 3:]], 1).detach()
 
-    def _regress(self, targets: dict[int, Tensor]) -> None:
+    def _regress(self, frames: Sequence[int], target: Callable[[int], Tensor]) -> None:
         assert self.module.decoders is not None
         training = self.config.training
         optimiser = torch.optim.Adam(self.module.decoders.parameters(), lr=training.learning_rate, fused=True)
         weights = torch.ones(self.analytic.shape[1])
         weights[10] = WARMUP_OPACITY_WEIGHT
-        frames = list(targets)
         for step in range(training.warmup_steps):
             frame = frames[step % len(frames)]
-            raw = self.module.decode(self._conditions_of(frame))
-            loss = (weights * (raw - targets[frame]) ** 2).mean()
+            raw = self._decode(self._conditions_of(frame))
+            loss = (weights * (raw - target(frame)) ** 2).mean()
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
@@ -132,11 +158,21 @@ class AshAvatar:
     def render(self, motion: Motion, frame: int, camera: Camera, *, clock: StageClock) -> np.ndarray:
         """Premultiplied RGBA, float32 `[h, w, 4]`."""
         drawn = self.module(motion, frame, camera, clock)
-        return torch.cat([drawn.rgb[0], drawn.alpha[0, ..., None]], -1).clamp(0, 1).numpy()
+        image = torch.empty(camera.height, camera.width, 4)
+        image[..., :3], image[..., 3] = drawn.rgb[0], drawn.alpha[0]
+        return image.clamp_(0, 1).numpy()
 
     def template_vertices(self, motion: Motion, frame: int) -> np.ndarray:
         """The posed template, `[v, 3]` metres."""
-        return self.template.pose(motion, frame).vertices.numpy()
+        posed, refinement = self.template.pose(motion, frame), self.module.refinement
+        if refinement is None:
+            return posed.vertices.numpy()
+        with torch.no_grad():
+            return posed.transforms.apply(posed.canonical + refinement()).numpy()
+
+    def template_seconds(self) -> float | None:
+        """What learning the template took, once for all methods that stand on it; None where it was not learned."""
+        return None if self.template.learned is None else self.template.learned.seconds
 
     @torch.no_grad()
     def gaussian_means(self, motion: Motion, frame: int) -> np.ndarray:
@@ -159,8 +195,3 @@ class AshAvatar:
     def load(self, path: Path) -> None:
         """Read the weights that `save` wrote."""
         load_module(self.module, read_safetensors(path)[0], path)
-
-
-def template_of(kind: str, capture: Capture) -> Template:
-    """The template that a configuration names; "exact" reads the truth and is for oracles."""
-    return exact_template(capture, read_template_truth(capture)) if kind == "exact" else skinned_template(capture)

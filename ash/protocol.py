@@ -34,8 +34,8 @@ class Avatar(Protocol):
     `ash_bench.methods`. A preset is a budget: every method knows at least `ci` (seconds) and `cpu` (minutes), and
     raises ValueError for one it does not know. The capture handed to the factory and to `fit` holds training views
     and training motion only, unless the suite lists the method among its oracles. A training that diverged raises
-    FloatingPointError. `log.jsonl` holds one object per line; `seconds` with `train_psnr` (dB) or `loss` make the
-    training curve of the report.
+    FloatingPointError. `log.jsonl` holds one object per line; `seconds` with `train_psnr` (dB, foreground, of a few
+    training views that the method kept from itself) or `loss` make the training curve of the report.
     """
 
     def fit(self, capture: Capture, *, folder: Path) -> None:
@@ -66,3 +66,35 @@ class PosedGeometry(Protocol):
 
     def gaussian_means(self, motion: Motion, frame: int) -> np.ndarray:
         """Centres of the posed Gaussians, float `[n, 3]` metres; `[0, 3]` for a method without any."""
+
+
+@runtime_checkable
+class LearnsTemplate(Protocol):
+    """What an avatar may offer besides whose template is learned before it, in a job that methods share."""
+
+    def template_seconds(self) -> float | None:
+        """What the job took when it was done; None where the template was not learned."""
+
+
+@runtime_checkable
+class Drawn(Protocol):
+    """Whatever draws frames: an avatar, or its display."""
+
+    def render(self, motion: Motion, frame: int, camera: Camera, *, clock: StageClock) -> np.ndarray:
+        """As `Avatar.render`."""
+
+
+@runtime_checkable
+class Display(Drawn, Protocol):
+    """Draws an avatar as it would be shown, which may be another way than the one it was trained with."""
+
+    def close(self) -> None:
+        """Free what the display holds."""
+
+
+@runtime_checkable
+class Displayed(Protocol):
+    """What an avatar may offer besides: a display of its own, whose speed `ash-bench display` measures."""
+
+    def open_display(self) -> Display:
+        """Open the display, or raise an InputError that says what is missing on this machine."""

@@ -9,8 +9,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ash.dataset import Capture, Motion, Skeleton, TemplateMesh
+import ash.native.mesh
+from ash.dataset import Capture, Motion, Skeleton, TemplateMesh, require_pose
 from ash.files import InputError
+from ash.graph import EmbeddedGraph
 from ash.skinning import (
     RigidTransforms,
     SkinWeights,
@@ -68,21 +70,80 @@ class KnownDeformation:
         return transforms.apply_inverse(self.posed[frame])
 
 
+class PerturbedDeformation:
+    """A deformation with a planted error whose size is exactly known, to chart quality against template error.
+
+    The error is smooth over the surface, and half of its mean square is the same in all frames; the other half is
+    drawn anew for every frame, as the part of a learned template's error that no pose explains. In every frame its
+    root mean square over the vertices is `error_mm`, before and after posing, for posing is rigid per vertex.
+    """
+
+    LENGTH_M = 0.1  # Points nearer than this move alike.
+    WAVES = 64
+
+    def __init__(self, inner: Deformation, mesh: TemplateMesh, *, error_mm: float, seed: int) -> None:
+        self.inner, self.seed, self.amplitude = inner, seed, 1e-3 * error_mm
+        self.rest = mesh.vertices
+        self.static = _of_unit_rms(self._smooth_field(np.random.default_rng([seed, 0])))
+
+    def canonical(self, motion: Motion, frame: int, transforms: RigidTransforms) -> Float[Tensor, "v 3"]:
+        """The inner deformation's vertices, off by the planted error."""
+        return self.inner.canonical(motion, frame, transforms) + torch.from_numpy(self.error(frame)).float()
+
+    def error(self, frame: int) -> Float[np.ndarray, "v 3"]:
+        """The error of a frame, metres, canonical. The two parts are orthogonal, so that their squares add up."""
+        own = self._smooth_field(np.random.default_rng([self.seed, 1, frame]))
+        own -= self.static * (own * self.static).sum() / (self.static**2).sum()
+        return self.amplitude * np.sqrt(0.5) * (self.static + _of_unit_rms(own))
+
+    def _smooth_field(self, rng: np.random.Generator) -> Float[np.ndarray, "v 3"]:
+        """A Gaussian random field over space, by random Fourier features (Rahimi and Recht 2007)."""
+        waves = rng.standard_normal((3, self.WAVES)) / self.LENGTH_M
+        phases = rng.uniform(0, 2 * np.pi, self.WAVES)
+        return np.cos(self.rest @ waves + phases) @ rng.standard_normal((self.WAVES, 3))
+
+
+def _of_unit_rms(field: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
+    return field / np.sqrt((field**2).sum(1).mean())
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Learned:
+    """How a template was learned."""
+
+    seconds: float  # what it took, whenever that was
+    found: str  # what it settled on, in words
+
+
 class Template:
     """Poses the template mesh. The last few frames are kept: in playback, they are the next frame's history."""
 
     KEPT_FRAMES = 4
 
-    def __init__(self, mesh: TemplateMesh, skeleton: Skeleton, deformation: Deformation) -> None:
+    def __init__(
+        self,
+        mesh: TemplateMesh,
+        skeleton: Skeleton,
+        deformation: Deformation,
+        *,
+        through: EmbeddedGraph | None = None,
+    ) -> None:
+        """`through`: skin the nodes of this graph only, and blend their transforms, as the release does."""
         self.mesh = mesh
         self.skeleton = skeleton
         self.faces = torch.from_numpy(mesh.faces)
         self.skin: SkinWeights = sparse_skin_weights(torch.from_numpy(mesh.skin_weights).float())
+        self.links: SkinWeights | None = None
+        if through is not None:
+            self.skin = SkinWeights(joints=self.skin.joints[through.nodes], weights=self.skin.weights[through.nodes])
+            self.links = SkinWeights(joints=through.links, weights=through.weights)
         self.deformation = deformation
+        self.learned: Learned | None = None
         self._kept: OrderedDict[tuple[bytes, bytes], PosedTemplate] = OrderedDict()
 
     def pose(self, motion: Motion, frame: int) -> PosedTemplate:
         """The template in one frame of a motion."""
+        require_pose(motion, frame, self.skeleton)
         window = motion.window(frame, 5)
         key = (motion.dofs[window].tobytes(), np.int64(frame).tobytes())
         if key not in self._kept:
@@ -97,6 +158,8 @@ class Template:
         joints = forward_kinematics(self.skeleton, dofs)
         joints = RigidTransforms(quats=joints.quats.float(), translations=joints.translations.float())
         transforms = dual_quaternion_skinning(joints, self.skin)
+        if self.links is not None:
+            transforms = dual_quaternion_skinning(transforms, self.links)
         canonical = self.deformation.canonical(motion, frame, transforms)
         vertices = transforms.apply(canonical)
         return PosedTemplate(
@@ -108,7 +171,12 @@ class Template:
 
 
 def vertex_normals(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "v 3"]:
-    """Area-weighted mean of the adjacent face normals, unit length. A vertex without area gets the zero vector."""
+    """Area-weighted mean of the adjacent face normals, unit length. A vertex without area gets the zero vector.
+
+    By a native kernel where no gradient is needed.
+    """
+    if ash.native.mesh.takes(vertices):
+        return ash.native.mesh.vertex_normals(vertices, faces)
     a, b, c = vertices[faces].unbind(1)
     doubled_area = torch.linalg.cross(b - a, c - a)
     summed = torch.zeros_like(vertices).index_add_(0, faces.reshape(-1), doubled_area.repeat_interleave(3, 0))
@@ -120,6 +188,13 @@ def skinned_template(capture: Capture) -> Template:
     return Template(capture.template, capture.skeleton, RestDeformation(capture.template))
 
 
-def exact_template(capture: Capture, posed: Float[np.ndarray, "t v 3"]) -> Template:
-    """The oracle's template: `posed` vertices are exact in every frame of the capture's motion."""
-    return Template(capture.template, capture.skeleton, KnownDeformation(capture.motion, posed))
+def exact_template(
+    capture: Capture, posed: Float[np.ndarray, "t v 3"], *, error_mm: float = 0.0, seed: int = 0
+) -> Template:
+    """The oracle's template: `posed` vertices are exact in every frame of the capture's motion, or off by a planted
+    error of exactly `error_mm` (rms), which is a function of the seed and the frame."""
+    known = KnownDeformation(capture.motion, posed)
+    if error_mm == 0:
+        return Template(capture.template, capture.skeleton, known)
+    off = PerturbedDeformation(known, capture.template, error_mm=error_mm, seed=seed)
+    return Template(capture.template, capture.skeleton, off)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from ash.dataset import Motion, TemplateMesh
 from ash.files import InputError
@@ -15,9 +15,10 @@ from ash.skinning import (
     root_yaw,
     rotate,
     rotvec_to_unitquat,
+    unitquat_to_rotmat,
     unitquat_to_rotvec,
 )
-from ash.template import PosedTemplate, Template
+from ash.template import Template
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -35,23 +36,30 @@ class TexelLattice:
 
     def interpolate(self, values: Float[Tensor, "v c"]) -> Float[Tensor, "n c"]:
         """Eq. 4 for any per-vertex quantity."""
-        return (values[self.corners] * self.barycentric[..., None]).sum(1)
+        return self._blend(values, self.barycentric)
 
     def interpolate_transforms(self, transforms: RigidTransforms) -> RigidTransforms:
         """Per-texel transform T of Eq. 5: the dual quaternions of the three corners, blended.
 
         Signs are aligned with the corner of the largest weight, as in skinning.
         """
-        quats = transforms.quats[self.corners]
-        strongest = self.barycentric.argmax(1)[:, None, None].expand(-1, 1, 4)
-        aligned = torch.where((quats * quats.gather(1, strongest)).sum(-1) < 0, -self.barycentric, self.barycentric)
-        blended = (quats * aligned[..., None]).sum(1)
         # The dual part of (q, t) is t q / 2; blending it and multiplying by the conjugate of the blend gives the
         # translation.
-        moments = _dual_parts(quats, transforms.translations[self.corners])
-        moment = (moments * aligned[..., None]).sum(1)
-        length = blended.norm(dim=-1, keepdim=True)
-        return RigidTransforms(quats=blended / length, translations=_translation(blended / length, moment / length))
+        dual = torch.cat([transforms.quats, dual_parts(transforms.quats, transforms.translations)], -1)
+        blended = self._blend(dual, self._aligned_weights(transforms.quats))
+        blended = blended / blended[:, :4].norm(dim=-1, keepdim=True)
+        return RigidTransforms(quats=blended[:, :4], translations=_translation(blended[:, :4], blended[:, 4:]))
+
+    def _blend(self, values: Float[Tensor, "v c"], weights: Float[Tensor, "n 3"]) -> Float[Tensor, "n c"]:
+        # A bag is a gather and a weighted sum in one: ten times as fast as the two in turn.
+        return nn.functional.embedding_bag(self.corners, values, per_sample_weights=weights.to(values), mode="sum")
+
+    def _aligned_weights(self, quats: Float[Tensor, "v 4"]) -> Float[Tensor, "n 3"]:
+        """Barycentric weights, negative for a corner whose quaternion lies in the other hemisphere."""
+        corners = quats[self.corners]
+        strongest = self.barycentric.argmax(1)[:, None, None].expand(-1, 1, 4)
+        opposite = (corners * corners.gather(1, strongest)).sum(-1) < 0
+        return torch.where(opposite, -self.barycentric, self.barycentric)
 
     def to_texture(self, values: Float[Tensor, "n c"]) -> Float[Tensor, "c r r"]:
         """Scatter per-texel values into a texture that is zero elsewhere."""
@@ -64,7 +72,8 @@ class TexelLattice:
         return texture.flatten(1).T[self.texels]
 
 
-def _dual_parts(quats: Float[Tensor, "n k 4"], translations: Float[Tensor, "n k 3"]) -> Float[Tensor, "n k 4"]:
+def dual_parts(quats: Float[Tensor, "n 4"], translations: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
+    """Dual part t q / 2 of each rigid transform as a dual quaternion (q, t q / 2)."""
     w, u = quats[..., :1], quats[..., 1:]
     real = -(translations * u).sum(-1, keepdim=True)
     return 0.5 * torch.cat([real, w * translations + torch.linalg.cross(translations, u)], -1)
@@ -134,10 +143,13 @@ def motion_aware_textures(
     """
     dofs = torch.from_numpy(motion.dofs[frame]).float()
     root = dofs[:3] + torch.from_numpy(template.skeleton.heads[0]).float()
-    unturn = _about_y(-root_yaw(dofs) if yaw_normalise else torch.zeros(()))
     posed = [template.pose(motion, int(past)) for past in motion.window(frame, window)]
-    channels = torch.cat([_in_root_frame(p, root, unturn) for p in posed], dim=-1)
-    return lattice.to_texture(lattice.interpolate(channels))
+    vectors = torch.stack([v for p in posed for v in (p.normals, p.vertices - root)], 1)
+    # Interpolated first and turned then: a texture has fewer texels than the mesh has vertices.
+    texels = lattice.interpolate(vectors.flatten(1)).unflatten(1, (-1, 3))
+    if yaw_normalise:
+        texels = texels @ unitquat_to_rotmat(_about_y(root_yaw(dofs)))  # x R = R^T x: turned back
+    return lattice.to_texture(texels.flatten(1))
 
 
 @torch.no_grad()
@@ -152,9 +164,36 @@ def texture_statistics(textures: list[Float[Tensor, "c r r"]]) -> tuple[Float[Te
     return mean, deviations.square().mean((0, 2)).sqrt().clamp(min=1e-3)[:, None, None]
 
 
-def _in_root_frame(posed: PosedTemplate, root: Tensor, unturn: Tensor) -> Float[Tensor, "v 6"]:
-    turn = unturn.expand(len(posed.vertices), 4)
-    return torch.cat([rotate(turn, posed.normals), rotate(turn, posed.vertices - root)], dim=-1)
+class TextureDrawer(nn.Module):
+    """Stg.2 as a network sees it: the motion-aware textures of a frame, standardised if asked.
+
+    What is standardised is a deviation from the mean training texture, in units of its channel's spread (not in the
+    paper). Mean and spread are part of a checkpoint.
+    """
+
+    def __init__(self, lattice: TexelLattice, *, window: int, yaw_normalise: bool, standardise: bool) -> None:
+        super().__init__()
+        self.lattice, self.window, self.yaw_normalise, self.standardise = lattice, window, yaw_normalise, standardise
+        self.mean: Tensor
+        self.spread: Tensor
+        if standardise:
+            self.register_buffer("mean", torch.zeros(6 * window, lattice.resolution, lattice.resolution))
+            self.register_buffer("spread", torch.ones(6 * window, 1, 1))
+
+    def observe(self, template: Template, motion: Motion, frames: tuple[int, ...]) -> None:
+        """Take mean and spread from the frames of a training motion."""
+        if self.standardise:
+            self.mean, self.spread = texture_statistics([self._draw(template, motion, frame) for frame in frames])
+
+    def forward(self, template: Template, motion: Motion, frame: int) -> Float[Tensor, "c r r"]:
+        """The textures of a frame, `c = 6 window` channels."""
+        textures = self._draw(template, motion, frame)
+        return (textures - self.mean) / self.spread if self.standardise else textures
+
+    def _draw(self, template: Template, motion: Motion, frame: int) -> Float[Tensor, "c r r"]:
+        return motion_aware_textures(
+            template, self.lattice, motion, frame, window=self.window, yaw_normalise=self.yaw_normalise
+        )
 
 
 def _about_y(angle: Float[Tensor, ""]) -> Float[Tensor, " 4"]:

@@ -1,7 +1,8 @@
-"""Training the deformable template (Stg.1), before and apart from the avatar.
+"""Where the template's vertices lie in every training frame: what Stg.1 learns from, before and apart from the avatar.
 
-Supervision is either exact ("vertices": an oracle, correspondences known) or what a lab has ("chamfer": a surface
-per frame, no correspondences; UMA, the successor of ASH, states this loss).
+Supervision is exact ("vertices": an oracle, correspondences known), what a lab has ("chamfer": a surface per frame,
+no correspondences; UMA, the successor of ASH, states this loss), or nothing but the videos ("images", in
+`ash.image_tracking`).
 """
 
 from collections.abc import Callable
@@ -9,88 +10,125 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from ash.config import one_of
-from ash.dataset import Capture, read_surface_truth, read_template_truth
-from ash.deforming import LearnedDeformation
-from ash.files import InputError
-from ash.template import RestDeformation, Template
+from ash.dataset import Capture, read_scan, read_template_truth
+from ash.graph import NeighbourMean, vertex_neighbours
+from ash.skinning import RigidTransforms
+from ash.template import Template, vertex_normals
 
-SURFACE_POINTS = 6000
+RANGE_M = 0.1  # A surface point farther away than this is no match,
+ALIGNED = 0.7  # nor one whose normal differs by more than this cosine.
+POINTS = 5000  # Of a surface that look for their nearest vertex.
+SHARED_SWEEPS = (16, 4, 2)  # Smoothing of the correction that all frames share, pass by pass,
+SHARED_FRAMES = 16  # seen from some of them,
+OWN_SWEEPS = (8, 4, 2, 1)  # and then of each frame's own.
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class TrackingConfig:
-    """One frame per step, Adam with a linear decay."""
+class Tracked:
+    """The template in the training frames."""
 
-    supervision: str = "chamfer"
-    steps: int = 1500
-    learning_rate: float = 2e-3
-    smoothness: float = 0.1  # Weight of the Laplacian of the deformation, against squared millimetres.
+    frames: tuple[int, ...]
+    canonical: Float[Tensor, "t v 3"]  # metres, deformed but unposed
 
-    def __post_init__(self) -> None:
-        """Refuse an unknown supervision."""
-        one_of("supervision", self.supervision, ("vertices", "chamfer"))
-        if self.steps < 1:
-            raise InputError(f"tracking: expected at least one step, got {self.steps}")
+    @property
+    def shift(self) -> Float[Tensor, "t v 3"]:
+        """From the mean over the frames."""
+        return self.canonical - self.canonical.mean(0)
 
 
-Distance = Callable[[Tensor], Tensor]  # Posed vertices [v, 3], metres -> mean squared error, metres^2.
+Correction = Callable[[int, Tensor], tuple[Tensor, Tensor]]  # Frame, posed vertices -> shift [v, 3], weight [v].
 
 
-def track(deformation: LearnedDeformation, capture: Capture, config: TrackingConfig, *, seed: int) -> None:
-    """Fit the deformation to the training frames, in place."""
+def track_vertices(capture: Capture, template: Template) -> Tracked:
+    """The oracle: the true vertices, brought back to canonical space."""
     frames = capture.splits["train"].frames
-    distances = _distances(capture, config, seed)
-    windows = {frame: deformation.window_transforms(capture.motion, frame) for frame in frames}
-    skinned = Template(capture.template, capture.skeleton, RestDeformation(capture.template))
-    optimiser = torch.optim.Adam(deformation.parameters(), lr=config.learning_rate, fused=True)
-    for step in range(config.steps):
-        epoch, position = divmod(step, len(frames))
-        frame = frames[np.random.default_rng([seed, epoch]).permutation(len(frames))[position]]
-        for group in optimiser.param_groups:
-            group["lr"] = config.learning_rate * (1 - step / config.steps)
-        canonical = deformation.deform(windows[frame])
-        posed = skinned.pose(capture.motion, frame).transforms.apply(canonical)
-        loss = distances[frame](posed) + config.smoothness * _roughness(deformation, canonical)
-        optimiser.zero_grad()
-        (1e6 * loss).backward()  # type: ignore[no-untyped-call]
-        optimiser.step()
+    truth = torch.from_numpy(read_template_truth(capture)).float()
+    canonical = [template.pose(capture.motion, f).transforms.apply_inverse(truth[f]) for f in frames]
+    return Tracked(frames=frames, canonical=torch.stack(canonical))
 
 
-def _roughness(deformation: LearnedDeformation, canonical: Float[Tensor, "v 3"]) -> Tensor:
-    """Mean squared difference between a vertex's shift and the mean shift of its neighbours."""
-    shift = canonical - deformation.rest
-    return ((shift - deformation.graph.vertex_adjacency(shift)) ** 2).sum(1).mean()
+def track_chamfer(capture: Capture, template: Template) -> Tracked:
+    """Non-rigid registration to a surface per frame: both ways to the nearest point, along its normal.
+
+    Moving along the surface's normals alone leaves the vertices free to stay where skinning put them along it, which
+    is what nobody without correspondences can know. First one correction is found for all frames, then each frame's
+    own; corrections are smoothed over the template, less from pass to pass.
+    """
+    scans = {frame: _Scan(*read_scan(capture, frame)) for frame in capture.splits["train"].frames}
+
+    def towards_scan(frame: int, posed: Tensor) -> tuple[Tensor, Tensor]:
+        return scans[frame].correction(posed, vertex_normals(posed, template.faces))
+
+    return _register(capture, template, towards_scan)
 
 
-def _distances(capture: Capture, config: TrackingConfig, seed: int) -> dict[int, Distance]:
+def _register(capture: Capture, template: Template, correction: Correction) -> Tracked:
     frames = capture.splits["train"].frames
-    if config.supervision == "vertices":
-        truth = torch.from_numpy(read_template_truth(capture)).float()
-        return {frame: _to_vertices(truth[frame]) for frame in frames}
-    return {frame: _chamfer(read_surface_truth(capture, frame), seed) for frame in frames}
+    neighbours = vertex_neighbours(template.mesh)
+    transforms = {frame: template.pose(capture.motion, frame).transforms for frame in frames}
+    rest = torch.from_numpy(template.mesh.vertices).float()
+    canonical = rest.expand(len(frames), -1, -1).clone()
+    some = range(0, len(frames), -(-len(frames) // SHARED_FRAMES))
+    for sweeps in SHARED_SWEEPS:
+        found = [_in_canonical(transforms[frames[i]], canonical[i], frames[i], correction) for i in some]
+        shift, weight = (torch.stack(parts) for parts in zip(*found, strict=True))
+        total = weight.sum(0)
+        mean = (shift * weight[..., None]).sum(0) / total.clamp(min=1)[:, None]
+        canonical += smoothed(mean, total / len(some), neighbours, sweeps)
+    for sweeps in OWN_SWEEPS:
+        for index, frame in enumerate(frames):
+            shift, weight = _in_canonical(transforms[frame], canonical[index], frame, correction)
+            canonical[index] += smoothed(shift, weight, neighbours, sweeps)
+    return Tracked(frames=frames, canonical=canonical)
 
 
-def _to_vertices(truth: Float[Tensor, "v 3"]) -> Distance:
-    return lambda posed: ((posed - truth) ** 2).sum(1).mean()
+def _in_canonical(
+    transforms: RigidTransforms, canonical: Tensor, frame: int, correction: Correction
+) -> tuple[Tensor, Tensor]:
+    posed = transforms.apply(canonical)
+    shift, weight = correction(frame, posed)
+    return transforms.apply_inverse(posed + shift) - canonical, weight
 
 
-def _chamfer(surface: Float[np.ndarray, "s 3"], seed: int) -> Distance:
-    """Mean squared distance both ways; nearest points are found anew each time, and held while differentiating."""
-    chosen = np.random.default_rng(seed).choice(len(surface), min(SURFACE_POINTS, len(surface)), replace=False)
-    tree, points = cKDTree(surface), torch.from_numpy(surface).float()
+def smoothed(
+    shift: Float[Tensor, "v 3"], weight: Float[Tensor, " v"], neighbours: NeighbourMean, sweeps: int
+) -> Float[Tensor, "v 3"]:
+    """Weighted mean of the shifts around every vertex; what no weighted vertex is near stays where it is."""
+    both = torch.cat([shift * weight[:, None], weight[:, None]], 1)
+    for _ in range(sweeps):
+        both = 0.5 * (both + neighbours(both))
+    return both[:, :3] / both[:, 3:].clamp(min=0.05)
 
-    def distance(posed: Tensor) -> Tensor:
-        vertices = posed.detach().numpy()
-        to_surface = points[torch.from_numpy(tree.query(vertices)[1])]
-        to_template = posed[torch.from_numpy(cKDTree(vertices).query(surface[chosen])[1])]
-        return ((posed - to_surface) ** 2).sum(1).mean() + ((to_template - points[chosen]) ** 2).sum(1).mean()
 
-    return distance
+class _Scan:
+    """A surface of one frame, to look up the nearest points of."""
+
+    def __init__(self, vertices: Float[np.ndarray, "s 3"], faces: Int[np.ndarray, "f 3"]) -> None:
+        self.points = torch.from_numpy(vertices).float()
+        self.normals = vertex_normals(self.points, torch.from_numpy(faces))
+        self.tree = cKDTree(vertices)
+        self.few = torch.arange(0, len(vertices), max(1, len(vertices) // POINTS))
+
+    def correction(self, posed: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean shift along the normals of the scan, from each vertex' nearest point and from the points nearest to it;
+        and 1 where there is any, else 0."""
+        # A vertex without a point in range gets an infinite distance and a number beyond the last point.
+        distance, nearest = self.tree.query(posed.numpy(), distance_upper_bound=RANGE_M)
+        back, vertex = cKDTree(posed.numpy()).query(self.points[self.few].numpy())
+        vertices = torch.cat([torch.arange(len(posed)), torch.from_numpy(vertex)])
+        points = torch.cat([torch.from_numpy(nearest).clamp(max=len(self.points) - 1), self.few])
+        normal = self.normals[points]
+        matches = (torch.from_numpy(np.concatenate([distance, back])) < RANGE_M) & (
+            (normal * normals[vertices]).sum(1) > ALIGNED
+        )
+        shift = normal * ((self.points[points] - posed[vertices]) * normal).sum(1, keepdim=True)
+        total = torch.zeros_like(posed).index_add_(0, vertices[matches], shift[matches])
+        count = torch.zeros(len(posed)).index_add_(0, vertices, matches.float())
+        return total / count.clamp(min=1)[:, None], (count > 0).float()
 
 
 def template_error_mm(template: Template, capture: Capture, frames: tuple[int, ...]) -> Float[np.ndarray, "t v"]:

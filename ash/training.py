@@ -8,7 +8,7 @@ import math
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -26,6 +26,8 @@ from ash.losses import cache_target, l1_ssim_loss
 
 CROP_MARGIN = 12  # Pixels around the subject, so that a Gaussian that strays outside the mask is still seen.
 LOG_EVERY = 50
+RESERVED_VIEWS = 4  # Training views that no step sees: the training curve is drawn from them.
+CURVE = tuple(i / 32 for i in (1, 2, 4, 8, 12, 16, 20, 24, 28, 32))  # Shares of the steps after which they are drawn.
 FINAL_LEARNING_RATE = 0.02  # Of the initial one, at the end of the cosine.
 
 
@@ -49,7 +51,11 @@ class Trainable(Protocol):
         """Adam's groups, each with its own `lr`."""
 
     def draw_training_views(self, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
-        """Differentiable rgb `[c, h, w, 3]` over `background`, for cameras of one size."""
+        """Differentiable rgb `[c, h, w, 3]` over `background`, for cameras of one size.
+
+        Raises:
+            FloatingPointError: what the weights make cannot be drawn, because it holds NaN or infinity, say.
+        """
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -60,6 +66,7 @@ class TrainingImages:
     boxes: dict[tuple[str, int], tuple[int, int, int, int]]  # x0, y0, x1, y1 in pixels, half open
     cameras: dict[str, Camera]
     frames: tuple[int, ...]
+    reserved: tuple[tuple[str, int], ...] = ()  # views that no batch holds
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -93,7 +100,17 @@ def load_training_images(capture: Capture) -> TrainingImages:
         boxes=boxes,
         cameras={name: capture.cameras[name] for name in train.cameras},
         frames=tuple(train.frames),
+        reserved=reserved_views(tuple(train.cameras), tuple(train.frames)),
     )
+
+
+def reserved_views(cameras: tuple[str, ...], frames: tuple[int, ...]) -> tuple[tuple[str, int], ...]:
+    """A few views of different cameras in different frames; none where a step would then lack cameras."""
+    count = min(RESERVED_VIEWS, len(frames) // 2)
+    if len(cameras) < 3 or count == 0:
+        return ()
+    where = [(i * len(cameras) // count, i * len(frames) // count) for i in range(count)]
+    return tuple((cameras[camera], frames[frame]) for camera, frame in where)
 
 
 def draw_batch(images: TrainingImages, config: TrainingConfig, seed: int, step: int) -> Batch:
@@ -102,8 +119,9 @@ def draw_batch(images: TrainingImages, config: TrainingConfig, seed: int, step: 
     order = np.random.default_rng([seed, 1, epoch]).permutation(len(images.frames))
     frame = images.frames[order[position]]
     rng = np.random.default_rng([seed, 2, step])
-    count = min(config.views_per_step, len(images.cameras))
-    names = [list(images.cameras)[i] for i in rng.choice(len(images.cameras), count, replace=False)]
+    cameras = [name for name in images.cameras if (name, frame) not in images.reserved]
+    count = min(config.views_per_step, len(cameras))
+    names = [cameras[i] for i in rng.choice(len(cameras), count, replace=False)]
     colour = rng.random(3) if config.background == "random" else np.zeros(3)
     return cut_batch(images, frame, names, torch.from_numpy(colour).float())
 
@@ -153,22 +171,30 @@ def fit(
     `before_start` runs only when training starts afresh (warm-ups that do not render).
 
     Raises:
-        Diverged: a loss or gradient was not finite, again after one roll-back with half the learning rate.
+        Diverged: a loss, gradient or weight was not finite, again after one roll-back with half the learning rate.
         Interrupted: SIGTERM came; the checkpoint holds everything up to the last whole step.
     """
-    run = _Run(learner, config, folder)
+    if not config.crop:
+        whole = {
+            (name, frame): (0, 0, images.cameras[name].width, images.cameras[name].height)
+            for name, frame in images.boxes
+        }
+        images = replace(images, boxes=whole)
+    run = _Run(learner, config, images, folder)
     if not run.resume():
         before_start()
-        run.save()
+        run.average_afresh()
+        if not run.save():
+            raise Diverged("the warm-up left weights that are not finite")
     with _sigterm() as asked_to_stop:
-        while run.step < config.steps:
+        while run.step < config.steps or not run.save():  # What cannot be saved was rolled back: on from there.
             batch = draw_batch(images, config, seed, run.step)
             run.advance(batch)
             if asked_to_stop():
                 run.save()
                 raise Interrupted(f"stopped at step {run.step} of {config.steps}; run again to go on")
             run.save_if_due()
-    run.save()
+    run.finish()
 
 
 def view_loss(images: Float[Tensor, "c h w 3"], batch: Batch, config: TrainingConfig) -> Tensor:
@@ -183,55 +209,86 @@ def view_loss(images: Float[Tensor, "c h w 3"], batch: Batch, config: TrainingCo
 class _Run:
     """The state of one training: model, optimiser, step and elapsed seconds."""
 
-    def __init__(self, learner: Trainable, config: TrainingConfig, folder: Path) -> None:
-        self.learner, self.config = learner, config
+    def __init__(self, learner: Trainable, config: TrainingConfig, images: TrainingImages, folder: Path) -> None:
+        self.learner, self.config, self.images = learner, config, images
         groups = learner.parameter_groups()
         self.optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
         self.initial_rates = [group["lr"] for group in self.optimiser.param_groups]
         self.path, self.log = folder / "checkpoint.safetensors", folder / "log.jsonl"
         self.step, self.seconds, self.rate_scale = 0, 0.0, 1.0
+        self.curve_steps = {round(share * config.steps) for share in CURVE}
+        self.average: dict[str, Tensor] = {}
+        self.average_afresh()
         self.started = self.saved_at = time.monotonic()
+
+    def average_afresh(self) -> None:
+        """Let the average of the weights start from the weights as they are."""
+        if self.config.ema:
+            self.average = {name: value.detach().clone() for name, value in self.learner.module.named_parameters()}
 
     def advance(self, batch: Batch) -> None:
         """One step of Adam."""
-        fraction = self.step / self.config.steps
-        cosine = FINAL_LEARNING_RATE + (1 - FINAL_LEARNING_RATE) * 0.5 * (1 + math.cos(math.pi * fraction))
+        factor = self._schedule() * self.rate_scale
         for group, rate in zip(self.optimiser.param_groups, self.initial_rates, strict=True):
-            group["lr"] = rate * cosine * self.rate_scale
+            group["lr"] = rate * factor
         self.optimiser.zero_grad(set_to_none=True)
-        drawn = self.learner.draw_training_views(batch.frame, batch.cameras, batch.background, self.step)
+        try:
+            drawn = self.learner.draw_training_views(batch.frame, batch.cameras, batch.background, self.step)
+        except FloatingPointError as error:
+            self._roll_back(str(error))
+            return
         loss = view_loss(drawn, batch, self.config)
         loss.backward()  # type: ignore[no-untyped-call]
         if not self._finite(loss):
-            self._roll_back()
+            self._roll_back("loss or gradient not finite")
             return
         self.optimiser.step()
-        if self.step % LOG_EVERY == 0 or self.step + 1 == self.config.steps:
-            self._write_log(loss, drawn.detach(), batch)
+        for name, value in self.learner.module.named_parameters() if self.average else ():
+            # A short memory at first, so that the start is soon forgotten.
+            self.average[name].lerp_(value.detach(), 1 - min(self.config.ema, (1 + self.step) / (10 + self.step)))
         self.step += 1
+        if self.step % LOG_EVERY == 1 or self.step == self.config.steps or self.step in self.curve_steps:
+            self._write_log(loss)
+
+    def _schedule(self) -> float:
+        """The factor of the learning rates at this step."""
+        if self.config.schedule == "constant":
+            return 1.0
+        fraction = self.step / self.config.steps
+        return FINAL_LEARNING_RATE + (1 - FINAL_LEARNING_RATE) * 0.5 * (1 + math.cos(math.pi * fraction))
 
     def _finite(self, loss: Tensor) -> bool:
         gradients = [p.grad for group in self.optimiser.param_groups for p in group["params"] if p.grad is not None]
         return all(torch.isfinite(g.sum()) for g in [loss.detach(), *gradients])
 
-    def _roll_back(self) -> None:
+    def _roll_back(self, why: str) -> None:
         if self.rate_scale < 1:
-            raise Diverged(f"loss or gradient not finite at step {self.step}, again after a roll-back")
+            raise Diverged(f"{why} at step {self.step}, again after a roll-back")
         self.resume()
         self.rate_scale = 0.5
 
-    def _write_log(self, loss: Tensor, drawn: Tensor, batch: Batch) -> None:
-        inside = batch.foreground > 0.5
-        error = ((drawn.clamp(0, 1) - batch.targets)[inside] ** 2).mean()
-        row = {
-            "step": self.step,
-            "seconds": round(self._elapsed(), 3),
-            "loss": float(loss.detach()),
-            "train_psnr": float(-10 * torch.log10(error)),
-        }
+    def _write_log(self, loss: Tensor) -> None:
+        row = {"step": self.step, "seconds": round(self._elapsed(), 3), "loss": float(loss.detach())}
+        if self.step in self.curve_steps and self.images.reserved:
+            began = time.monotonic()
+            row["train_psnr"] = self._reserved_psnr()
+            self.started += time.monotonic() - began  # Looking is not training.
         self.log.parent.mkdir(parents=True, exist_ok=True)
         with self.log.open("a") as file:
             file.write(json.dumps(row) + "\n")
+
+    @torch.no_grad()
+    def _reserved_psnr(self) -> float:
+        """Foreground PSNR of the training views that no step sees, in dB, with the weights as they are."""
+        errors = []
+        for name, frame in self.images.reserved:
+            view = cut_batch(self.images, frame, [name], torch.zeros(3))
+            try:
+                drawn = self.learner.draw_training_views(frame, view.cameras, view.background, self.step)
+            except FloatingPointError:
+                return math.nan  # The next step meets the same, and deals with it.
+            errors.append((drawn.clamp(0, 1) - view.targets)[view.foreground > 0.5].square().flatten())
+        return float(-10 * torch.log10(torch.cat(errors).mean()))
 
     def _elapsed(self) -> float:
         return self.seconds + time.monotonic() - self.started
@@ -241,15 +298,27 @@ class _Run:
         if time.monotonic() - self.saved_at > self.config.checkpoint_seconds:
             self.save()
 
-    def save(self) -> None:
-        """Write the checkpoint atomically."""
+    def save(self) -> bool:
+        """Write the checkpoint atomically. False: the weights are not finite, and were rolled back instead."""
+        if not all(torch.isfinite(value).all() for value in self.learner.module.state_dict().values()):
+            if self.path.exists():
+                self._roll_back("weights not finite")
+            return False
         tensors = {f"model.{name}": value.contiguous() for name, value in self.learner.module.state_dict().items()}
         for index, state in self.optimiser.state_dict()["state"].items():
             for name, value in state.items():
                 tensors[f"adam.{index}.{name}"] = value.contiguous()
+        tensors |= {f"average.{name}": value.contiguous() for name, value in self.average.items()}
         facts = {"step": str(self.step), "seconds": repr(self._elapsed()), "rate_scale": repr(self.rate_scale)}
         write_atomic(self.path, safetensors.torch.save(tensors, metadata=facts))
         self.saved_at = time.monotonic()
+        return True
+
+    @torch.no_grad()
+    def finish(self) -> None:
+        """Give the model the averaged weights, if they were averaged; the checkpoint keeps both."""
+        for name, value in self.learner.module.named_parameters() if self.average else ():
+            value.copy_(self.average[name])
 
     def resume(self) -> bool:
         """Load the checkpoint, if there is one."""
@@ -267,6 +336,8 @@ class _Run:
                 state.setdefault(int(index), {})[key] = laid.detach()
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": state, "param_groups": groups})
+        for name, value in self.average.items():
+            value.copy_(tensors[f"average.{name}"])
         self.step, self.seconds = int(facts["step"]), float(facts["seconds"])
         self.rate_scale = float(facts["rate_scale"])
         self.started = time.monotonic()

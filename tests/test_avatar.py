@@ -6,7 +6,7 @@ import torch
 from captures import known_model, tube_model_config
 from figures import front_camera, tube_mesh, tube_motion, tube_skeleton
 
-from ash.avatar import AshModel, split_raw
+from ash.avatar import AshModel
 from ash.config import AshConfig, ModelConfig, TrainingConfig
 from ash.decoders import Decoders
 from ash.files import InputError
@@ -15,6 +15,7 @@ from ash.initialising import blank_gaussians, texel_pitch
 from ash.protocol import StageClock
 from ash.skinning import rotate, unitquat_to_rotmat
 from ash.template import RestDeformation, Template
+from ash.texels import split_raw
 from ash.textures import build_lattice
 
 
@@ -139,7 +140,7 @@ def test_rotated_normals_reach_the_conditions():
     ("changes", "message"),
     [
         ({"texels": 50}, "multiple of shuffle 1 times 2"),
-        ({"norm": "batch"}, "norm: expected one of instance, none"),
+        ({"norm": "batch"}, "norm: expected one of none, batch-as-released, instance"),
         ({"sh_degree": 4}, "sh_degree: expected 0 to 3"),
         ({"motion": False, "base": False}, "motion=False needs base=True"),
     ],

@@ -4,9 +4,10 @@ import torch
 from figures import tube_mesh, tube_motion, tube_skeleton
 from scipy.spatial.transform import Rotation
 
-from ash.deforming import DeformationConfig, LearnedDeformation
+from ash.config import TemplateConfig
 from ash.files import InputError
 from ash.graph import LINKS, build_graph, embedded_deformation, euler_to_rotmat
+from ash.graph_nets import GraphDeformation, GraphNet
 from ash.skinning import RigidTransforms
 
 
@@ -70,9 +71,10 @@ def test_too_few_or_too_many_nodes_are_refused():
             build_graph(tube_mesh(), nodes=nodes)
 
 
-def learned() -> LearnedDeformation:
+def learned(**changes) -> GraphDeformation:
     torch.manual_seed(0)
-    deformation = LearnedDeformation(DeformationConfig(nodes=30, width=8, blocks=1), tube_mesh(), tube_skeleton())
+    config = TemplateConfig(network="graph", window=3, **({"nodes": 30, "width": 8, "blocks": 1} | changes))
+    deformation = GraphDeformation(config, tube_mesh(), tube_skeleton())
     for net in (deformation.graph_net, deformation.displacement_net):
         torch.nn.init.normal_(net.head.weight, std=0.1)
     return deformation
@@ -99,3 +101,28 @@ def test_learned_deformation_sees_the_past():
     unused = RigidTransforms(quats=torch.zeros(0, 4), translations=torch.zeros(0, 3))
     assert not torch.allclose(deformation.canonical(motion, 4, unused), deformation.canonical(changed, 4, unused))
     torch.testing.assert_close(deformation.canonical(motion, 1, unused), deformation.canonical(changed, 1, unused))
+
+
+def test_weights_per_node_tell_nodes_apart_that_shared_weights_cannot(graph):
+    """Equal inputs at all nodes: shared weights give equal outputs, weights per node do not."""
+    equal = torch.ones(len(graph.nodes), 4)
+    for weights, differs in (("shared", False), ("per-node", True)):
+        torch.manual_seed(0)
+        net = GraphNet(4, 2, TemplateConfig(width=6, blocks=1, weights=weights), nodes=len(graph.nodes))
+        torch.nn.init.normal_(net.head.weight)
+        out = net(equal, graph.adjacency)
+        assert (out.std(0).max() > 1e-3) == differs
+
+
+def test_the_dense_layer_alone_carries_news_across_the_whole_mesh(graph):
+    """One block reaches three hops; what a node says farther away can only come through the full matrix."""
+    for dense in (False, True):
+        torch.manual_seed(0)
+        net = GraphNet(3, 3, TemplateConfig(width=4, blocks=1), nodes=len(rest()), dense=dense)
+        torch.nn.init.normal_(net.head.weight)
+        if net.across is not None:
+            torch.nn.init.normal_(net.across.weight)
+        x = rest().clone()
+        before = net(x, graph.vertex_adjacency)
+        x[0] += 1.0  # The lowest ring; the highest is eight edges away.
+        assert (not torch.equal(net(x, graph.vertex_adjacency)[-1], before[-1])) == dense

@@ -7,7 +7,13 @@ from scipy.spatial.transform import Rotation
 from ash.dataset import Motion
 from ash.skinning import RigidTransforms, rotvec_to_unitquat
 from ash.template import RestDeformation, Template
-from ash.textures import build_lattice, motion_aware_textures, normalised_motion, texture_statistics
+from ash.textures import (
+    TextureDrawer,
+    build_lattice,
+    motion_aware_textures,
+    normalised_motion,
+    texture_statistics,
+)
 
 RESOLUTION = 16
 
@@ -128,3 +134,17 @@ def test_statistics_are_of_the_motion_not_of_the_body(template):
     standardised = torch.stack([lattice.from_texture((texture - mean) / deviation) for texture in drawn])
     torch.testing.assert_close(standardised.mean(0), torch.zeros_like(standardised[0]), atol=1e-4, rtol=0)
     torch.testing.assert_close(standardised.square().mean((0, 1)).sqrt(), torch.ones(12), atol=1e-3, rtol=0)
+
+
+def test_a_standardised_drawer_is_restored_by_its_checkpoint(template):
+    motion, lattice = tube_motion(), build_lattice(tube_mesh(), RESOLUTION)
+    plain, seen, restored = (
+        TextureDrawer(lattice, window=2, yaw_normalise=True, standardise=standardise)
+        for standardise in (False, True, True)
+    )
+    seen.observe(template, motion, (0, 1, 2, 3))
+    restored.load_state_dict(seen.state_dict())
+    assert torch.equal(restored(template, motion, 5), seen(template, motion, 5))
+    mean, spread = texture_statistics([plain(template, motion, frame) for frame in (0, 1, 2, 3)])
+    assert torch.equal(seen(template, motion, 5), (plain(template, motion, 5) - mean) / spread)
+    assert not plain.state_dict()

@@ -53,30 +53,73 @@ def test_known_gaussians_are_recovered_from_their_images(capture, tmp_path):
     assert psnr(avatar, capture, "novel_view") > before + 12
     assert psnr(avatar, capture, "novel_pose") > before + 12
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert rows[-1]["step"] == 299
-    assert rows[-1]["train_psnr"] > rows[0]["train_psnr"] + 10
+    assert rows[-1]["step"] == 300
+    assert rows[-1]["loss"] < 0.5 * rows[0]["loss"]
+    curve = [row["train_psnr"] for row in rows if "train_psnr" in row]
+    assert len(curve) == 10
+    assert curve[-1] > curve[0] + 1
 
 
-def test_a_run_stopped_anywhere_ends_with_the_same_bits(capture, tmp_path):
-    undisturbed = AshAvatar(config(), capture)
+def stop_before_end_of(avatar: AshAvatar, step: int) -> None:
+    """Send SIGTERM while the given step is drawn."""
+    draw = avatar.draw_training_views
+
+    def draw_then_signal(frame, cameras, background, at):
+        if at == step:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return draw(frame, cameras, background, at)
+
+    avatar.draw_training_views = draw_then_signal
+
+
+def test_a_run_stopped_at_ten_random_steps_ends_with_the_same_bits(capture, tmp_path):
+    settings = config(steps=24, ema=0.9)
+    undisturbed = AshAvatar(settings, capture)
     undisturbed.fit(capture, folder=tmp_path / "whole")
-    for stop in (1, 5, 11):  # In the warm-up, after it, and at the last step.
-        folder = tmp_path / f"stopped{stop}"
-        first = AshAvatar(config(), capture)
-        draw = first.draw_training_views
+    stops = sorted(np.random.default_rng(5).choice(24, 10, replace=False))
+    for stop in stops:
+        avatar = AshAvatar(settings, capture)
+        stop_before_end_of(avatar, int(stop))
+        with pytest.raises(Interrupted, match=f"stopped at step {stop}|{stop + 1} of 24"):
+            avatar.fit(capture, folder=tmp_path / "stopped")
+    again = AshAvatar(settings, capture)
+    again.fit(capture, folder=tmp_path / "stopped")
+    for name, value in weights(undisturbed).items():
+        assert torch.equal(weights(again)[name], value), name
+    once_more = AshAvatar(settings, capture)
+    once_more.fit(capture, folder=tmp_path / "stopped")
+    assert torch.equal(weights(once_more)["base"], weights(undisturbed)["base"])
 
-        def draw_then_signal(frame, cameras, background, step, draw=draw, stop=stop):
-            if step == stop:
-                os.kill(os.getpid(), signal.SIGTERM)
-            return draw(frame, cameras, background, step)
 
-        first.draw_training_views = draw_then_signal
-        with pytest.raises(Interrupted, match=f"stopped at step {stop + 1} of 12"):
-            first.fit(capture, folder=folder)
-        again = AshAvatar(config(), capture)
-        again.fit(capture, folder=folder)
-        for name, value in weights(undisturbed).items():
-            assert torch.equal(weights(again)[name], value), name
+def test_the_average_of_the_weights_is_the_result_and_nothing_else_changes(capture, tmp_path):
+    last, averaged = AshAvatar(config(), capture), AshAvatar(config(ema=0.5), capture)
+    passed = []
+    draw = last.draw_training_views
+
+    def draw_and_keep(*arguments):
+        if arguments[-1] == len(passed):  # The curve's views are drawn besides.
+            passed.append(last.module.base.detach().clone())
+        return draw(*arguments)
+
+    last.draw_training_views = draw_and_keep
+    last.fit(capture, folder=tmp_path / "last")
+    averaged.fit(capture, folder=tmp_path / "averaged")
+    expected = passed[0]
+    for step, base in enumerate([*passed[1:12], last.module.base.detach()]):
+        decay = min(0.5, (1 + step) / (10 + step))
+        expected = decay * expected + (1 - decay) * base
+    torch.testing.assert_close(averaged.module.base.detach(), expected, atol=1e-5, rtol=1e-5)
+    assert not torch.equal(averaged.module.base, last.module.base)
+
+
+def test_reserved_views_are_never_trained_on(capture):
+    images = load_training_images(capture.training_only())
+    assert len(images.reserved) == 2
+    for step in range(64):
+        batch = draw_batch(images, replace(config().training, views_per_step=4), 0, step)
+        seen = {(camera.name, batch.frame) for camera in batch.cameras}
+        assert not seen & set(images.reserved)
+        assert len(seen) == 4 - sum(frame == batch.frame for _, frame in images.reserved)
 
 
 def test_equal_seeds_give_equal_bits_and_other_seeds_do_not(capture, tmp_path):
@@ -106,6 +149,53 @@ def test_nan_rolls_back_once_and_then_ends_the_run(capture, tmp_path):
     spoiled.clear()
     with pytest.raises(Diverged, match="step 6"):
         avatar.fit(capture, folder=tmp_path / "always")
+
+
+def poison(avatar: AshAvatar, *, at: set[int], times: int) -> None:
+    """Spoil a weight before the given steps are drawn, `times` times in all."""
+    draw, left = avatar.draw_training_views, [times]
+
+    def draw_poisoned(frame, cameras, background, step):
+        if step in at and left[0] > 0:
+            left[0] -= 1
+            with torch.no_grad():
+                avatar.module.base[0, 3] = float("nan")
+        return draw(frame, cameras, background, step)
+
+    avatar.draw_training_views = draw_poisoned
+
+
+def test_a_weight_that_is_nan_rolls_back_once_and_then_ends_the_run_as_diverged(capture, tmp_path):
+    """The splatter refuses such Gaussians as wrong input; the run must not end as that."""
+    avatar = AshAvatar(config(), capture)
+    poison(avatar, at={7}, times=1)
+    avatar.fit(capture, folder=tmp_path / "once")
+    assert all(torch.isfinite(value).all() for value in weights(avatar).values())
+    avatar = AshAvatar(config(), capture)
+    poison(avatar, at={7}, times=2)
+    with pytest.raises(Diverged, match=r"Gaussians that cannot be drawn \(scales.*at step 7, again"):
+        avatar.fit(capture, folder=tmp_path / "always")
+
+
+@pytest.mark.parametrize("spoiled", [{12}, {12, 24}])
+def test_weights_that_the_last_step_spoiled_are_never_the_result(capture, tmp_path, monkeypatch, spoiled):
+    avatar, made, step = AshAvatar(config(), capture), [0], torch.optim.Adam.step
+
+    def spoil(optimiser, *arguments):
+        step(optimiser, *arguments)
+        made[0] += 1
+        if made[0] in spoiled:
+            with torch.no_grad():
+                avatar.module.base[0, 3] = float("nan")
+
+    monkeypatch.setattr(torch.optim.Adam, "step", spoil)
+    if len(spoiled) == 2:
+        with pytest.raises(Diverged, match="weights not finite at step 12, again"):
+            avatar.fit(capture, folder=tmp_path)
+    else:
+        avatar.fit(capture, folder=tmp_path)
+        assert made[0] == 24
+        assert all(torch.isfinite(value).all() for value in weights(avatar).values())
 
 
 def test_a_damaged_checkpoint_is_named(capture, tmp_path):
