@@ -36,6 +36,11 @@ def res_512(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
     return _ash(replace(config, model=replace(config.model, texels=config.model.texels * 2)), capture, seed)
 
 
+def ash_frugal(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
+    """ASH with the preset `frugal`, whatever the others have: what lightness costs."""
+    return _ash(named("frugal"), capture, seed)
+
+
 def cams_12(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
     """w/ 12.cam: a tenth of the rig."""
     return _with_cameras(capture, seed, preset, 12)

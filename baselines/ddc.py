@@ -6,7 +6,7 @@ pixel sees; only the texture (and the light) is learned here, through perspectiv
 antialiased coverage.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,23 +16,25 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ash.avatar import LIGHT_COEFFICIENTS
-from ash.config import AshConfig, ModelConfig, TrainingConfig
+from ash.config import AshConfig, ModelConfig, TemplateConfig, TrainingConfig
 from ash.dataset import Camera, Capture, Motion, TemplateMesh
 from ash.decoders import UNet
+from ash.drawing import draw_mesh, textured, topology_of
 from ash.files import write_atomic
-from ash.harmonics import sh_basis
-from ash.initialising import mean_colours
-from ash.method import template_of
+from ash.initialising import initial_texture
 from ash.presets import named
-from ash.protocol import StageClock
-from ash.rasterizing import project_vertices, rasterize_mesh
+from ash.protocol import Display, StageClock
+from ash.refining import Refinement
 from ash.template import PosedTemplate, Template
-from ash.textures import TexelLattice, build_lattice, motion_aware_textures, texture_statistics
+from ash.templates import template_of
+from ash.texels import LIGHT_COEFFICIENTS
+from ash.textures import TextureDrawer, build_lattice
 from ash.training import fit, load_module, load_training_images, read_safetensors
 
-TEXTURE_FACTOR = 2  # Texture pixels per Gaussian of ASH's lattice, per side: the mesh must not be starved.
-SUPERSAMPLING = 2  # Rays per pixel side: antialiased coverage and texture.
+# Texture pixels per Gaussian of ASH's lattice, per side: the mesh must not be starved. At 256x256 a body's pixel is
+# 9 mm wide, twice 256 texels are 3 mm apart and more shows nothing; at full size pixels of 2.5 mm ask for four times.
+TEXTURE_FACTOR = 2
+TEXTURE_FACTORS = {"paper": 4, "official": 4}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -49,11 +51,12 @@ class DdcConfig:
     standardise: bool
     light: bool
     training: TrainingConfig
-    template: str
+    template: TemplateConfig
+    refine: bool  # let images move the vertices; an exact surface has nothing to gain
     seed: int
 
 
-def ddc_config(ash: AshConfig, *, seed: int, template: str) -> DdcConfig:
+def ddc_config(ash: AshConfig, *, seed: int, template: TemplateConfig) -> DdcConfig:
     """DDC with the budget and the conditions of an ASH preset."""
     model: ModelConfig = ash.model
     return DdcConfig(
@@ -68,6 +71,7 @@ def ddc_config(ash: AshConfig, *, seed: int, template: str) -> DdcConfig:
         light=model.light,
         training=ash.training,
         template=template,
+        refine=template.kind != "exact" or template.error_mm > 0,
         seed=seed,
     )
 
@@ -76,14 +80,16 @@ class DdcModel(nn.Module):
     """A static texture plus a residual that is predicted from the motion-aware textures."""
 
     def __init__(
-        self, config: DdcConfig, mesh: TemplateMesh, template: Template, lattice: TexelLattice, initial: Tensor
+        self, config: DdcConfig, mesh: TemplateMesh, template: Template, textures: TextureDrawer, initial: Tensor
     ) -> None:
         """`initial`: texture to start from, `[3, R, R]`."""
         super().__init__()
-        self.config, self.template, self.lattice = config, template, lattice
+        self.config, self.template, self.textures = config, template, textures
         self.uv_faces = torch.from_numpy(mesh.uv_faces)
         self.uvs = torch.from_numpy(mesh.uvs).float()
+        self.topology = topology_of(template.faces)
         self.texture = nn.Parameter(initial.clone())
+        self.refinement = Refinement(mesh) if config.refine else None
         self.network = UNet(
             6 * config.window,
             3 * (config.texture // config.texels) ** 2,
@@ -92,29 +98,6 @@ class DdcModel(nn.Module):
             norm=config.norm,
         )
         self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.light else None
-        self.register_buffer("texture_mean", torch.zeros(6 * config.window, config.texels, config.texels))
-        self.register_buffer("texture_deviation", torch.ones(6 * config.window, 1, 1))
-
-    def observe(self, motion: Motion, frames: tuple[int, ...]) -> None:
-        """Take the statistics of the textures that `standardise` refers to, from training frames."""
-        if self.config.standardise:
-            drawn = [self._raw_conditions(motion, frame) for frame in frames]
-            self.texture_mean, self.texture_deviation = texture_statistics(drawn)
-
-    def conditions(self, motion: Motion, frame: int) -> Float[Tensor, "c r r"]:
-        """The motion-aware textures of a frame, as the network sees them."""
-        textures = self._raw_conditions(motion, frame)
-        return (textures - self.texture_mean) / self.texture_deviation
-
-    def _raw_conditions(self, motion: Motion, frame: int) -> Float[Tensor, "c r r"]:
-        return motion_aware_textures(
-            self.template,
-            self.lattice,
-            motion,
-            frame,
-            window=self.config.window,
-            yaw_normalise=self.config.yaw_normalise,
-        )
 
     def dynamic_texture(self, conditions: Float[Tensor, "c r r"]) -> Float[Tensor, "3 t t"]:
         """The texture of a frame: decoded at the resolution of the motion-aware textures and shuffled up."""
@@ -125,32 +108,20 @@ class DdcModel(nn.Module):
     def draw(
         self, texture: Float[Tensor, "3 t t"], posed: PosedTemplate, camera: Camera, background: Tensor
     ) -> Float[Tensor, "h w 4"]:
-        """Rasterise: rgb over `background`, and coverage. Differentiable in the texture and the light."""
-        width, height = camera.width * SUPERSAMPLING, camera.height * SUPERSAMPLING
-        viewmat, K = torch.from_numpy(camera.viewmat).float(), torch.from_numpy(camera.K).float()
-        K = torch.diag(torch.tensor([float(SUPERSAMPLING), float(SUPERSAMPLING), 1.0])) @ K
-        drawn = rasterize_mesh(
-            project_vertices(posed.vertices, viewmat, K), self.template.faces, width=width, height=height
-        )
-        covered = (drawn.triangle.reshape(-1) >= 0).nonzero().squeeze(1)
-        triangles = drawn.triangle.reshape(-1)[covered].long()
-        barycentric = drawn.barycentric.reshape(-1, 3)[covered][..., None]
-        uvs = (self.uvs[self.uv_faces[triangles]] * barycentric).sum(1)
-        colours = sample_texture(texture, uvs)
-        if self.light is not None:
-            normals = (posed.normals[self.template.faces[triangles]] * barycentric).sum(1)
-            colours = colours * (sh_basis(nn.functional.normalize(normals, dim=-1), 2) @ self.light).exp()
-        over = torch.cat([background, background.new_zeros(1)]).expand(height * width, 4)
-        image = over.index_put((covered,), torch.cat([colours, torch.ones_like(colours[:, :1])], 1))
-        image = image.reshape(camera.height, SUPERSAMPLING, camera.width, SUPERSAMPLING, 4)
-        return image.mean((1, 3))
+        """Rgb over `background`, and coverage. Differentiable in the texture, the light and the posed vertices.
 
+        Outlines are blended while vertices learn, for the gradient's sake; what is shown counts samples.
+        """
+        shade = textured(texture, self.uvs, self.uv_faces, posed.normals, self.template.faces, self.light)
+        learns = posed.vertices.requires_grad
+        return draw_mesh(posed.vertices, self.topology, camera, shade, background, outlines=learns)
 
-def sample_texture(texture: Float[Tensor, "c t s"], uvs: Float[Tensor, "n 2"]) -> Float[Tensor, "n c"]:
-    """Bilinear samples at UVs in [0, 1], v up; differentiable in the texture and the UVs."""
-    grid = torch.stack([2 * uvs[:, 0] - 1, 1 - 2 * uvs[:, 1]], -1)[None, None]
-    sampled = nn.functional.grid_sample(texture[None], grid, padding_mode="border", align_corners=False)
-    return sampled[0, :, 0].T
+    def refined(self, posed: PosedTemplate) -> PosedTemplate:
+        """The template with its vertices where the images moved them. The light keeps the normals that it had."""
+        if self.refinement is None:
+            return posed
+        canonical = posed.canonical + self.refinement()
+        return replace(posed, canonical=canonical, vertices=posed.transforms.apply(canonical))
 
 
 class DdcAvatar:
@@ -159,13 +130,16 @@ class DdcAvatar:
     def __init__(self, config: DdcConfig, capture: Capture) -> None:
         torch.manual_seed(config.seed)
         self.config = config
-        self.template = template_of(config.template, capture)
-        fine = build_lattice(capture.template, config.texture)
-        colours = mean_colours(capture, self.template, fine)
-        initial = fine.to_texture(colours - colours.mean(0)) + colours.mean(0)[:, None, None]
-        lattice = build_lattice(capture.template, config.texels)
-        self.module = DdcModel(config, capture.template, self.template, lattice, initial)
-        self.module.observe(capture.motion, capture.splits["train"].frames)
+        self.template = template_of(config.template, capture, seed=config.seed)
+        initial = initial_texture(capture, self.template, build_lattice(capture.template, config.texture))
+        textures = TextureDrawer(
+            build_lattice(capture.template, config.texels),
+            window=config.window,
+            yaw_normalise=config.yaw_normalise,
+            standardise=config.standardise,
+        )
+        textures.observe(self.template, capture.motion, capture.splits["train"].frames)
+        self.module = DdcModel(config, capture.template, self.template, textures, initial)
         self._motion = capture.motion
         self._conditions: dict[int, Tensor] = {}  # The template is frozen: each training frame is posed once.
         self._posed: dict[int, PosedTemplate] = {}
@@ -179,35 +153,56 @@ class DdcAvatar:
         """The network, and the texture with the light, as ASH's decoders and base."""
         training = self.config.training
         static = [self.module.texture] + ([self.module.light] if self.module.light is not None else [])
+        moves = list(self.module.refinement.parameters()) if self.module.refinement is not None else []
         return [
             {"params": list(self.module.network.parameters()), "lr": training.learning_rate},
-            {"params": static, "lr": training.base_learning_rate},
+            {"params": static + moves, "lr": training.base_learning_rate},
         ]
 
     def draw_training_views(self, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
         """The texture of the frame, drawn into each camera; the static texture alone while the warm-up lasts."""
         if frame not in self._posed:
             self._posed[frame] = self.template.pose(self._motion, frame)
-            self._conditions[frame] = self.module.conditions(self._motion, frame)
+            self._conditions[frame] = self.module.textures(self.template, self._motion, frame)
         static = self.config.training.warmup == "static" and step < self.config.training.warmup_steps
         texture = self.module.texture if static else self.module.dynamic_texture(self._conditions[frame])
-        return torch.stack([self.module.draw(texture, self._posed[frame], c, background)[..., :3] for c in cameras])
+        posed = self.module.refined(self._posed[frame])
+        return torch.stack([self.module.draw(texture, posed, c, background)[..., :3] for c in cameras])
 
     @torch.no_grad()
     def render(self, motion: Motion, frame: int, camera: Camera, *, clock: StageClock) -> np.ndarray:
         """Premultiplied RGBA, float32 `[h, w, 4]`."""
-        with clock.stage("stg1"):
-            posed = self.template.pose(motion, frame)
-        with clock.stage("stg2"):
-            conditions = self.module.conditions(motion, frame)
-        with clock.stage("stg3"):
-            texture = self.module.dynamic_texture(conditions)
+        posed, texture = self.dress(motion, frame, clock)
         with clock.stage("stg4"):
             return self.module.draw(texture, posed, camera, torch.zeros(3)).clamp(0, 1).numpy()
 
+    @torch.no_grad()
+    def dress(self, motion: Motion, frame: int, clock: StageClock) -> tuple[PosedTemplate, Float[Tensor, "3 t t"]]:
+        """The posed template of a frame and its texture: everything but the picture.
+
+        Training may leave negative colours between texels; no display knows those, and held-out views are better
+        without them.
+        """
+        with clock.stage("stg1"):
+            posed = self.module.refined(self.template.pose(motion, frame))
+        with clock.stage("stg2"):
+            conditions = self.module.textures(self.template, motion, frame)
+        with clock.stage("stg3"):
+            return posed, self.module.dynamic_texture(conditions).clamp(min=0)
+
+    def open_display(self) -> Display:
+        """OpenGL's picture of the avatar, as it would be shown."""
+        from baselines.display import DdcDisplay
+
+        return DdcDisplay(self)
+
     def template_vertices(self, motion: Motion, frame: int) -> np.ndarray:
         """The posed template, `[v, 3]` metres."""
-        return self.template.pose(motion, frame).vertices.numpy()
+        return self.module.refined(self.template.pose(motion, frame)).vertices.detach().numpy()
+
+    def template_seconds(self) -> float | None:
+        """What learning the template took, once for all methods that stand on it; None where it was not learned."""
+        return None if self.template.learned is None else self.template.learned.seconds
 
     def gaussian_means(self, motion: Motion, frame: int) -> np.ndarray:
         """A mesh has none."""
@@ -232,9 +227,12 @@ class DdcAvatar:
 
 def ddc(capture: Capture, *, seed: int, preset: str) -> DdcAvatar:
     """The mesh baseline on the template that ASH gets."""
-    return DdcAvatar(ddc_config(named(preset), seed=seed, template="skinned"), capture)
+    config = named(preset)
+    mesh = ddc_config(config, seed=seed, template=config.template)
+    texture = TEXTURE_FACTORS.get(preset, TEXTURE_FACTOR) * config.model.texels
+    return DdcAvatar(replace(mesh, texture=texture), capture)
 
 
 def ddc_truth(capture: Capture, *, seed: int, preset: str) -> DdcAvatar:
     """The mesh baseline on the exact surface: an oracle, to see when a mesh wins."""
-    return DdcAvatar(ddc_config(named(preset), seed=seed, template="exact"), capture)
+    return DdcAvatar(ddc_config(named(preset), seed=seed, template=TemplateConfig(kind="exact")), capture)

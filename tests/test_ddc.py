@@ -7,11 +7,13 @@ import torch
 from captures import write_tube_capture
 from figures import front_camera, tube_motion
 
+from ash.config import TemplateConfig
 from ash.dataset import image_path, load_capture
+from ash.drawing import SUPERSAMPLING, sample_texture
 from ash.files import write_image
 from ash.presets import named
 from ash.protocol import StageClock
-from baselines.ddc import SUPERSAMPLING, DdcAvatar, ddc_config, sample_texture
+from baselines.ddc import DdcAvatar, ddc_config
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +25,9 @@ def avatar(capture, *, steps: int = 120) -> DdcAvatar:
     ash = named("ci")
     small = replace(ash.model, texels=16, width=4, levels=2, window=2)
     training = replace(ash.training, steps=steps, warmup_steps=steps // 2)
-    return DdcAvatar(ddc_config(replace(ash, model=small, training=training), seed=0, template="skinned"), capture)
+    return DdcAvatar(
+        ddc_config(replace(ash, model=small, training=training), seed=0, template=TemplateConfig()), capture
+    )
 
 
 def test_samples_hit_texture_pixels_where_the_atlas_says():

@@ -1,0 +1,141 @@
+"""A trained mesh avatar drawn in real time by OpenGL (pyrender, off-screen): how the mesh baseline is displayed.
+
+The same picture as the training renderer's (`baselines.ddc`): bilinear texture samples at the centres of half pixels,
+averaged. The light, which depends on the normal alone, travels as vertex colours.
+"""
+
+import os
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from ash.dataset import Camera, Motion
+from ash.drawing import SUPERSAMPLING
+from ash.files import InputError
+from ash.harmonics import sh_basis
+from ash.protocol import StageClock
+from ash.template import PosedTemplate
+from baselines.ddc import DdcAvatar
+
+NEAR, FAR = 0.1, 50.0  # metres
+TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # Our cameras look along +z with y down, OpenGL's along -z with y up.
+LINEAR, CLAMP_TO_EDGE = 9729, 33071  # OpenGL's names for: bilinear without mipmaps; the border's texels go on.
+
+
+def pyrender_or_refuse() -> Any:
+    """Import pyrender for drawing without a screen.
+
+    `PYOPENGL_PLATFORM` is read when OpenGL is first imported; without it pyrender would look for a screen.
+
+    Raises:
+        InputError: a system library is missing, or the platform draws on screens only.
+    """
+    platform = os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
+    if platform not in ("egl", "osmesa"):
+        raise InputError(f"PYOPENGL_PLATFORM: expected egl or osmesa to draw without a screen, got {platform!r}")
+    try:
+        import pyrender
+    except Exception as error:  # Missing libraries show as ImportError, AttributeError and others.
+        raise InputError(f"pyrender cannot be imported ({type(error).__name__}: {error})") from error
+    return pyrender
+
+
+def _one_sample_renderer(pyrender: Any) -> Any:
+    """An off-screen renderer that looks at the centre of each pixel, as the training renderer does.
+
+    pyrender always asks for four samples per pixel, which costs twice the time and moves silhouettes; here its
+    multisampled buffers are allocated again with one.
+    """
+    from OpenGL import GL
+    from pyrender.renderer import Renderer
+
+    class OneSample(Renderer):  # type: ignore[misc]
+        def _configure_main_framebuffer(self) -> None:
+            known = self._main_fb_dims
+            super()._configure_main_framebuffer()
+            if self._main_fb_dims == known:
+                return
+            formats = ((self._main_cb_ms, GL.GL_RGBA), (self._main_db_ms, GL.GL_DEPTH_COMPONENT24))
+            for buffer, kind in formats:
+                GL.glBindRenderbuffer(GL.GL_RENDERBUFFER, buffer)
+                GL.glRenderbufferStorage(GL.GL_RENDERBUFFER, kind, self.viewport_width, self.viewport_height)
+
+    class OffScreen(pyrender.OffscreenRenderer):  # type: ignore[misc, name-defined]
+        def _create(self) -> None:
+            super()._create()
+            self._renderer.delete()  # type: ignore[has-type]
+            self._renderer = OneSample(self.viewport_width, self.viewport_height)
+
+    return OffScreen(64, 64)
+
+
+class DdcDisplay:
+    """Draws a DDC avatar. Has `render` as an avatar has, so that it is timed and compared in the same way."""
+
+    def __init__(self, avatar: DdcAvatar) -> None:
+        """Open an OpenGL context.
+
+        Raises:
+            InputError: there is no off-screen OpenGL here.
+        """
+        self.avatar = avatar
+        self.pyrender = pyrender_or_refuse()
+        try:
+            self.renderer = _one_sample_renderer(self.pyrender)
+        except Exception as error:
+            raise InputError(f"no off-screen OpenGL here ({type(error).__name__}: {error})") from error
+        module = avatar.module
+        # OpenGL knows one UV per vertex: vertices at seams are listed once per UV.
+        pairs = torch.stack([module.template.faces.reshape(-1), module.uv_faces.reshape(-1)], 1)
+        corners, index = torch.unique(pairs, dim=0, return_inverse=True)
+        self.vertex, self.uvs = corners[:, 0], module.uvs[corners[:, 1]].numpy()
+        self.faces = index.reshape(-1, 3).numpy()
+
+    def close(self) -> None:
+        """Free the OpenGL context."""
+        self.renderer.delete()
+
+    @torch.no_grad()
+    def render(self, motion: Motion, frame: int, camera: Camera, *, clock: StageClock) -> np.ndarray:
+        """Premultiplied RGBA, float32 `[h, w, 4]`, as the avatar's own `render`."""
+        posed, texture = self.avatar.dress(motion, frame, clock)
+        with clock.stage("stg4"):
+            return self._draw(posed, texture, camera)
+
+    def _draw(self, posed: PosedTemplate, texture: torch.Tensor, camera: Camera) -> Float[np.ndarray, "h w 4"]:
+        # Texels are stored in eight bits between 0 and 1; what exceeds 1 is scaled down, and up again with the light.
+        scale = texture.max().clamp(min=1.0)
+        material = self._material((texture / scale).clamp(0, 1))
+        light = torch.ones_like(posed.normals)
+        if self.avatar.module.light is not None:
+            light = (sh_basis(posed.normals, 2) @ self.avatar.module.light).exp()
+        colours = torch.cat([scale * light, torch.ones_like(light[:, :1])], 1)
+        primitive = self.pyrender.Primitive(
+            positions=posed.vertices[self.vertex].numpy(),
+            texcoord_0=self.uvs,
+            color_0=colours[self.vertex].numpy(),
+            indices=self.faces,
+            material=material,
+            mode=4,  # triangles
+        )
+        scene = self.pyrender.Scene(bg_color=np.zeros(4))
+        scene.add(self.pyrender.Mesh([primitive]))
+        K = camera.K * SUPERSAMPLING
+        eye = self.pyrender.IntrinsicsCamera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], znear=NEAR, zfar=FAR)
+        scene.add(eye, pose=np.linalg.inv(camera.viewmat) @ TO_OPENGL)
+        self.renderer.viewport_width = camera.width * SUPERSAMPLING
+        self.renderer.viewport_height = camera.height * SUPERSAMPLING
+        flags = self.pyrender.RenderFlags
+        drawn, _ = self.renderer.render(scene, flags.FLAT | flags.RGBA | flags.SKIP_CULL_FACES)
+        # Sums of strided views are ten times as fast as a mean over two axes.
+        steps = range(SUPERSAMPLING)
+        total = sum(drawn[y::SUPERSAMPLING, x::SUPERSAMPLING].astype(np.uint16) for y in steps for x in steps)
+        return np.asarray(total, np.float32) / np.float32(255 * SUPERSAMPLING**2)
+
+    def _material(self, texture: torch.Tensor) -> Any:
+        pixels = (255 * texture).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
+        sampler = self.pyrender.Sampler(magFilter=LINEAR, minFilter=LINEAR, wrapS=CLAMP_TO_EDGE, wrapT=CLAMP_TO_EDGE)
+        image = self.pyrender.Texture(sampler=sampler, source=pixels, source_channels="RGB")
+        return self.pyrender.MetallicRoughnessMaterial(baseColorTexture=image, baseColorFactor=np.ones(4))

@@ -1,0 +1,29 @@
+"""ASH and DDC on the exact surface with a planted error of 2 to 16 mm rms: what the margin between them depends on.
+
+Both get the same wrong surface in one seed. Zero is `ash_truth` and `ddc_truth`.
+"""
+
+from dataclasses import replace
+from functools import partial
+
+from ash.config import TemplateConfig
+from ash.dataset import Capture
+from ash.method import AshAvatar
+from ash.presets import named
+from baselines.ddc import DdcAvatar, ddc_config
+
+
+def ash_off(capture: Capture, *, seed: int, preset: str, error_mm: float) -> AshAvatar:
+    """ASH on a template that is wrong by `error_mm`."""
+    template = TemplateConfig(kind="exact", error_mm=error_mm)
+    return AshAvatar(replace(named(preset), seed=seed, template=template), capture)
+
+
+def ddc_off(capture: Capture, *, seed: int, preset: str, error_mm: float) -> DdcAvatar:
+    """DDC on a template that is wrong by `error_mm`."""
+    template = TemplateConfig(kind="exact", error_mm=error_mm)
+    return DdcAvatar(ddc_config(named(preset), seed=seed, template=template), capture)
+
+
+ash_2mm, ash_4mm, ash_8mm, ash_16mm = (partial(ash_off, error_mm=mm) for mm in (2.0, 4.0, 8.0, 16.0))
+ddc_2mm, ddc_4mm, ddc_8mm, ddc_16mm = (partial(ddc_off, error_mm=mm) for mm in (2.0, 4.0, 8.0, 16.0))
