@@ -6,6 +6,7 @@ A cell lives in a folder of its own, named by the hash of what went in:
     log.jsonl       the method's training log, one object per line
     output.log      what the process printed
     model.safetensors, checkpoints of the method
+    input/          the training part of the capture, all that the method sees; only while it runs
     images/SPLIT/CAM/FRAME.png   predictions, RGBA uint8, colour on black: `rescore` reads them
     result.json     what came out; written last, atomically: where it exists, the cell is finished
 """
@@ -33,6 +34,8 @@ class CellConfig:
     preset: str
     seed: int
     code: str  # SHA-256 over the sources that decide the outcome
+    axis: str = ""  # the stress axis along which the capture is spoilt; none: the clean capture
+    severity: float = 0.0
     protocol: str = PROTOCOL
 
     @property
@@ -41,9 +44,14 @@ class CellConfig:
         return hash_of(asdict(self))[:16]
 
     @property
+    def place(self) -> str:
+        """The scene, and how its capture is spoilt."""
+        return f"{self.scene} {self.axis}={self.severity:g}" if self.axis else self.scene
+
+    @property
     def title(self) -> str:
         """For progress lines and errors."""
-        return f"{self.scene} · {self.method} · seed {self.seed}"
+        return f"{self.place} · {self.method} · seed {self.seed}"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

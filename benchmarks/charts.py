@@ -92,11 +92,11 @@ def scatter(panels: Sequence[Panel], *, x_title: str, y_title: str, width: float
         parts.append(_real_time(x, y))
         parts.append(_points(panel, x, y))
         if panel.note:
-            parts.append(_text(start + each, top - 16, panel.note, anchor="end", kind="dim"))
-        parts.append(_text(start + each / 2, height - 12, x_title, anchor="middle", kind="dim"))
+            parts.append(text_at(start + each, top - 16, panel.note, anchor="end", kind="dim"))
+        parts.append(text_at(start + each / 2, height - 12, x_title, anchor="middle", kind="dim"))
     middle = (top + height - bottom) / 2
-    turned = f'transform="rotate(-90 16 {_n(middle)})"'
-    parts.append(_text(16.0, middle, y_title, anchor="middle", kind="dim", extra=turned))
+    turned = f'transform="rotate(-90 16 {short(middle)})"'
+    parts.append(text_at(16.0, middle, y_title, anchor="middle", kind="dim", extra=turned))
     return document("".join(parts), width=width, height=height, title=f"{y_title} against {x_title}")
 
 
@@ -111,18 +111,18 @@ def curves(lines: Sequence[Line], *, x_title: str, y_title: str, width: float = 
     parts = [_frame("", x, y, y_labels=True)]
     ends = _apart([y.at(line.points[-1][1]) for line in drawn], 15.0, top, height - bottom)
     for line, end in zip(drawn, ends, strict=True):
-        path = " ".join(f"{_n(x.at(px))},{_n(y.at(py))}" for px, py in line.points)
+        path = " ".join(f"{short(x.at(px))},{short(y.at(py))}" for px, py in line.points)
         dash = ' stroke-dasharray="5 3"' if line.dashed else ""
         title = f"<title>{escape(line.label)}: {line.points[-1][1]:.2f} after {line.points[-1][0]:.0f} s</title>"
         stroke = f'stroke="{line.colour}" stroke-width="1.8" fill="none" stroke-linejoin="round"{dash}'
         parts.append(f'<polyline points="{path}" {stroke}>{title}</polyline>')
         tip_x, tip_y = x.at(line.points[-1][0]), y.at(line.points[-1][1])
-        parts.append(f'<circle cx="{_n(tip_x)}" cy="{_n(tip_y)}" r="3" fill="{line.colour}"/>')
-        parts.append(_text(width - right + 10, end + 4, line.label, colour=line.colour))
-    parts.append(_text((left + width - right) / 2, height - 10, x_title, anchor="middle", kind="dim"))
+        parts.append(f'<circle cx="{short(tip_x)}" cy="{short(tip_y)}" r="3" fill="{line.colour}"/>')
+        parts.append(text_at(width - right + 10, end + 4, line.label, colour=line.colour))
+    parts.append(text_at((left + width - right) / 2, height - 10, x_title, anchor="middle", kind="dim"))
     middle = (top + height - bottom) / 2
-    turned = f'transform="rotate(-90 16 {_n(middle)})"'
-    parts.append(_text(16.0, middle, y_title, anchor="middle", kind="dim", extra=turned))
+    turned = f'transform="rotate(-90 16 {short(middle)})"'
+    parts.append(text_at(16.0, middle, y_title, anchor="middle", kind="dim", extra=turned))
     return document("".join(parts), width=width, height=height, title=f"{y_title} over {x_title}")
 
 
@@ -135,18 +135,18 @@ def bars(rows: Sequence[Bar], names: Sequence[str], colours: Sequence[str], *, u
     scale = (width - left - right) / max(sum(row.parts) for row in rows)
     parts, at = [], left
     for name, colour in zip(names, colours, strict=True):
-        parts.append(f'<rect x="{_n(at)}" y="10" width="12" height="12" rx="2" fill="{colour}"/>')
-        parts.append(_text(at + 17, 20.0, name, kind="dim"))
+        parts.append(f'<rect x="{short(at)}" y="10" width="12" height="12" rx="2" fill="{colour}"/>')
+        parts.append(text_at(at + 17, 20.0, name, kind="dim"))
         at += 34 + 6.6 * len(name)
     for index, row in enumerate(rows):
         y, at = top + index * step, left
-        parts.append(_text(left - 10, y + 15, row.label, anchor="end"))
+        parts.append(text_at(left - 10, y + 15, row.label, anchor="end"))
         for name, colour, value in zip(names, colours, row.parts, strict=True):
             title = f"<title>{escape(row.label)}, {escape(name)}: {value:.2f} {unit}</title>"
-            box = f'x="{_n(at)}" y="{_n(y)}" width="{_n(value * scale)}" height="20"'
+            box = f'x="{short(at)}" y="{short(y)}" width="{short(value * scale)}" height="20"'
             parts.append(f'<rect {box} fill="{colour}">{title}</rect>')
             at += value * scale
-        parts.append(_text(at + 6, y + 15, f"{sum(row.parts):.1f} {unit}", kind="dim"))
+        parts.append(text_at(at + 6, y + 15, f"{sum(row.parts):.1f} {unit}", kind="dim"))
     return document("".join(parts), width=width, height=height, title="time per stage")
 
 
@@ -233,13 +233,14 @@ def _points(panel: Panel, x: Axis, y: Axis) -> str:
     for a, b in panel.links:
         (x1, y1), (x2, y2) = anchors[a], anchors[b]
         dashes = f'stroke="{panel.points[a].colour}" stroke-width="1.2" stroke-dasharray="3 3" opacity="0.75"'
-        parts.append(f'<line x1="{_n(x1)}" y1="{_n(y1)}" x2="{_n(x2)}" y2="{_n(y2)}" {dashes}/>')
+        parts.append(f'<line x1="{short(x1)}" y1="{short(y1)}" x2="{short(x2)}" y2="{short(y2)}" {dashes}/>')
     whiskers = []
     for point, (px, _) in zip(panel.points, anchors, strict=True):
         if point.low is not None and point.high is not None:
             low, high = y.at(point.low), y.at(point.high)
+            caps = f"M{short(px - 4)} {short(low)}h8M{short(px - 4)} {short(high)}h8"
             parts.append(
-                f'<path d="M{_n(px)} {_n(low)}V{_n(high)}M{_n(px - 4)} {_n(low)}h8M{_n(px - 4)} {_n(high)}h8" '
+                f'<path d="M{short(px)} {short(low)}V{short(high)}{caps}" '
                 f'stroke="{point.colour}" stroke-width="1.3" fill="none"/>'
             )
             whiskers.append((px - 4, min(low, high), px + 4, max(low, high)))
@@ -248,12 +249,12 @@ def _points(panel: Panel, x: Axis, y: Axis) -> str:
         title = f"<title>{escape(point.label)}: {point.y:.2f} at {point.x:.1f} ms</title>"
         if point.ringed:
             ring = f'stroke="{point.colour}" stroke-width="1.4" fill="none"'
-            parts.append(f'<circle class="ring" cx="{_n(px)}" cy="{_n(py)}" r="9.5" {ring}/>')
-        parts.append(f'<circle cx="{_n(px)}" cy="{_n(py)}" r="5.5" {ink}>{title}</circle>')
+            parts.append(f'<circle class="ring" cx="{short(px)}" cy="{short(py)}" r="9.5" {ring}/>')
+        parts.append(f'<circle cx="{short(px)}" cy="{short(py)}" r="5.5" {ink}>{title}</circle>')
     widths = [text_width(point.label) for point in panel.points]
     box = (x.start, y.end, x.end, y.start)
     for point, place in zip(panel.points, place_labels(anchors, widths, box, whiskers), strict=True):
-        parts.append(_text(*place, point.label, colour=point.colour, kind="halo"))
+        parts.append(text_at(*place, point.label, colour=point.colour, kind="halo"))
     return "".join(parts)
 
 
@@ -261,24 +262,26 @@ def _front(anchors: Sequence[tuple[float, float]], x: Axis, y: Axis) -> str:
     """The staircase above which no method lies, from the cheapest member to the right edge."""
     if not anchors:
         return ""
-    path = f"M{_n(anchors[0][0])} {_n(y.start)}"
+    path = f"M{short(anchors[0][0])} {short(y.start)}"
     for px, py in anchors:
-        path += f"H{_n(px)}V{_n(py)}"
-    return f'<path class="front" d="{path}H{_n(x.end)}" fill="none" stroke-width="1"/>'
+        path += f"H{short(px)}V{short(py)}"
+    return f'<path class="front" d="{path}H{short(x.end)}" fill="none" stroke-width="1"/>'
 
 
 def _frame(title: str, x: Axis, y: Axis, *, y_labels: bool) -> str:
-    parts = [_text(x.start, y.end - 16, title, kind="head")] if title else []
+    parts = [text_at(x.start, y.end - 16, title, kind="head")] if title else []
     for tick in y.ticks:
-        at = _n(y.at(tick))
-        parts.append(f'<line class="grid" x1="{_n(x.start)}" x2="{_n(x.end)}" y1="{at}" y2="{at}"/>')
+        at = short(y.at(tick))
+        parts.append(f'<line class="grid" x1="{short(x.start)}" x2="{short(x.end)}" y1="{at}" y2="{at}"/>')
         if y_labels:
-            parts.append(_text(x.start - 7, y.at(tick) + 4, _tick(tick), anchor="end", kind="dim"))
+            parts.append(text_at(x.start - 7, y.at(tick) + 4, _tick(tick), anchor="end", kind="dim"))
     for tick in x.ticks:
-        at = _n(x.at(tick))
-        parts.append(f'<line class="grid" x1="{at}" x2="{at}" y1="{_n(y.start)}" y2="{_n(y.end)}"/>')
-        parts.append(_text(x.at(tick), y.start + 16, _tick(tick), anchor="middle", kind="dim"))
-    parts.append(f'<line class="axis" x1="{_n(x.start)}" x2="{_n(x.end)}" y1="{_n(y.start)}" y2="{_n(y.start)}"/>')
+        at = short(x.at(tick))
+        parts.append(f'<line class="grid" x1="{at}" x2="{at}" y1="{short(y.start)}" y2="{short(y.end)}"/>')
+        parts.append(text_at(x.at(tick), y.start + 16, _tick(tick), anchor="middle", kind="dim"))
+    parts.append(
+        f'<line class="axis" x1="{short(x.start)}" x2="{short(x.end)}" y1="{short(y.start)}" y2="{short(y.start)}"/>'
+    )
     return "".join(parts)
 
 
@@ -287,9 +290,9 @@ def _real_time(x: Axis, y: Axis) -> str:
     frame_ms = 1e3 / 30
     if not x.low < frame_ms < x.high:
         return ""
-    at = _n(x.at(frame_ms))
-    line = f'<line class="axis" stroke-dasharray="2 4" x1="{at}" x2="{at}" y1="{_n(y.start)}" y2="{_n(y.end)}"/>'
-    return line + _text(x.at(frame_ms) + 5, y.start - 7, "30 frames/s", kind="dim")
+    at = short(x.at(frame_ms))
+    line = f'<line class="axis" stroke-dasharray="2 4" x1="{at}" x2="{at}" y1="{short(y.start)}" y2="{short(y.end)}"/>'
+    return line + text_at(x.at(frame_ms) + 5, y.start - 7, "30 frames/s", kind="dim")
 
 
 def _apart(wanted: Sequence[float], gap: float, low: float, high: float) -> list[float]:
@@ -312,12 +315,13 @@ def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float,
     return max(0.0, min(a[2], b[2]) - max(a[0], b[0])) * max(0.0, min(a[3], b[3]) - max(a[1], b[1]))
 
 
-def _text(
+def text_at(
     x: float, y: float, text: str, *, anchor: str = "start", kind: str = "", colour: str = "", extra: str = ""
 ) -> str:
+    """A text element; `kind` is a class of the style sheet."""
     kinds = f' class="{kind}"' if kind else ""
     fill = f' style="fill:{colour}"' if colour else ""
-    where = f'x="{_n(x)}" y="{_n(y)}" text-anchor="{anchor}"'
+    where = f'x="{short(x)}" y="{short(y)}" text-anchor="{anchor}"'
     return f"<text {where}{kinds}{fill}{' ' + extra if extra else ''}>{escape(text)}</text>"
 
 
@@ -325,5 +329,6 @@ def _tick(value: float) -> str:
     return f"{value:g}"
 
 
-def _n(value: float) -> str:
+def short(value: float) -> str:
+    """A coordinate with no more digits than a screen shows."""
     return f"{value:.1f}".rstrip("0").rstrip(".")

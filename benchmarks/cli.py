@@ -8,10 +8,13 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
 from ash.files import InputError
+from benchmarks import method_verbs
+from benchmarks.capture_verbs import add_verbs
 from benchmarks.errors import disk_problem
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -135,6 +138,16 @@ def gate(arguments: argparse.Namespace) -> int:
     return DONE if all(check.verdict == "pass" for check in checks) else FAILED
 
 
+def gate_rates(arguments: argparse.Namespace) -> int:
+    """Measure how far the gate can be trusted."""
+    from benchmarks.provenance import cores
+    from benchmarks.trust import markdown, measure
+
+    found = measure(arguments.out, arguments.data, reruns=arguments.reruns, workers=arguments.workers or cores())
+    print(markdown(found))
+    return DONE
+
+
 def merge(arguments: argparse.Namespace) -> int:
     """Put the cells of shards together and report."""
     from benchmarks.merge import merge_runs
@@ -179,40 +192,15 @@ def rescore(arguments: argparse.Namespace) -> int:
     return _again(arguments.run, rescore_cell)
 
 
-def synth(arguments: argparse.Namespace) -> int:
-    """Render a capture."""
-    from benchmarks.experiments import CaptureSpec
-    from benchmarks.provenance import cores
-    from benchmarks.runs import make_capture_in
-
-    spec = CaptureSpec(scene=arguments.scene, size=arguments.size, seed=arguments.seed)
-    folder = arguments.out or Path("data") / spec.name
-    make_capture_in(spec, folder, workers=arguments.workers or cores())
-    print(folder)
-    return DONE
-
-
-def verify(arguments: argparse.Namespace) -> int:
-    """Hash every file of a capture again."""
-    from ash.dataset import read_manifest, verify_capture
-
-    manifest = read_manifest(arguments.folder)
-    problems = verify_capture(arguments.folder)
-    if not manifest["complete"]:
-        problems.append("the capture is unfinished")
-    for problem in problems:
-        print(f"{arguments.folder}: {problem}", file=sys.stderr)
-    if problems:
-        return WRONG_INPUT
-    print(f"{arguments.folder}: {len(manifest['files'])} files, all as the manifest says")
-    return DONE
-
-
 def speed(arguments: argparse.Namespace) -> int:
     """Time the kernels or whole frames."""
+    if arguments.what == "frame":
+        from benchmarks.speed_frame import main as measure_frames
+
+        return measure_frames(arguments.json)
     from benchmarks.speed import main as measure
 
-    return measure(arguments.what, arguments.json) or DONE
+    return measure(arguments.what, arguments.json)
 
 
 def doctor(arguments: argparse.Namespace) -> int:
@@ -226,6 +214,8 @@ def doctor(arguments: argparse.Namespace) -> int:
 
 def test(arguments: argparse.Namespace) -> int:
     """Every check that CI runs, on the checkout."""
+    from benchmarks.provenance import cores
+
     root = Path(__file__).parent.parent
     if not (root / "tests").is_dir() or not (root / "pyproject.toml").is_file():
         raise InputError(f"{root}: expected a checkout with tests/; an installed package has none")
@@ -235,7 +225,7 @@ def test(arguments: argparse.Namespace) -> int:
         "ruff format": [*module, "ruff", "format", "--check", "."],
         "import-linter": [sys.executable, "-c", "from importlinter.cli import lint_imports_command as f; f()"],
         "mypy": [*module, "mypy"],
-        "pytest": [*module, "pytest", *arguments.pytest],
+        "pytest": [*module, "pytest", "-n", str(cores()), "--dist", "loadfile", *arguments.pytest],
     }
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     failed = []
@@ -253,14 +243,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     verbs = parser.add_subparsers(metavar="VERB", required=True)
     _add_run(verbs)
-    verb = _verb(verbs, synth, "synth", "render the ground truth of a scene into a capture folder")
-    verb.add_argument("scene", metavar="SCENE")
-    verb.add_argument("--size", default="quick", help="size of the capture (default: %(default)s)")
-    verb.add_argument("--out", type=Path, metavar="DIR", help="default: data/SCENE-SIZE-SEED")
-    verb.add_argument("--seed", type=_natural, default=0, help="root seed of the scene (default: %(default)s)")
-    verb.add_argument("--workers", type=_positive, metavar="N", help="processes (default: all cores)")
-    verb = _verb(verbs, verify, "verify", "hash every file of a capture again")
-    verb.add_argument("folder", type=Path, metavar="DIR")
+    add_verbs(partial(_verb, verbs), natural=_natural, positive=_positive)
     verb = _verb(verbs, train, "train", "train and evaluate one method on one capture")
     verb.add_argument("method", metavar="METHOD")
     verb.add_argument("capture", type=Path, metavar="CAPTURE")
@@ -278,6 +261,7 @@ def _parser() -> argparse.ArgumentParser:
     verb = _verb(verbs, merge, "merge", "put the cells of shards together and report")
     verb.add_argument("shards", type=Path, metavar="RUN", nargs="+")
     verb.add_argument("--out", type=Path, metavar="DIR", required=True)
+    method_verbs.add_verbs(partial(_verb, verbs), positive=_positive)
     verb = _verb(verbs, speed, "speed", "time the kernels, or whole frames by stage, beside their definitions")
     verb.add_argument("what", choices=("kernels", "frame"))
     verb.add_argument("--json", type=Path, metavar="FILE", help="write the rows there as well")
@@ -331,6 +315,11 @@ def _add_gate(verbs: Any) -> None:
     verb.add_argument("--markdown", type=Path, metavar="FILE", help="write the summary there, for a pull request")
     verb.add_argument("--junit", type=Path, metavar="FILE", help="write the checks there as JUnit")
     verb.add_argument("--update-baseline", action="store_true", help="make the run the new baseline")
+    verb = _verb(verbs, gate_rates, "gate-rates", "measure the gate's false alarms and the planted defects it catches")
+    verb.add_argument("--reruns", type=_natural, default=20, metavar="N", help="unchanged runs (default: %(default)s)")
+    verb.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/gate-rates"), help="default: %(default)s")
+    verb.add_argument("--data", type=Path, metavar="DIR", default=Path("data"), help="where captures are kept")
+    verb.add_argument("--workers", type=_positive, metavar="N", help="default: one per core")
 
 
 def _verb(verbs: Any, function: Callable[[argparse.Namespace], int], name: str, about: str) -> argparse.ArgumentParser:

@@ -48,6 +48,15 @@ class Failure:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class Ending:
+    """How a watched process ended: by itself, for exceeding a limit, or at somebody's wish."""
+
+    exit_code: int
+    failure: Failure | None = None
+    interrupted: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class Plan:
     """Cells of a run: those to do, and those with a result. `reasons` says why a cell must run again."""
 
@@ -124,17 +133,22 @@ def run_in_process(folder: str, limits: Limits) -> str:
     cell = read_cell(Path(folder))
     for path in cell.folder.rglob(".*.*"):  # What a killed process left half-written.
         path.unlink(missing_ok=True)
+    command = [sys.executable, "-m", "benchmarks.run", str(cell.folder), "--follow-parent"]
+    ending = watched_process(command, cell.folder / "output.log", limits)
+    shutil.rmtree(cell.folder / "input", ignore_errors=True)  # Left there by a method that was ended.
+    if ending.interrupted:
+        return "interrupted"
+    return _outcome(cell, ending, limits).status
+
+
+def watched_process(command: Sequence[str], log: Path, limits: Limits) -> Ending:
+    """Run a command, its output appended to `log`, until it ends or exceeds its time or memory."""
     start = time.monotonic()
-    with (cell.folder / "output.log").open("ab") as log, _starting:
+    with log.open("ab") as output, _starting:
         if _stopping.is_set():
-            return "interrupted"
+            return Ending(exit_code=INTERRUPTIONS[0], interrupted=True)
         child = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.run", str(cell.folder), "--follow-parent"],
-            stdin=subprocess.PIPE,
-            stdout=log,
-            stderr=log,
-            env=_environment(),
-            start_new_session=True,
+            command, stdin=subprocess.PIPE, stdout=output, stderr=output, env=_environment(), start_new_session=True
         )
         _children.add(child)
     try:
@@ -142,9 +156,8 @@ def run_in_process(folder: str, limits: Limits) -> str:
     finally:
         _kill(child)
         _children.discard(child)
-    if _stopping.is_set() or (failure is None and child.returncode in INTERRUPTIONS):
-        return "interrupted"
-    return _outcome(cell, child.returncode, failure).status
+    interrupted = _stopping.is_set() or (failure is None and child.returncode in INTERRUPTIONS)
+    return Ending(exit_code=child.returncode, failure=failure, interrupted=interrupted)
 
 
 def stop_children() -> None:
@@ -193,19 +206,30 @@ def _watch(child: subprocess.Popen[bytes], limits: Limits, start: float) -> Fail
         if time.monotonic() - start > limits.seconds:
             return Failure(status="timeout", reason=f"not finished after the limit of {limits.seconds / 60:.0f} min")
         with contextlib.suppress(psutil.Error):
-            if (used := process.memory_info().rss / 2**20) > limits.memory_mb:
-                return Failure(status="out of memory", reason=f"{used:.0f} MB, the limit is {limits.memory_mb} MB")
+            family = [process, *process.children(recursive=True)]
+            if (used := sum(member.memory_info().rss for member in family) / 2**20) > limits.memory_mb:
+                return _too_large(used, limits)
 
 
-def _outcome(cell: Cell, exit_code: int, failure: Failure | None) -> CellResult:
+def _too_large(used_mb: float, limits: Limits) -> Failure:
+    return Failure(status="out of memory", reason=f"{used_mb:.0f} MB, the limit is {limits.memory_mb} MB")
+
+
+def _outcome(cell: Cell, ending: Ending, limits: Limits) -> CellResult:
     """The result that the child left, or else one that says how it failed."""
+    failure = ending.failure
     if failure is None:
-        if exit_code == WRONG_INPUT:
-            raise InputError(_last_line(cell.folder / "output.log"))
+        if ending.exit_code == WRONG_INPUT:
+            raise InputError(last_line(cell.folder / "output.log"))
         result = read_result(cell.folder)
-        if result is not None:
+        peak = result.value("memory", "", "peak_rss_mb") if result is not None else None
+        if result is not None and (peak is None or peak <= limits.memory_mb):
             return result
-        reason = f"the process ended with {_exit_name(exit_code)}: {_last_line(cell.folder / 'output.log')}"
+        if peak is not None:  # Too short a peak for the watch to see.
+            failure = _too_large(peak, limits)
+    if failure is None:
+        log = last_line(cell.folder / "output.log")
+        reason = f"the process ended with {_exit_name(ending.exit_code)}: {log}"
         failure = Failure(status="crashed", reason=reason)
     result = failed_result(cell.config, failure.status, failure.reason)
     write_result(cell.folder, result)
@@ -231,7 +255,7 @@ def _environment() -> dict[str, str]:
 def _why_stale(cell: Cell) -> str | None:
     """Which input changed since this method and seed were last run in this folder, if they were."""
     fresh = asdict(cell.config)
-    same = ("scene", "size", "method", "preset", "seed", "capture_seed")
+    same = ("scene", "size", "method", "preset", "seed", "capture_seed", "axis", "severity")
     for path in cell.folder.parent.glob("*/config.json"):
         old = asdict(read_cell(path.parent).config)
         if path.parent != cell.folder and all(old[name] == fresh[name] for name in same):
@@ -241,7 +265,8 @@ def _why_stale(cell: Cell) -> str | None:
     return None
 
 
-def _last_line(log: Path) -> str:
+def last_line(log: Path) -> str:
+    """The last line of a log: mostly what went wrong."""
     lines = log.read_text(errors="replace").strip().splitlines() if log.exists() else []
     return lines[-1] if lines else "(it printed nothing)"
 

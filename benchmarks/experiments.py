@@ -5,36 +5,44 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
+from importlib.machinery import ModuleSpec
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from ash.files import InputError
+from benchmarks.stress import ALL_STRESSES, Stress
 
 METHOD_GROUP = "ash_bench.methods"
 
 # Who may look at truth/ is decided here, not by the method: these get the whole capture, all others its training part.
-ORACLES = frozenset({"ash_truth", "ddc_truth", "oracle_texture"})
+TEMPLATE_ERRORS_MM = (0, 2, 4, 8, 16)
+WRONG_BY_MM = {
+    mm: ("ash_truth", "ddc_truth") if mm == 0 else (f"ash_{mm}mm", f"ddc_{mm}mm") for mm in TEMPLATE_ERRORS_MM
+}
+ORACLES = frozenset({"oracle_texture"}).union(*WRONG_BY_MM.values())
 
 # Sources of ours that decide a cell's outcome; a change in any other file (a report, say) leaves results valid.
 DECIDING_PACKAGES = ("ash", "baselines")
-DECIDING_MODULES = ("cells.py", "lpips.py", "metrics.py", "run.py", "timing.py", "views.py")
+DECIDING_MODULES = ("cells.py", "lpips.py", "metrics.py", "run.py", "sealing.py", "timing.py", "views.py")
 SOURCE_SUFFIXES = {".py", ".cpp", ".hpp", ".h", ".inc"}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class CaptureSpec:
-    """Which capture a cell needs: the generator's scene and size, and its root seed."""
+    """Which capture a cell needs: the generator's scene and size, its root seed, and how it is spoilt, if it is."""
 
     scene: str
     size: str
     seed: int = 0
+    stress: Stress | None = None
 
     @property
     def name(self) -> str:
         """The capture's folder."""
-        return f"{self.scene}-{self.size}-{self.seed}"
+        name = f"{self.scene}-{self.size}-{self.seed}"
+        return name if self.stress is None else f"{name}-{self.stress.axis}-{self.stress.severity:g}"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -59,13 +67,18 @@ class Suite:
     preset: str
     seeds: int
     cell_minutes: float
+    stresses: tuple[Stress, ...] = ()
     limit_minutes: float = 60.0
     limit_mb: int = 8192
 
     @property
     def captures(self) -> tuple[CaptureSpec, ...]:
-        """One capture per scene, shared by all methods and seeds."""
-        return tuple(CaptureSpec(scene=scene, size=self.size) for scene in self.scenes)
+        """One capture per scene, and one per scene and stress, shared by all methods and seeds."""
+        return tuple(
+            CaptureSpec(scene=scene, size=self.size, stress=stress)
+            for stress in (None, *self.stresses)
+            for scene in self.scenes
+        )
 
     @property
     def cells(self) -> Iterator[CellSpec]:
@@ -77,6 +90,31 @@ class Suite:
 
 
 MAIN_METHODS = ("ash", "ddc", "wo_disp", "wo_mot", "ash_truth", "ddc_truth")
+
+# Rows of the suite `switches`; named here, for to import them is to import torch.
+SWITCHES = (
+    "warm_up_paper",
+    "warm_up_released",
+    "warm_up_none",
+    "loss_paper",
+    "loss_released",
+    "norm_released",
+    "norm_instance",
+    "world_rotations",
+    "released_phi",
+    "wo_phi",
+    "sh_3",
+    "wide_dilation",
+    "wo_base",
+    "wo_light",
+    "wo_standardise",
+    "wo_heading",
+    "two_trunks",
+    "averaged",
+    "blendshapes",
+    "skinned_template",
+    "learned_template",
+)
 
 ABLATIONS = ("mlp", "res_128", "res_512", "cams_12", "cams_30", "cams_60")
 
@@ -106,12 +144,65 @@ SUITES = {
         Suite(
             name="ladder",
             about="one phenomenon per scene against one missing part per method: what needs what",
-            scenes=("still", "skinned", "wrinkles", "swing", "lit", "glossy", "turning"),
+            scenes=("splats", "still", "skinned", "wrinkles", "swing", "lit", "glossy", "turning"),
             size="ci",
             methods=("ash", "wo_mot", "wo_disp", "mlp", "ddc", "ash_truth", "ddc_truth"),
             preset="ci",
             seeds=3,
             cell_minutes=0.4,
+        ),
+        Suite(
+            name="stability",
+            about="where methods fail: nine ways to spoil a capture, three severities each, and the trivial baseline",
+            scenes=("loose",),
+            size="ci",
+            methods=("ash", "ddc", "wo_mot", "nearest"),
+            preset="ci",
+            seeds=3,
+            cell_minutes=0.4,
+            stresses=ALL_STRESSES,
+        ),
+        Suite(
+            name="template",
+            about="the margin between splats and a mesh against the template's error, 0 to 16 mm",
+            scenes=("tight", "loose"),
+            size="ci",
+            methods=("ash", "ddc", *(method for pair in WRONG_BY_MM.values() for method in pair)),
+            preset="ci",
+            seeds=3,
+            cell_minutes=0.4,
+        ),
+        Suite(
+            name="switches",
+            about="every switch between paper, release and the fast presets, one at a time, on both outfits",
+            scenes=("tight", "loose"),
+            size="ci",
+            methods=("ash", *(f"baselines.switches:{name}" for name in SWITCHES)),
+            preset="ci",
+            seeds=3,
+            cell_minutes=0.4,
+        ),
+        Suite(
+            name="speed",
+            about="accuracy against milliseconds per frame: lighter and heavier avatars on loose clothes, three seeds",
+            scenes=("loose",),
+            size="quick",
+            methods=("ash", "ash_frugal", "res_128", "res_512", "wo_mot", "mlp", "static", "ddc"),
+            preset="cpu",
+            seeds=3,
+            cell_minutes=3.0,
+        ),
+        Suite(
+            name="paper",
+            about="both outfits at the paper's size and length: work for a cluster with GPUs",
+            scenes=("tight", "loose"),
+            size="paper",
+            methods=(*MAIN_METHODS[:4], *ABLATIONS, "smpl", *MAIN_METHODS[4:]),
+            preset="paper",
+            seeds=3,
+            cell_minutes=7 * 24 * 60.0,  # The paper: GPU-weeks.
+            limit_minutes=21 * 24 * 60.0,
+            limit_mb=128 * 1024,
         ),
         Suite(
             name="ci",
@@ -167,11 +258,21 @@ def methods() -> dict[str, Method]:
 
 
 def find_method(name: str) -> Method:
-    """An installed method by name."""
+    """An installed method by name, or any importable factory as `package.module:function`."""
+    if ":" in name and find_spec_of(name) is not None:
+        return Method(name=name, target=name, distribution="")
     known = methods()
     if name not in known:
         raise InputError(f"unknown method {name!r}, expected one of {', '.join(known) or '(none installed)'}")
     return known[name]
+
+
+def find_spec_of(target: str) -> ModuleSpec | None:
+    """The module of `package.module:function`, None where there is none."""
+    try:
+        return find_spec(target.partition(":")[0])
+    except (ImportError, ValueError):
+        return None
 
 
 @cache
@@ -186,6 +287,9 @@ def code_version(method: str) -> str:
     found = find_method(method)
     if not found.is_ours:
         digest.update(f"{found.target} {found.distribution}".encode())
+    spec = find_spec_of(found.target)
+    if not found.distribution and spec is not None and spec.origin is not None:
+        digest.update(Path(spec.origin).read_bytes())  # No version tells when a factory by its path changes.
     return digest.hexdigest()[:16]
 
 

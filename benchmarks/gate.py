@@ -80,8 +80,8 @@ class Check:
 def summarise(suite: str, results: Sequence[CellResult]) -> Baseline:
     """What the gate needs to know of a run."""
     known = [result.provenance for result in results if result.provenance is not None]
-    pairs = dict.fromkeys((result.config.scene, result.config.method) for result in results)
-    entries = [_entry([r for r in results if (r.config.scene, r.config.method) == pair]) for pair in pairs]
+    pairs = dict.fromkeys((result.config.place, result.config.method) for result in results)
+    entries = [_entry([r for r in results if (r.config.place, r.config.method) == pair]) for pair in pairs]
     commit = known[0].commit if known else "unknown"
     machine = known[0].machine.get("processor", "unknown") if known else "unknown"
     return Baseline(suite=suite, commit=commit, machine=machine, entries=tuple(entries))
@@ -166,7 +166,7 @@ def _entry(results: Sequence[CellResult]) -> Entry:
     done = [result for result in sorted(results, key=lambda r: r.config.seed) if result.status == "done"]
     config = results[0].config
     return Entry(
-        scene=config.scene,
+        scene=config.place,
         method=config.method,
         capture=config.capture,
         seeds=tuple(result.config.seed for result in done),

@@ -67,6 +67,7 @@ METRICS = {
         Metric(key="stg3_ms", title="Stg.3", unit="ms", direction="down", worst=1e6, decimals=1, abs_tol=0.0),
         Metric(key="stg4_ms", title="Stg.4", unit="ms", direction="down", worst=1e6, decimals=1, abs_tol=0.0),
         Metric(key="train_s", title="training", unit="s", direction="down", worst=1e6, decimals=0, abs_tol=0.0),
+        Metric(key="template_s", title="template", unit="s", direction="down", worst=1e6, decimals=0, abs_tol=0.0),
         Metric(key="params", title="parameters", unit="", direction="down", worst=1e12, decimals=0, abs_tol=0.0),
         Metric(key="gaussians", title="Gaussians", unit="", direction="down", worst=1e12, decimals=0, abs_tol=0.0),
         Metric(key="peak_rss_mb", title="memory", unit="MB", direction="down", worst=1e6, decimals=0, abs_tol=0.0),

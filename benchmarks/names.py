@@ -25,7 +25,10 @@ LOOKS = {
     "cams_12": Look(title="12 of 120 cameras", colour="#a0522d"),
     "cams_30": Look(title="30 of 120 cameras", colour="#b8860b"),
     "cams_60": Look(title="60 of 120 cameras", colour="#7a869a"),
+    "ash_frugal": Look(title="ASH, frugal", colour="#2a9d8f"),
     "mlp": Look(title="w/ MLP", colour="#c2415c"),
+    "mlp_time": Look(title="w/ MLP, equal time", colour="#c2415c"),
+    "smpl": Look(title="bare-body template", colour="#8d6e63"),
     "static": Look(title="static", colour="#7a869a"),
     "nearest": Look(title="nearest image", colour="#7a869a"),
     "oracle_texture": Look(title="best texture, exact mesh", colour="#b8860b"),
@@ -38,7 +41,9 @@ def look_of(method: str) -> Look:
     """The look of a method; unknown ones get a colour by the sum of their letters, the same in every report."""
     if method in LOOKS:
         return LOOKS[method]
-    return Look(title=method, colour=SPARE_COLOURS[sum(method.encode()) % len(SPARE_COLOURS)])
+    name = method.rpartition(":")[2]
+    title = name.replace("_", " ") if name != method else method  # A factory's name, where it came by its path.
+    return Look(title=title, colour=SPARE_COLOURS[sum(method.encode()) % len(SPARE_COLOURS)])
 
 
 def is_oracle(method: str) -> bool:

@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from ash.dataset import Capture
 from ash.files import InputError
 from benchmarks import metrics
+from benchmarks.causes import REGION_COLOURS, worst_frames
 from benchmarks.cells import Cell, CellResult, ViewScore
 from benchmarks.names import look_of
 from benchmarks.run import stored_prediction
@@ -69,7 +70,7 @@ def compare(capture: Capture, cells: Sequence[Cell], results: Sequence[CellResul
     crop = _crop([truth, *predictions])
     ceiling = view.scores.get(("foreground", "noise_ceiling"))
     noise = "" if ceiling is None else f"noise ceiling {ceiling:.1f} dB"
-    images = [Tile(caption="Truth", score=noise, pixels=_on_paper(truth[crop]))]
+    images = [Tile(caption="Truth", score=noise, pixels=on_paper(truth[crop]))]
     errors = []
     for cell, result, prediction in zip(cells, results, predictions, strict=True):
         scores = next(
@@ -77,7 +78,7 @@ def compare(capture: Capture, cells: Sequence[Cell], results: Sequence[CellResul
         )
         title = look_of(cell.config.method).title
         psnr, flip = scores["foreground", "psnr"], scores["foreground", "flip"]
-        images.append(Tile(caption=title, score=f"{psnr:.1f} dB", pixels=_on_paper(prediction[crop])))
+        images.append(Tile(caption=title, score=f"{psnr:.1f} dB", pixels=on_paper(prediction[crop])))
         error = metrics.flip_map(prediction[..., :3], truth[..., :3])[crop]
         errors.append(Tile(caption="FLIP error", score=f"{flip:.3f}", pixels=_heat(error)))
     split = {"novel_view": "Held-out view", "novel_pose": "Held-out motion"}.get(view.split, view.split)
@@ -127,6 +128,25 @@ def comparisons_of(capture: Capture, cells: Sequence[Cell], results: Sequence[Ce
     return [compare(capture, cells, results, view) for view in views]
 
 
+def gallery(capture: Capture, cell: Cell, result: CellResult) -> list[Comparison]:
+    """A method's worst frames of the held-out motion: truth, prediction, FLIP error, and what explains it."""
+    found = []
+    for cause in worst_frames(capture, cell, result):
+        view, truth, prediction = cause.view, cause.truth, cause.predicted
+        crop = _crop([truth, prediction])
+        error = metrics.flip_map(prediction[..., :3], truth[..., :3])[crop]
+        title = look_of(cell.config.method).title
+        images = (
+            Tile(caption="Truth", score="", pixels=on_paper(truth[crop])),
+            Tile(caption=title, score=f"{view.scores['foreground', 'psnr']:.1f} dB", pixels=on_paper(prediction[crop])),
+            Tile(caption="FLIP error", score=f"{view.scores['foreground', 'flip']:.3f}", pixels=_heat(error)),
+            Tile(caption="Regions", score="", pixels=_paint(cause.map[crop])),
+        )
+        where = f"{title}, camera {view.camera}, frame {view.frame}"
+        found.append(Comparison(title=f"{where}. {cause.explanation}", images=images, errors=()))
+    return found
+
+
 def missing_pictures(folder: Path, error: InputError) -> str:
     """What to say where the capture or a prediction is gone: numbers do not depend on it, so the report goes on."""
     return f"No pictures: {error}. The numbers come from {folder} and do not need it."
@@ -144,7 +164,8 @@ def _crop(images: Sequence[np.ndarray]) -> tuple[slice, slice]:
     return rows, slice(max(0, left - margin), min(width, right + margin))
 
 
-def _on_paper(on_black: np.ndarray) -> np.ndarray:
+def on_paper(on_black: np.ndarray) -> np.ndarray:
+    """A prediction or truth on black, uint8 RGBA, over the paper's grey: uint8 `[h, w, 3]`."""
     alpha = on_black[..., 3:].astype(float) / 255
     return np.clip(np.rint(on_black[..., :3] + PAPER * (1 - alpha)), 0, 255).astype(np.uint8)
 
@@ -155,3 +176,9 @@ def _heat(error: np.ndarray) -> np.ndarray:
 
     colours = colormaps["magma"](np.clip(error / FLIP_WHITE, 0, 1))[..., :3]
     return np.rint(np.asarray(colours) * 255).astype(np.uint8)
+
+
+def _paint(regions: np.ndarray) -> np.ndarray:
+    """Regions `[h, w]` in their colours, background as paper."""
+    colours = np.array([*(tuple(bytes.fromhex(colour[1:])) for colour in REGION_COLOURS), (PAPER,) * 3], np.uint8)
+    return colours[regions]

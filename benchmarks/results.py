@@ -16,7 +16,7 @@ def tidy(results: Sequence[CellResult]) -> pd.DataFrame:
     """One row per number of every cell, in the columns of `results.csv`."""
     rows = [
         (
-            result.config.scene,
+            result.config.place,
             result.config.method,
             result.config.seed,
             row.split,

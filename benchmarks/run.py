@@ -6,13 +6,13 @@ Exit codes: 0 a result was written (also that of a method that failed), 2 wrong 
 
 import argparse
 import os
-import resource
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -22,7 +22,7 @@ import numpy as np
 
 from ash.dataset import Capture, load_capture, pixels_path, read_template_truth, surface_path
 from ash.files import InputError, read_arrays, read_image, write_image
-from ash.protocol import Avatar, PosedGeometry, StageClock
+from ash.protocol import Avatar, LearnsTemplate, PosedGeometry, StageClock
 from benchmarks import metrics, provenance
 from benchmarks.cells import (
     Cell,
@@ -41,11 +41,13 @@ from benchmarks.curves import read_curve
 from benchmarks.errors import disk_problem
 from benchmarks.experiments import ORACLES, find_method
 from benchmarks.metrics import IMAGE_SPLITS, VIEW_SCORES
-from benchmarks.timing import time_frames
-from benchmarks.views import View, evaluated_views
+from benchmarks.sealing import seen_by_method, watched
+from benchmarks.timing import peak_memory_mb, time_frames
+from benchmarks.views import View, evaluated_views, playback
 from benchmarks.weights import weights_file
 
 CHECKPOINT = "model.safetensors"
+TEMPLATES = "templates"  # Beside the captures: learned once, shared by methods and runs.
 GEOMETRY_FRAMES = 4
 
 
@@ -104,12 +106,27 @@ def evaluate_cell(cell: Cell) -> CellResult:
     """Load a cell's checkpoint, render and score again, and write the result anew; training is not repeated."""
     before = _finished(cell)
     capture = _capture_of(cell)
-    avatar = _make(cell.config, capture, find_method(cell.config.method).load())
-    avatar.load(cell.folder / CHECKPOINT)
     train_s = before.value("speed", "", "train_s") or 0.0
-    result = replace(_evaluate(cell, capture, avatar, train_s), provenance=before.provenance)
+    with load_avatar(cell, capture) as (avatar, seen):
+        result = replace(_evaluate(cell, capture, seen, avatar, train_s), provenance=before.provenance)
     write_result(cell.folder, result)
     return result
+
+
+def is_trained(cell: Cell) -> bool:
+    """Whether there is an avatar to load."""
+    return (cell.folder / CHECKPOINT).exists()
+
+
+@contextmanager
+def load_avatar(cell: Cell, capture: Capture) -> Iterator[tuple[Avatar, Capture]]:
+    """A cell's trained avatar and the capture as it sees it; both hold as long as the body runs."""
+    factory = find_method(cell.config.method).load()
+    with _seen(cell, capture) as seen:
+        with watched(capture, seen):
+            avatar = _make(cell.config, seen, factory)
+            avatar.load(cell.folder / CHECKPOINT)
+        yield avatar, seen
 
 
 def rescore_cell(cell: Cell) -> CellResult:
@@ -142,51 +159,55 @@ def stored_prediction(cell: Cell, capture: Capture, view: View) -> np.ndarray:
 
 
 def _train_and_evaluate(cell: Cell, capture: Capture, factory: Callable[..., Avatar]) -> CellResult:
-    avatar = _make(cell.config, capture, factory)
-    start = time.perf_counter()
-    avatar.fit(_visible(cell.config, capture), folder=cell.folder)
-    train_s = time.perf_counter() - start
-    avatar.save(cell.folder / CHECKPOINT)
-    return _evaluate(cell, capture, avatar, train_s)
+    with _seen(cell, capture) as seen:
+        with watched(capture, seen):
+            avatar = _make(cell.config, seen, factory)
+            start = time.perf_counter()
+            avatar.fit(seen, folder=cell.folder)
+            train_s = time.perf_counter() - start
+            avatar.save(cell.folder / CHECKPOINT)
+        return _evaluate(cell, capture, seen, avatar, train_s)
 
 
-def _evaluate(cell: Cell, capture: Capture, avatar: Avatar, train_s: float) -> CellResult:
+def _evaluate(cell: Cell, capture: Capture, seen: Capture, avatar: Avatar, train_s: float) -> CellResult:
+    """The method draws everything first, while it is watched; truth is read afterwards."""
     views = evaluated_views(capture)
-    scored = []
-    for view in views:
-        camera = capture.cameras[view.camera]
-        prediction = metrics.quantise(avatar.render(capture.motion, view.frame, camera, clock=StageClock()))
-        if prediction.shape != (camera.height, camera.width, 4):
-            raise ValueError(f"expected an image {(camera.height, camera.width, 4)}, got {prediction.shape}")
-        write_image(prediction_path(cell.folder, view), prediction)
-        scored.append(_score(cell, capture, view, prediction))
-    last_split = views[-1].split
-    timing = time_frames(avatar, capture, _playback(views, last_split))
+    with watched(capture, seen):
+        for view in views:
+            _draw(cell, capture, avatar, view)
+        timing = time_frames(avatar, capture, playback(views))
+        geometry = _pose_geometry(capture, avatar, views)
+    scored = [_score(cell, capture, view, stored_prediction(cell, capture, view)) for view in views]
     curve = read_curve(cell.folder / "log.jsonl")
     summary = (
         _image_summary(scored)
         + _flicker_summary(cell, capture, scored)
-        + _geometry_summary(capture, avatar, views)
+        + _geometry_summary(capture, geometry, views)
         + _cost_summary(avatar, timing, max([train_s, *(point.seconds for point in curve)]))
+        + _template_cost(avatar)
     )
     return CellResult(
         config=cell.config, status="done", summary=summary, views=tuple(scored), timing=timing, curve=curve
     )
 
 
-def _playback(views: tuple[View, ...], split: str) -> list[View]:
-    """One camera's views of a split: every frame is new to the avatar, as in playback, and only its history is not."""
-    first = next(view.camera for view in views if view.split == split)
-    return [view for view in views if view.split == split and view.camera == first]
+def _draw(cell: Cell, capture: Capture, avatar: Avatar, view: View) -> None:
+    """Render a view and store it."""
+    camera = capture.cameras[view.camera]
+    prediction = metrics.quantise(avatar.render(capture.motion, view.frame, camera, clock=StageClock()))
+    if prediction.shape != (camera.height, camera.width, 4):
+        raise ValueError(f"expected an image {(camera.height, camera.width, 4)}, got {prediction.shape}")
+    write_image(prediction_path(cell.folder, view), prediction)
 
 
 def _make(config: CellConfig, capture: Capture, factory: Callable[..., Avatar]) -> Avatar:
-    return factory(_visible(config, capture), seed=config.seed, preset=config.preset)
+    return factory(capture, seed=config.seed, preset=config.preset)
 
 
-def _visible(config: CellConfig, capture: Capture) -> Capture:
+def _seen(cell: Cell, capture: Capture) -> AbstractContextManager[Capture]:
     """What a method may see: the training part; oracles, which stand for a bound and no method, see the truth."""
-    return capture if config.method in ORACLES else capture.training_only()
+    store = cell.capture_folder.parent / TEMPLATES
+    return seen_by_method(capture, cell.folder / "input", oracle=cell.config.method in ORACLES, store=store)
 
 
 def _capture_of(cell: Cell) -> Capture:
@@ -259,34 +280,61 @@ def _flicker_summary(cell: Cell, capture: Capture, scored: list[ViewScore]) -> t
     return (Summary(split="novel_pose", region="foreground", metric="flicker", value=float(np.mean(values))),)
 
 
-def _geometry_summary(capture: Capture, avatar: Avatar, views: tuple[View, ...]) -> tuple[Summary, ...]:
-    """Template and Gaussians against the true surface, for methods that show their geometry."""
-    if not isinstance(avatar, PosedGeometry) or not (capture.folder / "truth" / "template.npz").exists():
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PosedFrames:
+    """What an avatar says about its geometry: per frame, template vertices and centres of Gaussians, metres."""
+
+    vertices: dict[int, np.ndarray]
+    means: dict[int, np.ndarray]
+
+
+def _pose_geometry(capture: Capture, avatar: Avatar, views: tuple[View, ...]) -> PosedFrames | None:
+    """Template and Gaussians in the evaluated frames, of methods that show their geometry."""
+    if not isinstance(avatar, PosedGeometry):
+        return None
+    frames = sorted({view.frame for view in views})
+    few = {frame for split in IMAGE_SPLITS for frame in _few(_frames_of(views, split))}
+    return PosedFrames(
+        vertices={frame: avatar.template_vertices(capture.motion, frame) for frame in frames},
+        means={frame: avatar.gaussian_means(capture.motion, frame) for frame in few} if avatar.gaussian_count() else {},
+    )
+
+
+def _geometry_summary(capture: Capture, posed: PosedFrames | None, views: tuple[View, ...]) -> tuple[Summary, ...]:
+    """Template and Gaussians against the true surface."""
+    if posed is None or not (capture.folder / "truth" / "template.npz").exists():
         return ()
     rows = []
     template_truth = read_template_truth(capture)
     for split in IMAGE_SPLITS:
-        frames = sorted({view.frame for view in views if view.split == split})
-        vertices = [avatar.template_vertices(capture.motion, frame) for frame in frames]
-        if frames:
+        frames = _frames_of(views, split)
+        vertices = [posed.vertices[frame] for frame in frames]
+        # A template of its own (a bare body, say) has no vertices that correspond to the capture's.
+        if frames and np.shape(vertices)[1:] == template_truth.shape[1:]:
             error = metrics.vertex_error_mm(np.stack(vertices), template_truth[frames])
             rows.append(Summary(split=split, region="", metric="template_mm", value=error))
-        few = frames[:: max(1, len(frames) // GEOMETRY_FRAMES)]
-        distances = [_surface_distance(capture, avatar, frame) for frame in few] if avatar.gaussian_count() else []
+        distances = [_surface_distance(capture, posed.means[frame], frame) for frame in _few(frames) if posed.means]
         known = [distance for distance in distances if distance is not None]
         if known:
             rows.append(Summary(split=split, region="", metric="surface_mm", value=float(np.mean(known))))
     return tuple(rows)
 
 
-def _surface_distance(capture: Capture, avatar: PosedGeometry, frame: int) -> float | None:
+def _frames_of(views: tuple[View, ...], split: str) -> list[int]:
+    return sorted({view.frame for view in views if view.split == split})
+
+
+def _few(frames: list[int]) -> list[int]:
+    return frames[:: max(1, len(frames) // GEOMETRY_FRAMES)]
+
+
+def _surface_distance(capture: Capture, means: np.ndarray, frame: int) -> float | None:
     path = surface_path(capture.folder, frame)
-    if not path.exists():
+    if not path.exists() or not len(means):
         return None
     faces = read_arrays(capture.folder / "truth" / "surface.npz", expected=("faces",))["faces"]
     vertices = read_arrays(path, expected=("vertices",))["vertices"].astype(np.float64)
-    means = np.asarray(avatar.gaussian_means(capture.motion, frame), np.float64)
-    return metrics.surface_distance_mm(means, vertices, faces) if len(means) else None
+    return metrics.surface_distance_mm(np.asarray(means, np.float64), vertices, faces)
 
 
 def _cost_summary(avatar: Avatar, timing: Timing, train_s: float) -> tuple[Summary, ...]:
@@ -297,11 +345,18 @@ def _cost_summary(avatar: Avatar, timing: Timing, train_s: float) -> tuple[Summa
         ("speed", "failed"): 0.0,
         ("memory", "params"): float(avatar.parameter_count()),
         ("memory", "gaussians"): float(avatar.gaussian_count()),
-        ("memory", "peak_rss_mb"): resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        ("memory", "peak_rss_mb"): peak_memory_mb(),
     }
     return tuple(
         Summary(split=split, region="", metric=metric, value=value) for (split, metric), value in costs.items()
     )
+
+
+def _template_cost(avatar: Avatar) -> tuple[Summary, ...]:
+    """What learning the template took, for methods that stand on a learned one; `train_s` is without it."""
+    if not isinstance(avatar, LearnsTemplate) or (seconds := avatar.template_seconds()) is None:
+        return ()
+    return (Summary(split="speed", region="", metric="template_s", value=seconds),)
 
 
 def _provenance(wall_s: float) -> Provenance:

@@ -1,18 +1,22 @@
 """A run: a suite's captures, then its cells, then what they came to, all in one folder."""
 
 import contextlib
+import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ash.dataset import load_capture, read_manifest, verify_capture
 from ash.files import InputError, read_json, write_json
+from benchmarks import splats_rung
 from benchmarks.cells import Cell, CellConfig, CellResult, read_cell, read_result
 from benchmarks.engine import Limits, make_executor, plan_cells, run_cells, shard_of
 from benchmarks.experiments import CaptureSpec, CellSpec, Suite, code_version, find_method
 from benchmarks.locks import only_run_in
 from benchmarks.metrics import PROTOCOL
 from benchmarks.progress import Progress
+from benchmarks.stress import Stress
+from synth.perturb import perturb
 from synth.presets import scene
 
 RUN_FILE = "run.json"
@@ -58,7 +62,13 @@ def _run_suite(suite: Suite, options: RunOptions) -> Run:
     cells = [cell_for(spec, folders[spec.capture], options.out) for spec in suite.cells]
     run = Run(folder=options.out, suite=suite.name, about=suite.about, command=options.command, cells=tuple(cells))
     write_run(run)
-    plan = plan_cells(shard_of(cells, options.shard) if options.shard else cells, retry_failed=options.retry_failed)
+    run_missing(shard_of(cells, options.shard) if options.shard else cells, suite, options)
+    return run
+
+
+def run_missing(cells: Sequence[Cell], suite: Suite, options: RunOptions) -> None:
+    """Run the cells that have no result, within the suite's limits, and show how far they are."""
+    plan = plan_cells(cells, retry_failed=options.retry_failed)
     limits = Limits(seconds=suite.limit_minutes * 60, memory_mb=suite.limit_mb)
     progress = Progress("cells", len(plan.todo), expected_s=suite.cell_minutes * 60, workers=options.workers)
     for reason in plan.reasons:
@@ -68,7 +78,6 @@ def _run_suite(suite: Suite, options: RunOptions) -> Run:
     with make_executor(options.executor, workers=options.workers) as executor:
         run_cells(plan, executor, limits, progress)
     progress.close()
-    return run
 
 
 def make_capture(spec: CaptureSpec, data: Path, *, workers: int) -> Path:
@@ -76,11 +85,26 @@ def make_capture(spec: CaptureSpec, data: Path, *, workers: int) -> Path:
 
     A capture that an older version of the scene left under the same name is not touched: the new one goes beside it.
     """
+    if spec.stress is not None:
+        return _spoilt_capture(spec, spec.stress, make_capture(replace(spec, stress=None), data, workers=workers), data)
     folder = data / spec.name
+    if spec.scene == splats_rung.SCENE:
+        splats_rung.draw_capture(folder, size=spec.size, seed=spec.seed)
+        return folder
     wanted = scene(spec.scene, size=spec.size, seed=spec.seed).identity
     if (folder / "manifest.json").exists() and read_manifest(folder).get("identity", wanted) != wanted:
         folder = data / f"{spec.name}-{wanted[:8]}"
     make_capture_in(spec, folder, workers=workers)
+    return folder
+
+
+def _spoilt_capture(spec: CaptureSpec, stress: Stress, clean: Path, data: Path) -> Path:
+    """The clean capture, spoilt; made anew where an earlier attempt did not come to its manifest, the last file."""
+    capture = load_capture(clean)
+    folder = data / f"{spec.name}-{capture.identity[:8]}"
+    if not (folder / "manifest.json").exists():
+        shutil.rmtree(folder, ignore_errors=True)
+        perturb(clean, folder, stress.perturbation(capture), seed=spec.seed)
     return folder
 
 
@@ -118,6 +142,8 @@ def cell_for(spec: CellSpec, capture_folder: Path, out: Path) -> Cell:
         preset=spec.preset,
         seed=spec.seed,
         code=code_version(spec.method),
+        axis=spec.capture.stress.axis if spec.capture.stress else "",
+        severity=spec.capture.stress.severity if spec.capture.stress else 0.0,
     )
     return Cell(config=config, folder=out / "cells" / config.key, capture_folder=capture_folder)
 

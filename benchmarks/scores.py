@@ -20,9 +20,9 @@ class Scores:
     """The results of a run, looked up by scene, method and quantity."""
 
     def __init__(self, results: Sequence[CellResult]) -> None:
-        self.results = tuple(results)
-        self.scenes = tuple(dict.fromkeys(result.config.scene for result in results))
-        self.seeds = len({result.config.seed for result in results})
+        self.results = tuple(result for result in results if not result.config.axis)  # Spoilt captures: stability.py.
+        self.scenes = tuple(dict.fromkeys(result.config.scene for result in self.results))
+        self.seeds = len({result.config.seed for result in self.results})
 
     def methods(self, scene: str) -> tuple[str, ...]:
         """Methods on a scene, in the suite's order."""

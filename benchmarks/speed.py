@@ -1,8 +1,6 @@
 """How fast the kernels are beside their definitions, all in one run: `ash-bench speed kernels`."""
 
-import resource
 import statistics
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -19,6 +17,7 @@ from ash.native.library import fma_peak, instruction_set, stage_ms
 from ash.rasterizing import rasterize_mesh, rasterize_mesh_naive
 from ash.splatting import splat, splat_naive
 from benchmarks.speed_scenes import SplatScene, body_mesh, splat_scene
+from benchmarks.timing import peak_memory_mb
 
 # Floating point operations of one splat at one pixel, counted in native/blend.inc: the exponent and its power of two,
 # the cap and the transmittance, four accumulated channels; backward all but the channels again, and the gradients.
@@ -119,7 +118,7 @@ def speed_kernels(
 ) -> Iterator[list[SpeedRow] | SplatDetail | Mixture]:
     """Time splatting, loss and rasteriser, naive and native by turns; yields results as they come."""
     for scene in (splat_scene("S"), splat_scene("P")):
-        yield from _time_splat(scene, rounds=rounds, threads=threads)
+        yield from time_splat(scene, rounds=rounds, threads=threads)
     for size, (height, width) in LOSS_SIZES.items():
         yield _time_loss(size, height, width, rounds=rounds, threads=threads)
     for size, pixels in (("256", 256), ("512", 512)):
@@ -127,7 +126,8 @@ def speed_kernels(
     yield time_mixture(rounds=10 * rounds)
 
 
-def _time_splat(scene: SplatScene, *, rounds: int, threads: tuple[int, ...]) -> Iterator[list[SpeedRow] | SplatDetail]:
+def time_splat(scene: SplatScene, *, rounds: int, threads: tuple[int, ...]) -> Iterator[list[SpeedRow] | SplatDetail]:
+    """Rows of forward and of forward with backward, naive and native by turns, then a detail per number of threads."""
     cameras = {"viewmats": scene.viewmats, "Ks": scene.Ks, "width": scene.width, "height": scene.height}
     leaves = {name: getattr(scene.gaussians, name).clone().requires_grad_() for name in Gaussians.__slots__}
     gradient = torch.randn(1, scene.height, scene.width, 3, generator=torch.Generator().manual_seed(1))
@@ -321,8 +321,7 @@ def main(what: str, json_path: Path | None) -> int:
         else:
             rows += result
             _print_rows(result)
-    # Linux counts kibibytes, macOS bytes.
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10)
+    peak_mb = peak_memory_mb()
     print(f"peak memory of this process, torch and the definitions included: {peak_mb:.0f} MB")
     if json_path is not None:
         write_json(

@@ -1,11 +1,14 @@
-"""How long a frame takes, by stage, beside a fixed workload that tells how fast the machine was at that moment."""
+"""How long a frame takes, by stage, beside a fixed workload that tells how fast the machine was; how much memory."""
 
+import resource
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 
 from ash.dataset import Capture
-from ash.protocol import Avatar, StageClock
+from ash.protocol import Drawn, StageClock
 from benchmarks.cells import Timing
 from benchmarks.views import View
 
@@ -13,7 +16,7 @@ WARM_UP_FRAMES = 3
 TIMED_FRAMES = 15
 
 
-def time_frames(avatar: Avatar, capture: Capture, views: list[View]) -> Timing:
+def time_frames(avatar: Drawn, capture: Capture, views: list[View]) -> Timing:
     """Time single frames after a warm-up; frames follow each other as in playback, so caches may help as there."""
     frame_ms, reference_ms = [], []
     stage_ms: dict[str, list[float]] = {}
@@ -42,3 +45,15 @@ def reference_workload_ms() -> float:
         product = np.tanh(product @ grid)
         np.sort(product, axis=None)
     return (time.perf_counter() - start) * 1e3
+
+
+def peak_memory_mb() -> float:
+    """The largest resident memory of this process so far, in MiB.
+
+    Linux's `ru_maxrss` survives `exec`: a child of a large process would begin with its parent's peak.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        return next(int(line.split()[1]) for line in status.read_text().splitlines() if line.startswith("VmHWM")) / 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10  # macOS counts bytes

@@ -41,6 +41,12 @@ def evaluated_views(capture: Capture) -> tuple[View, ...]:
     return tuple(View(split=s, camera=camera, frame=frame) for s in IMAGE_SPLITS for camera, frame in pairs[s])
 
 
+def playback(views: tuple[View, ...]) -> list[View]:
+    """One camera's views of the last split: every frame is new, as in playback, and only its history is not."""
+    first = next(view.camera for view in views if view.split == views[-1].split)
+    return [view for view in views if view.split == views[-1].split and view.camera == first]
+
+
 def spread(count: int, at_most: int) -> list[int]:
     """At most `at_most` different indices below `count`, evenly spread, ends included."""
     return sorted({round(x) for x in np.linspace(0, count - 1, min(count, at_most))})

@@ -1,17 +1,20 @@
 """A small capture for tests: a bending tube with known texel Gaussians, drawn by the splatter itself."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from figures import ring_cameras, tube_mesh, tube_motion, tube_skeleton
 
+from ash import presets
 from ash.avatar import AshModel
-from ash.config import ModelConfig
+from ash.config import AshConfig, ModelConfig
 from ash.dataset import (
     Capture,
     image_path,
     load_capture,
+    surface_path,
     write_cameras,
     write_motion,
     write_skeleton,
@@ -42,6 +45,14 @@ def tube_model_config(**changes) -> ModelConfig:
     return ModelConfig(**(settings | changes))
 
 
+def tiny_preset(*, steps: int, warmup_steps: int) -> AshConfig:
+    """The preset `ci` at a size for the tube."""
+    base = presets.ci()
+    model = replace(base.model, texels=16, shuffle=1, width=4, levels=2, window=2)
+    training = replace(base.training, steps=steps, warmup_steps=warmup_steps)
+    return replace(base, model=model, training=training, template=replace(base.template, nodes=20, steps=3))
+
+
 def known_model() -> AshModel:
     """Texel Gaussians with random colours that no training has touched."""
     config = tube_model_config(motion=False)
@@ -63,6 +74,9 @@ def write_tube_capture(folder: Path) -> Capture:
     write_motion(folder / "motion.npz", motion)
     posed = np.stack([model.template.pose(motion, frame).vertices.numpy() for frame in range(FRAMES)])
     write_arrays(folder / "truth" / "template.npz", vertices=posed)
+    write_arrays(folder / "truth" / "surface.npz", faces=tube_mesh().faces)
+    for frame in range(FRAMES):
+        write_arrays(surface_path(folder, frame), vertices=posed[frame])
     train = {"cameras": [c.name for c in cameras[1:]], "frames": list(range(FRAMES - 2))}
     splits = {
         "train": train,

@@ -144,14 +144,17 @@ def write_capture(folder: Path) -> Path:
     write_template(folder / "template.npz", mesh)
     write_motion(folder / "motion.npz", course)
     write_arrays(folder / "truth" / "template.npz", vertices=truth)
-    write_arrays(folder / "truth" / "surface.npz", faces=mesh.faces)
+    surface = {"rest": mesh.vertices, "faces": mesh.faces, "uvs": mesh.uvs, "uv_faces": mesh.uv_faces}
+    write_arrays(folder / "truth" / "surface.npz", **surface, part=np.zeros(len(mesh.faces), np.int64))
     views = [(camera, frame) for camera in rig for frame in train]
     views += [(camera, frame) for camera in rig[3:] for frame in test]
     for camera, frame in views:
         image = draw(truth[frame], camera)
         write_image(image_path(folder, camera.name, frame), np.rint(image * 255).astype(np.uint8))
+        # What was drawn are points, so no pixel knows a triangle.
+        nothing = {"triangle": np.full((SIZE, SIZE), -1), "barycentric": np.zeros((SIZE, SIZE, 2))}
         noise = np.full((SIZE, SIZE), 1e-4, dtype=np.float32)
-        write_arrays(pixels_path(folder, camera.name, frame), noise=noise)
+        write_arrays(pixels_path(folder, camera.name, frame), noise=noise, **nothing)
     for frame in range(len(truth)):
         write_arrays(surface_path(folder, frame), vertices=truth[frame])
     held_out = [camera.name for camera in rig[3:]]

@@ -84,9 +84,10 @@ def test_methods_can_be_imported() -> None:
         module, function = target.split(":")
         spec = find_spec(module)
         assert spec is not None and spec.origin is not None, f"{name}: no module {module}"
-        defined = [
-            node.name for node in ast.parse(Path(spec.origin).read_text()).body if isinstance(node, ast.FunctionDef)
-        ]
+        body = ast.parse(Path(spec.origin).read_text()).body
+        defined = [node.name for node in body if isinstance(node, ast.FunctionDef)]
+        targets = [target for node in body if isinstance(node, ast.Assign) for target in node.targets]
+        defined += [name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)]
         assert function in defined, f"{name}: {module} defines no {function}"
 
 
@@ -154,12 +155,14 @@ def test_torchvision_is_never_imported() -> None:
                 assert not {name.split(".")[0] for name in names} & {"torchvision", "lpips"}, path
 
 
-@pytest.mark.parametrize("document", ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md"])
+@pytest.mark.parametrize("document", ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "docs/plugin.md"])
 def test_documents_name_files_and_verbs_that_exist(document: str) -> None:
     text = (ROOT / document).read_text()
     named = set(re.findall(r"\b(?:ash|synth|baselines|benchmarks|tests|docs|reports)/[\w/.-]*[\w/]", text))
-    named |= set(re.findall(r"\]\((?!https?:)([^)#]+)\)", text))
     assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
-    verbs = set(re.findall(r"\./ash-bench ([a-z]+)", text))
-    known = set(re.findall(r'_verb\(verbs, \w+, "([a-z]+)"', (ROOT / "benchmarks" / "cli.py").read_text()))
+    linked = re.findall(r"\]\((?!https?:)([^)#]+)\)", text)
+    assert [name for name in linked if not ((ROOT / document).parent / name).exists()] == []
+    verbs = set(re.findall(r"\./ash-bench ([a-z-]+)", text))
+    sources = "".join(path.read_text() for path in (ROOT / "benchmarks").glob("*.py"))
+    known = set(re.findall(r'\b(?:_verb\(verbs|add\()[\w, ]*"([a-z-]+)"', sources))
     assert verbs <= known

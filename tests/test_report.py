@@ -10,9 +10,10 @@ from pathlib import Path
 
 import fakes
 import pytest
+from cells import config
 
 from benchmarks import charts, findings, tables
-from benchmarks.cells import CellConfig, CellResult, Summary, failed_result
+from benchmarks.cells import CellResult, Summary, failed_result
 from benchmarks.charts import Bar, Line, Panel, Point
 from benchmarks.engine import Limits, make_executor, plan_cells, run_cells
 from benchmarks.experiments import CaptureSpec, CellSpec
@@ -22,12 +23,6 @@ from benchmarks.runs import Run, cell_for, read_run, write_run
 from benchmarks.scores import Scores
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-
-
-def config(method: str, seed: int) -> CellConfig:
-    return CellConfig(
-        scene="loose", size="ci", capture_seed=0, capture="c" * 64, method=method, preset="ci", seed=seed, code="0"
-    )
 
 
 def scored(method: str, *, view: float, pose: float, frame_ms: float = 10.0, seed: int = 0) -> CellResult:

@@ -1,0 +1,92 @@
+"""ASH minus DDC against the error of the template that both are given: the paper's margins, and where the two cross."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from benchmarks.experiments import WRONG_BY_MM
+from benchmarks.scores import Scores
+from benchmarks.statistics import mean_interval, welch
+
+# ASH (CVPR 2024), Table 1: PSNR of ASH minus DDC, tight and loose clothes.
+PAPER_DB = {"novel_view": {"tight": 4.6, "loose": 7.4}, "novel_pose": {"tight": 1.1, "loose": 0.7}}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Margin:
+    """Foreground PSNR of ASH minus DDC in dB on templates of one error; the interval needs two seeds."""
+
+    error_mm: float  # root mean square
+    mean: float
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class MarginCurve:
+    """A scene and split: margins on templates of known error, least error first, and on the methods' own template."""
+
+    scene: str
+    split: str
+    known: tuple[Margin, ...]
+    honest: Margin | None
+    paper_db: float | None  # the paper's margin on such clothes
+
+    @property
+    def crossing_mm(self) -> float | None:
+        """The error at which the two are equal, between measured ones; None: one leads throughout."""
+        return self.error_at(0.0)
+
+    def error_at(self, margin_db: float) -> float | None:
+        """The least error at which the margin is reached, linear between measured errors."""
+        for a, b in zip(self.known, self.known[1:], strict=False):
+            if (a.mean - margin_db) * (b.mean - margin_db) <= 0 and a.mean != b.mean:
+                return a.error_mm + (margin_db - a.mean) / (b.mean - a.mean) * (b.error_mm - a.error_mm)
+        return None
+
+
+def margin_curves(scores: Scores) -> tuple[MarginCurve, ...]:
+    """A curve per scene and split, for scenes on which both methods ran with two errors or more."""
+    found = []
+    for scene in scores.scenes:
+        for split in PAPER_DB:
+            known = [_margin(scores, scene, split, ash, ddc, float(mm)) for mm, (ash, ddc) in WRONG_BY_MM.items()]
+            there = tuple(margin for margin in known if margin is not None)
+            if len(there) > 1:
+                template = scores.get(scene, "ash", split, "", "template_mm")
+                honest = _margin(scores, scene, split, "ash", "ddc", template.mean) if template else None
+                paper = PAPER_DB[split].get(scene)
+                found.append(MarginCurve(scene=scene, split=split, known=there, honest=honest, paper_db=paper))
+    return tuple(found)
+
+
+def sentence(curve: MarginCurve) -> str:
+    """The finding in one sentence."""
+    first, last = curve.known[0], curve.known[-1]
+    where = {"novel_view": "held-out views", "novel_pose": "held-out motion"}[curve.split]
+    text = f"On {curve.scene}, {where}: ASH minus DDC goes from {first.mean:+.1f} dB at {first.error_mm:g} mm"
+    text += f" to {last.mean:+.1f} dB at {last.error_mm:g} mm of template error"
+    crossing = curve.crossing_mm
+    text += f"; the two are equal at {crossing:.1f} mm" if crossing is not None else "; one leads throughout"
+    if curve.paper_db is not None:
+        at = curve.error_at(curve.paper_db)
+        reached = "is not reached" if at is None else f"is reached at {at:.1f} mm"
+        text += f"; the paper's {curve.paper_db:+.1f} dB {reached}"
+    if curve.honest is not None:
+        text += f"; with the honest template ({curve.honest.error_mm:.1f} mm) it is {curve.honest.mean:+.1f} dB"
+    return text + "."
+
+
+def _margin(scores: Scores, scene: str, split: str, ash: str, ddc: str, error_mm: float) -> Margin | None:
+    if scores.failed(scene, ash) or scores.failed(scene, ddc):
+        return None
+    a, b = (scores.values(scene, method, split, "foreground", "psnr") for method in (ash, ddc))
+    if not a or not b:
+        return None
+    if len(a) > 1 and len(b) > 1:
+        test = welch(a, b)
+        return Margin(error_mm=error_mm, mean=test.mean, low=test.low, high=test.high)
+    return Margin(error_mm=error_mm, mean=_mean(a) - _mean(b), low=None, high=None)
+
+
+def _mean(values: Sequence[float]) -> float:
+    return mean_interval(values).mean

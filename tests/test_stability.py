@@ -1,0 +1,127 @@
+"""Stress axes, breakdown points and the margin against the template's error."""
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from cells import cell
+from fakes import write_capture
+
+from ash.dataset import Split, load_capture, verify_capture
+from ash.files import InputError
+from benchmarks import courses, margin, runs, stability
+from benchmarks.cells import CellResult, failed_result
+from benchmarks.experiments import SUITES, CaptureSpec
+from benchmarks.scores import Scores
+from benchmarks.stress import ALL_STRESSES, AXES, Stress
+
+
+def course(levels: tuple[float, ...]) -> list[CellResult]:
+    """Three seeds of a method along the camera axis, a tenth of a decibel apart, and the trivial baseline at 10 dB."""
+    severities = (0.0, *AXES["cameras"].severities)
+    found = [cell("nearest", 10.0)]
+    for severity, level in zip(severities, levels, strict=True):
+        axis = "cameras" if severity else ""
+        found += [cell("ash", level + 0.1 * seed, seed=seed, axis=axis, severity=severity) for seed in range(3)]
+    return found
+
+
+def test_a_method_breaks_where_it_is_surely_below_half_way_to_the_trivial_baseline() -> None:
+    (ash,) = [c for c in stability.curves(course((30.0, 26.0, 19.9, 12.0)))[0].courses if c.method == "ash"]
+    assert ash.midpoint == pytest.approx((30.1 + 10.0) / 2)
+    assert ash.breakdown == 75.0  # at 50 % the mean, 20.0, lies below the midpoint, 20.05, but not its interval
+    assert ash.loss == pytest.approx(18.0)
+    (firm,) = [c for c in stability.curves(course((30.0, 26.0, 25.0, 24.0)))[0].courses if c.method == "ash"]
+    assert firm.breakdown is None
+
+
+def test_without_the_trivial_baseline_there_is_no_breakdown_point() -> None:
+    curve = stability.curves(course((30.0, 26.0, 19.0, 12.0))[1:])[0]
+    assert curve.trivial is None
+    assert curve.courses[0].midpoint is None and curve.courses[0].breakdown is None
+
+
+def test_a_failed_cell_is_the_worst_score_and_counts_in_the_rate() -> None:
+    results = course((30.0, 26.0, 25.0, 24.0))
+    last = next(i for i, r in enumerate(results) if r.config.severity == 75.0)
+    results[last] = failed_result(results[last].config, "diverged", "NaN")
+    (ash,) = [c for c in stability.curves(results)[0].courses if c.method == "ash"]
+    assert ash.steps[-1].failures == 1
+    assert ash.steps[-1].quality.mean == pytest.approx((24.1 + 24.2) / 3)
+    row = next(r for r in stability.reliability(results) if r.method == "ash")
+    assert (row.failures, row.cells, row.diverged) == (1, 12, 1)
+    assert row.rate[0] < 1 / 12 < row.rate[1]
+    assert row.spread_db == pytest.approx(0.1)
+
+
+def test_spoilt_captures_do_not_reach_the_tables() -> None:
+    assert [r.config.axis for r in Scores(course((30.0, 26.0, 19.9, 12.0))).results] == [""] * 4
+
+
+def test_the_margin_is_read_off_templates_of_known_error() -> None:
+    pairs = {"ash_truth": 30.0, "ddc_truth": 31.0, "ash_4mm": 27.0, "ddc_4mm": 26.0, "ash_16mm": 24.0, "ddc_16mm": 16.0}
+    results = [cell(method, psnr, seed=seed) for method, psnr in pairs.items() for seed in range(3)]
+    results += [cell("ash", 26.0), cell("ddc", 24.5)]
+    view = margin.margin_curves(Scores(results))[0]
+    assert [(m.error_mm, m.mean) for m in view.known] == [(0.0, -1.0), (4.0, 1.0), (16.0, 8.0)]
+    assert view.crossing_mm == pytest.approx(2.0)
+    assert view.paper_db == 7.4
+    assert view.error_at(7.4) == pytest.approx(4 + 12 * 6.4 / 7)
+    assert view.honest is not None and (view.honest.error_mm, view.honest.mean) == (5.0, 1.5)
+    assert "the two are equal at 2.0 mm" in margin.sentence(view)
+    assert margin.margin_curves(Scores(results[:6])) == ()
+
+
+def test_charts_are_svg_with_a_mark_where_a_method_breaks() -> None:
+    (report,) = courses.stability_reports(course((30.0, 26.0, 12.0, 11.0)))
+    for _, chart in report.charts:
+        root = ElementTree.fromstring(chart)
+        assert root.tag.endswith("svg")
+        assert "breakdown" in "".join(root.itertext())
+    assert report.breakdowns[0].entries == ("50 (19.0 dB lost at worst)",)
+
+
+@pytest.mark.parametrize("stress", [("cameras", 0.0), ("weather", 1.0), ("frames", float("inf"))])
+def test_a_stress_without_meaning_is_refused(stress: tuple[str, float]) -> None:
+    with pytest.raises(InputError):
+        Stress(axis=stress[0], severity=stress[1])
+
+
+def test_every_axis_changes_what_a_method_learns_from_more_and_more(tmp_path: Path) -> None:
+    capture = load_capture(write_capture(tmp_path))
+    train = Split(cameras=tuple(f"cam{i}" for i in range(4)), frames=tuple(range(20)))
+    capture = replace(capture, splits={**capture.splits, "train": train})
+    for name, axis in AXES.items():
+        found = [axis.perturbation(capture, severity) for severity in axis.severities]
+        assert len({repr(p) for p in found}) == len(found), name
+        assert list(axis.severities) == sorted(axis.severities)
+
+
+def test_a_stressed_suite_has_its_clean_captures_first_and_one_per_stress() -> None:
+    suite = SUITES["stability"]
+    assert [spec.stress for spec in suite.captures] == [None, *ALL_STRESSES]
+    assert len(list(suite.cells)) == suite.seeds * len(suite.methods) * (1 + len(ALL_STRESSES))
+    assert len({spec.name for spec in suite.captures}) == 1 + len(ALL_STRESSES)
+
+
+def test_a_spoilt_capture_is_made_once_whole_and_again_after_an_accident(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clean = write_capture(tmp_path / "clean")
+    original = runs.make_capture
+
+    def make(spec: CaptureSpec, data: Path, *, workers: int) -> Path:
+        return clean if spec.stress is None else original(spec, data, workers=workers)
+
+    monkeypatch.setattr(runs, "make_capture", make)
+    spec = CaptureSpec(scene="boxes", size="ci", stress=Stress(axis="frames", severity=50.0))
+    folder = make(spec, tmp_path, workers=1)
+    whole, spoilt = load_capture(clean), load_capture(folder)
+    assert len(spoilt.splits["train"].frames) == round(len(whole.splits["train"].frames) / 2)
+    assert spoilt.identity != whole.identity and not verify_capture(folder)
+    stamp = (folder / "manifest.json").stat().st_mtime_ns
+    assert make(spec, tmp_path, workers=1) == folder
+    assert (folder / "manifest.json").stat().st_mtime_ns == stamp
+    (folder / "manifest.json").unlink()
+    assert load_capture(make(spec, tmp_path, workers=1)).identity == spoilt.identity
