@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from ash.adam import Adam
 from ash.dataset import Camera, Capture
 from ash.drawing import draw_mesh, textured, topology_of
 from ash.graph import EmbeddedGraph
@@ -71,7 +72,7 @@ def track_images(capture: Capture, template: Template, graph: EmbeddedGraph, *, 
     groups = {RATE: [subject.texture, subject.light], MOVE_RATE: list(subject.shared.parameters())}
     shared = [{"params": parameters, "lr": rate} for rate, parameters in groups.items()]
     own = [{"params": [subject.own], "lr": MOVE_RATE}]
-    optimiser = torch.optim.Adam(shared + own)
+    optimiser = Adam(shared + own)
     generator = torch.Generator().manual_seed(seed)
     names = list(images.cameras)
     for step in range(STEPS):
@@ -79,10 +80,10 @@ def track_images(capture: Capture, template: Template, graph: EmbeddedGraph, *, 
         chosen = torch.randperm(len(names), generator=generator)[:VIEWS].tolist()
         background = torch.rand(3, generator=generator)
         batch = cut_batch(images, frames[index], [names[i] for i in chosen], background)
-        for group, rate in zip(optimiser.param_groups, (RATE, MOVE_RATE, MOVE_RATE), strict=True):
+        for group, rate in zip(optimiser.groups, (RATE, MOVE_RATE, MOVE_RATE), strict=True):
             group["lr"] = rate * (1 - step / STEPS)
         if step < SHARED_STEPS:
-            optimiser.param_groups[-1]["lr"] = 0.0
+            optimiser.groups[-1]["lr"] = 0.0
         canonical = subject.canonical(rest, index)
         loss = _image_loss(subject, posed[frames[index]], canonical, batch) + subject.restraint(index)
         optimiser.zero_grad()

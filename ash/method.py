@@ -10,6 +10,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from ash.adam import Adam
 from ash.avatar import AshModel
 from ash.blendshapes import LocalBlendshapes
 from ash.config import AshConfig, ModelConfig
@@ -129,7 +130,7 @@ class AshAvatar:
         """Pseudo ground truth of one frame: positions stay on the template, everything else is fitted to its views."""
         alone = replace(images, frames=(frame,))
         raw = self.analytic.clone().requires_grad_()
-        optimiser = torch.optim.Adam([raw], lr=self.config.training.base_learning_rate, fused=True)
+        optimiser = Adam([{"params": [raw], "lr": self.config.training.base_learning_rate}])
         conditions = self._conditions_of(frame)
         for step in range(FITTED_STEPS):
             batch = draw_batch(alone, self.config.training, self.config.seed, step)
@@ -143,7 +144,7 @@ class AshAvatar:
     def _regress(self, frames: Sequence[int], target: Callable[[int], Tensor]) -> None:
         assert self.module.decoders is not None
         training = self.config.training
-        optimiser = torch.optim.Adam(self.module.decoders.parameters(), lr=training.learning_rate, fused=True)
+        optimiser = Adam([{"params": list(self.module.decoders.parameters()), "lr": training.learning_rate}])
         weights = torch.ones(self.analytic.shape[1])
         weights[10] = WARMUP_OPACITY_WEIGHT
         for step in range(training.warmup_steps):

@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from ash.adam import Adam
 from ash.config import TrainingConfig
 from ash.dataset import Camera, Capture
 from ash.files import InputError, write_atomic
@@ -212,8 +213,8 @@ class _Run:
     def __init__(self, learner: Trainable, config: TrainingConfig, images: TrainingImages, folder: Path) -> None:
         self.learner, self.config, self.images = learner, config, images
         groups = learner.parameter_groups()
-        self.optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
-        self.initial_rates = [group["lr"] for group in self.optimiser.param_groups]
+        self.optimiser = Adam(groups, eps=1e-15)
+        self.initial_rates = [group["lr"] for group in groups]
         self.path, self.log = folder / "checkpoint.safetensors", folder / "log.jsonl"
         self.step, self.seconds, self.rate_scale = 0, 0.0, 1.0
         self.curve_steps = {round(share * config.steps) for share in CURVE}
@@ -229,9 +230,9 @@ class _Run:
     def advance(self, batch: Batch) -> None:
         """One step of Adam."""
         factor = self._schedule() * self.rate_scale
-        for group, rate in zip(self.optimiser.param_groups, self.initial_rates, strict=True):
+        for group, rate in zip(self.optimiser.groups, self.initial_rates, strict=True):
             group["lr"] = rate * factor
-        self.optimiser.zero_grad(set_to_none=True)
+        self.optimiser.zero_grad()
         try:
             drawn = self.learner.draw_training_views(batch.frame, batch.cameras, batch.background, self.step)
         except FloatingPointError as error:
@@ -258,7 +259,7 @@ class _Run:
         return FINAL_LEARNING_RATE + (1 - FINAL_LEARNING_RATE) * 0.5 * (1 + math.cos(math.pi * fraction))
 
     def _finite(self, loss: Tensor) -> bool:
-        gradients = [p.grad for group in self.optimiser.param_groups for p in group["params"] if p.grad is not None]
+        gradients = [p.grad for p in self.optimiser.parameters if p.grad is not None]
         return all(torch.isfinite(g.sum()) for g in [loss.detach(), *gradients])
 
     def _roll_back(self, why: str) -> None:
@@ -305,8 +306,8 @@ class _Run:
                 self._roll_back("weights not finite")
             return False
         tensors = {f"model.{name}": value.contiguous() for name, value in self.learner.module.state_dict().items()}
-        for index, state in self.optimiser.state_dict()["state"].items():
-            for name, value in state.items():
+        for index, moments in enumerate(self.optimiser.moments):
+            for name, value in (moments or {}).items():
                 tensors[f"adam.{index}.{name}"] = value.contiguous()
         tensors |= {f"average.{name}": value.contiguous() for name, value in self.average.items()}
         facts = {"step": str(self.step), "seconds": repr(self._elapsed()), "rate_scale": repr(self.rate_scale)}
@@ -326,16 +327,13 @@ class _Run:
             return False
         tensors, facts = read_safetensors(self.path)
         load_module(self.learner.module, {n[6:]: t for n, t in tensors.items() if n.startswith("model.")}, self.path)
-        parameters = [p for group in self.optimiser.param_groups for p in group["params"]]
-        state: dict[int, dict[str, Tensor]] = {}
-        for name, value in tensors.items():
-            if name.startswith("adam."):
-                _, index, key = name.split(".")
-                # The fused Adam walks memory: moments must lie as their parameter does (channels last, say).
-                laid = torch.empty_like(parameters[int(index)]).copy_(value) if value.dim() else value
-                state.setdefault(int(index), {})[key] = laid.detach()
-        groups = self.optimiser.state_dict()["param_groups"]
-        self.optimiser.load_state_dict({"state": state, "param_groups": groups})
+        for index, parameter in enumerate(self.optimiser.parameters):
+            if f"adam.{index}.step" not in tensors:  # It never had a gradient.
+                self.optimiser.moments[index] = None
+                continue
+            moments = self.optimiser.moments[index] = Adam.moments_like(parameter)
+            for name, value in moments.items():
+                value.copy_(tensors[f"adam.{index}.{name}"])
         for name, value in self.average.items():
             value.copy_(tensors[f"average.{name}"])
         self.step, self.seconds = int(facts["step"]), float(facts["seconds"])

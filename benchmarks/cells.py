@@ -34,6 +34,7 @@ class CellConfig:
     preset: str
     seed: int
     code: str  # SHA-256 over the sources that decide the outcome
+    truth: str = ""  # what the capture shows, on any machine: hash of scene, generator and perturbation
     axis: str = ""  # the stress axis along which the capture is spoilt; none: the clean capture
     severity: float = 0.0
     protocol: str = PROTOCOL

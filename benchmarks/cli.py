@@ -135,7 +135,7 @@ def gate(arguments: argparse.Namespace) -> int:
         write_atomic(arguments.markdown, summary.encode())
     if arguments.junit:
         write_atomic(arguments.junit, rules.junit(checks).encode())
-    return DONE if all(check.verdict == "pass" for check in checks) else FAILED
+    return DONE if all(check.verdict in rules.FINE for check in checks) else FAILED
 
 
 def gate_rates(arguments: argparse.Namespace) -> int:

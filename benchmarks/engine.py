@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import psutil
 
-from ash.files import InputError
+from ash.files import InputError, read_json
 from benchmarks.cells import Cell, CellResult, Status, failed_result, read_cell, read_result, write_config, write_result
 from benchmarks.progress import Progress
 
@@ -257,9 +257,9 @@ def _why_stale(cell: Cell) -> str | None:
     fresh = asdict(cell.config)
     same = ("scene", "size", "method", "preset", "seed", "capture_seed", "axis", "severity")
     for path in cell.folder.parent.glob("*/config.json"):
-        old = asdict(read_cell(path.parent).config)
-        if path.parent != cell.folder and all(old[name] == fresh[name] for name in same):
-            changed = [name for name in ("code", "capture", "protocol") if old[name] != fresh[name]]
+        old = read_json(path).get("config", {})  # Other versions of this program knew other fields.
+        if path.parent != cell.folder and all(old.get(name) == fresh[name] for name in same):
+            changed = [name for name in ("code", "capture", "protocol") if old.get(name) != fresh[name]]
             if (path.parent / "result.json").exists() and changed:
                 return f"the {' and the '.join(changed)} changed since its last result"
     return None

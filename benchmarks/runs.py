@@ -5,9 +5,10 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from ash.dataset import load_capture, read_manifest, verify_capture
-from ash.files import InputError, read_json, write_json
+from ash.files import InputError, hash_of, read_json, write_json
 from benchmarks import splats_rung
 from benchmarks.cells import Cell, CellConfig, CellResult, read_cell, read_result
 from benchmarks.engine import Limits, make_executor, plan_cells, run_cells, shard_of
@@ -133,11 +134,13 @@ def require_intact(folder: Path) -> None:
 
 def cell_for(spec: CellSpec, capture_folder: Path, out: Path) -> Cell:
     """The cell of a method on a capture, in its folder under `out`."""
+    capture = load_capture(capture_folder)
     config = CellConfig(
         scene=spec.capture.scene,
         size=spec.capture.size,
         capture_seed=spec.capture.seed,
-        capture=load_capture(capture_folder).identity,
+        capture=capture.identity,
+        truth=_truth_of(capture.manifest),
         method=spec.method,
         preset=spec.preset,
         seed=spec.seed,
@@ -146,6 +149,12 @@ def cell_for(spec: CellSpec, capture_folder: Path, out: Path) -> Cell:
         severity=spec.capture.stress.severity if spec.capture.stress else 0.0,
     )
     return Cell(config=config, folder=out / "cells" / config.key, capture_folder=capture_folder)
+
+
+def _truth_of(manifest: dict[str, Any]) -> str:
+    """A name for what a capture shows that does not depend on the machine that rendered it."""
+    spoilt = {name: value for name, value in manifest.get("perturbed", {}).items() if name != "of"}
+    return hash_of([manifest.get("identity"), manifest.get("source"), spoilt])
 
 
 def write_run(run: Run) -> None:

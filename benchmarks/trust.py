@@ -11,7 +11,7 @@ from ash.files import write_atomic, write_json
 from benchmarks.cells import Cell, CellResult, read_result
 from benchmarks.defects import DEFECTS
 from benchmarks.experiments import SUITES, CaptureSpec, CellSpec
-from benchmarks.gate import Baseline, Check, judge, summarise
+from benchmarks.gate import FINE, Baseline, Check, judge, summarise
 from benchmarks.runs import RunOptions, cell_for, make_capture, require_intact, run_missing
 from benchmarks.statistics import wilson
 
@@ -109,7 +109,7 @@ def _rate(what: str, count: int, trials: int) -> str:
 
 
 def _trial(name: str, about: str, before: Baseline, after: Baseline) -> Trial:
-    flagged = tuple(check for check in judge(before, after) if check.verdict != "pass")
+    flagged = tuple(check for check in judge(before, after) if check.verdict not in FINE)
     return Trial(name=name, about=about, flagged=flagged)
 
 

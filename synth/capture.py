@@ -36,7 +36,7 @@ from synth import cloth, texture
 from synth.bare import bare_template
 from synth.body import Body, Surface
 from synth.checks import penetrations, stretch
-from synth.code import code_version
+from synth.code import code_version, source_version
 from synth.mannequin import mannequin
 from synth.motion import make_motion, pose_novelty
 from synth.presets import require_space
@@ -169,6 +169,7 @@ def _manifest(scene: Scene, *, files: dict[str, str], complete: bool, made_with:
         "seed": scene.seed,
         "identity": scene.identity,
         "code": code_version(),
+        "source": source_version(),
         "parameters": scene.parameters,
         "splits": {
             name: {"cameras": list(split.cameras), "frames": list(split.frames)}

@@ -12,7 +12,7 @@ from benchmarks.gate import Check, judge, junit, markdown, read_baseline, summar
 
 def result(seed: int, *, psnr: float, ms: float = 10.0, mb: float = 400.0, params: float = 1000.0) -> CellResult:
     config = CellConfig(
-        scene="boxes", size="ci", capture_seed=0, capture="c", method="ash", preset="ci", seed=seed, code="0"
+        scene="boxes", size="ci", capture_seed=0, capture="c", method="ash", preset="ci", seed=seed, code="0", truth="t"
     )
     rows = [
         Summary(split=split, region="foreground", metric="psnr", value=psnr) for split in ("novel_view", "novel_pose")
@@ -62,6 +62,17 @@ def test_costs() -> None:
     assert verdicts(run(same, params=1001.0))["params"] == "fail"
 
 
+def test_on_another_machine_qualities_are_judged_and_costs_are_not() -> None:
+    worse = run([24.4, 24.5, 24.45], ms=30.0, mb=900.0)
+    rendered_there = [replace(r, config=replace(r.config, capture="other bytes")) for r in worse]
+    checks = judge(BASE, replace(summarise("ci", rendered_there), machine="another"))
+    found = {check.what.split(": ")[1]: check.verdict for check in checks}
+    assert found["novel_view/foreground/psnr"] == "fail" and found["memory and times"] == "not judged"
+    assert "peak memory" not in found and "time of frame" not in found and found["params"] == "pass"
+    suite = ElementTree.fromstring(junit(checks).split("\n", 1)[1])
+    assert len(suite.findall("testcase/skipped")) == 1 == int(suite.attrib["skipped"])
+
+
 def test_failed_and_missing_cells() -> None:
     failed = [*run([25.0, 25.1]), failed_result(result(2, psnr=0.0).config, "diverged", "nan")]
     assert verdicts(failed)["came through"] == "fail"
@@ -70,7 +81,7 @@ def test_failed_and_missing_cells() -> None:
 
 
 def test_another_capture_cannot_be_compared() -> None:
-    other = [replace(r, config=replace(r.config, capture="d")) for r in run([25.0, 25.1])]
+    other = [replace(r, config=replace(r.config, truth="d")) for r in run([25.0, 25.1])]
     assert verdicts(other)["capture"] == "fail"
 
 

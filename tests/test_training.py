@@ -8,6 +8,7 @@ import pytest
 import torch
 from captures import tube_model_config, write_tube_capture
 
+from ash.adam import Adam
 from ash.config import AshConfig, TrainingConfig
 from ash.files import InputError
 from ash.method import AshAvatar
@@ -179,7 +180,7 @@ def test_a_weight_that_is_nan_rolls_back_once_and_then_ends_the_run_as_diverged(
 
 @pytest.mark.parametrize("spoiled", [{12}, {12, 24}])
 def test_weights_that_the_last_step_spoiled_are_never_the_result(capture, tmp_path, monkeypatch, spoiled):
-    avatar, made, step = AshAvatar(config(), capture), [0], torch.optim.Adam.step
+    avatar, made, step = AshAvatar(config(), capture), [0], Adam.step
 
     def spoil(optimiser, *arguments):
         step(optimiser, *arguments)
@@ -188,7 +189,7 @@ def test_weights_that_the_last_step_spoiled_are_never_the_result(capture, tmp_pa
             with torch.no_grad():
                 avatar.module.base[0, 3] = float("nan")
 
-    monkeypatch.setattr(torch.optim.Adam, "step", spoil)
+    monkeypatch.setattr(Adam, "step", spoil)
     if len(spoiled) == 2:
         with pytest.raises(Diverged, match="weights not finite at step 12, again"):
             avatar.fit(capture, folder=tmp_path)
