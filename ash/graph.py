@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 import torch
-import trimesh
 from jaxtyping import Float, Int
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
@@ -46,6 +45,8 @@ def build_graph(mesh: TemplateMesh, *, nodes: int) -> EmbeddedGraph:
     count = len(mesh.vertices)
     if not LINKS < nodes <= count:
         raise InputError(f"embedded graph: expected {LINKS + 1} to {count} nodes, got {nodes}")
+    import trimesh  # Half a second, which most processes can spare.
+
     coarse = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).simplify_quadric_decimation(face_count=2 * nodes)
     chosen = np.unique(cKDTree(mesh.vertices).query(coarse.vertices)[1])
     edges = _edge_lengths(mesh.vertices, mesh.faces)

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from ash.dataset import TemplateMesh
 from ash.graph import vertex_neighbours
 
-UNIT_M = 0.001  # Of what is learned: Adam's step of 0.02 is then a fiftieth of a millimetre.
+UNIT_M = 0.004  # Of what is learned: Adam's step of 0.02 is then a twelfth of a millimetre.
 SWEEPS = 4  # Of smoothing over neighbours: a vertex is pulled by the pixels around it, not by a handful of its own.
 
 

@@ -13,7 +13,7 @@ Regions, ours first, then those of others' conventions:
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy import ndimage
@@ -22,6 +22,7 @@ from skimage.metrics import structural_similarity
 PROTOCOL = "1"
 PSNR_CAP_DB = 100.0  # Identical images would be infinite, and JSON and means know no infinity.
 FLIP_MARGIN = 24  # Pixels around the subject that FLIP's widest filter (radius 16 at 67 pixels per degree) can reach.
+SSIM_MARGIN = 11  # Pixels, beyond which windows of 11x11 or 7x7, mirrored at the margin's edge, see nothing.
 RELEASE_WINDOW = (600 / 1285, 496 / 940)
 
 Direction = Literal["up", "down", "none"]
@@ -123,17 +124,28 @@ def psnr(predicted: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = Non
 
 def ssim_map(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """SSIM per pixel `[h, w]`, mean over channels: 11x11 Gaussian window, sigma 1.5 (Wang et al. 2004)."""
-    _, similarity = structural_similarity(
-        truth.astype(np.float64) / 255,
-        predicted.astype(np.float64) / 255,
-        data_range=1.0,
-        channel_axis=2,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        full=True,
-    )
-    return similarity.mean(-1)
+    scaled = predicted.astype(np.float64) / 255, truth.astype(np.float64) / 255
+    window: dict[str, Any] = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    return _similarity(*scaled, blank=0, data_range=1.0, **window)
+
+
+def _similarity(predicted: np.ndarray, truth: np.ndarray, *, blank: int, **options: Any) -> np.ndarray:
+    """scikit-image's SSIM per pixel `[h, w]`. Where both images are `blank` far and wide it is 1 and not computed."""
+    similarity = np.ones(truth.shape[:2])
+    window = _occupied((predicted != blank).any(-1) | (truth != blank).any(-1), SSIM_MARGIN)
+    if window is not None:
+        _, inside = structural_similarity(truth[window], predicted[window], channel_axis=2, full=True, **options)
+        similarity[window] = inside.mean(-1)
+    return similarity
+
+
+def _occupied(mask: np.ndarray, margin: int) -> tuple[slice, slice] | None:
+    """The rows and columns that hold a mask and a margin around it; None where it is empty."""
+    places = np.argwhere(mask)
+    if len(places) == 0:
+        return None
+    (top, left), (bottom, right) = np.maximum(places.min(0) - margin, 0), places.max(0) + margin + 1
+    return slice(top, bottom), slice(left, right)
 
 
 def flip_map(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -144,11 +156,9 @@ def flip_map(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     import flip_evaluator
 
     error = np.zeros(truth.shape[:2])
-    occupied = np.argwhere((predicted != 0).any(-1) | (truth != 0).any(-1))
-    if len(occupied) == 0:
+    window = _occupied((predicted != 0).any(-1) | (truth != 0).any(-1), FLIP_MARGIN)
+    if window is None:
         return error
-    (top, left), (bottom, right) = np.maximum(occupied.min(0) - FLIP_MARGIN, 0), occupied.max(0) + FLIP_MARGIN + 1
-    window = slice(top, bottom), slice(left, right)
     pair = [np.ascontiguousarray(image[window], dtype=np.float32) / np.float32(255) for image in (truth, predicted)]
     error[window] = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False)[0][..., 0]
     return error
@@ -182,7 +192,8 @@ def box_ssim(predicted: np.ndarray, truth: np.ndarray) -> float:
     """SSIM with scikit-image's defaults: a 7x7 box window and sample covariance."""
     if min(truth.shape[:2]) < 7:
         return 1.0 if np.array_equal(predicted, truth) else 0.0
-    return float(structural_similarity(truth, predicted, data_range=255, channel_axis=2))
+    border = (slice(3, -3), slice(3, -3))  # Where a window would reach beyond the image.
+    return float(_similarity(predicted, truth, blank=255, data_range=255)[border].mean())
 
 
 def _window(occupied: np.ndarray, fraction: float) -> slice:
@@ -253,24 +264,26 @@ def surface_distance_mm(points: np.ndarray, vertices: np.ndarray, faces: np.ndar
     Exact among the triangles that meet at the 4 nearest vertices of each point, which on meshes with triangles
     of even size is the nearest triangle of all.
     """
-    tree_points = vertices[np.unique(faces)]
-    used = np.unique(faces)
     from scipy.spatial import cKDTree
 
-    _, nearest = cKDTree(tree_points).query(points, k=min(4, len(used)))
-    touching = [[] for _ in range(len(vertices))]  # type: list[list[int]]
-    for index, face in enumerate(faces):
-        for vertex in face:
-            touching[vertex].append(index)
-    width = max(len(triangles) for triangles in touching)
-    table = np.array(
-        [triangles + [triangles[0]] * (width - len(triangles)) for triangles in (t or [0] for t in touching)]
-    )
-    candidates = table[used[nearest.reshape(len(points), -1)]].reshape(len(points), -1)
+    used = np.unique(faces)
+    _, nearest = cKDTree(vertices[used]).query(points, k=min(4, len(used)))
+    candidates = _touching(faces)[used[nearest.reshape(len(points), -1)]].reshape(len(points), -1)
     distances = [
         _point_triangle(points, vertices[faces[candidates[:, column]]]) for column in range(candidates.shape[1])
     ]
     return float(np.min(distances, axis=0).mean()) * 1e3
+
+
+def _touching(faces: np.ndarray) -> np.ndarray:
+    """Triangles that meet at each vertex `[v, n]`, for `n` the most that do; where fewer do, the first again."""
+    order = faces.ravel().argsort(kind="stable")
+    corner, triangle = faces.ravel()[order], order // 3
+    start = np.searchsorted(corner, np.arange(corner[-1] + 1))
+    rank = np.arange(len(corner)) - start[corner]
+    table = np.repeat(triangle[np.minimum(start, len(corner) - 1)][:, None], rank.max() + 1, axis=1)
+    table[corner, rank] = triangle
+    return table
 
 
 def _point_triangle(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
