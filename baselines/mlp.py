@@ -18,8 +18,9 @@ LAYERS, WIDTH = 8, 256
 OCTAVES = 6
 
 # How many of ASH's training steps take as long as one of the MLP's: fastest steps of either, side by side in one
-# process on one core (a 2.5 GHz Cascade Lake), on the mannequin (ci) and on `loose` at size quick (cpu).
-ASH_STEPS_PER_STEP = {"ci": 5.0, "cpu": 12.0}
+# process on one core, on the mannequin (ci) and on `loose` at size quick. The processor multiplies matrices of bfloat16
+# (AMX); where it cannot, the MLP takes four times as long.
+ASH_STEPS_PER_STEP = {"ci": 2.6, "brief": 4.5, "cpu": 4.5}
 
 
 class MlpDecoder(nn.Module):
@@ -65,5 +66,7 @@ def mlp_time(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
 
 
 def _with_mlp(config: AshConfig, capture: Capture) -> AshAvatar:
+    """Products in bfloat16: float32 takes four times as long where the processor knows both."""
     dofs = capture.motion.dofs.shape[1]
+    config = replace(config, training=replace(config.training, precision="bfloat16"))
     return AshAvatar(config, capture, make_decoders=lambda model, _: MlpDecoder(model, dofs=dofs))

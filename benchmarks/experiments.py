@@ -117,6 +117,7 @@ SWITCHES = (
 )
 
 ABLATIONS = ("mlp", "res_128", "res_512", "cams_12", "cams_30", "cams_60")
+REFERENCES = ("mlp_time", "smpl", "static", "nearest", "oracle_texture")
 
 SUITES = {
     suite.name: suite
@@ -133,13 +134,13 @@ SUITES = {
         ),
         Suite(
             name="table",
-            about="the paper's two comparisons and two ablations on both outfits, three seeds",
+            about="the paper's two comparisons and two ablations on both outfits, and references, three seeds",
             scenes=("tight", "loose"),
             size="quick",
-            methods=(*MAIN_METHODS[:4], *ABLATIONS, *MAIN_METHODS[4:]),
-            preset="cpu",
+            methods=(*MAIN_METHODS[:4], *ABLATIONS, *REFERENCES, *MAIN_METHODS[4:]),
+            preset="brief",
             seeds=3,
-            cell_minutes=3.0,
+            cell_minutes=1.2,
         ),
         Suite(
             name="ladder",
@@ -149,17 +150,17 @@ SUITES = {
             methods=("ash", "wo_mot", "wo_disp", "mlp", "ddc", "ash_truth", "ddc_truth"),
             preset="ci",
             seeds=3,
-            cell_minutes=0.4,
+            cell_minutes=0.2,
         ),
         Suite(
             name="stability",
             about="where methods fail: nine ways to spoil a capture, three severities each, and the trivial baseline",
             scenes=("loose",),
             size="ci",
-            methods=("ash", "ddc", "wo_mot", "nearest"),
+            methods=("ash", "ddc", "nearest"),
             preset="ci",
             seeds=3,
-            cell_minutes=0.4,
+            cell_minutes=0.2,
             stresses=ALL_STRESSES,
         ),
         Suite(
@@ -170,7 +171,7 @@ SUITES = {
             methods=("ash", "ddc", *(method for pair in WRONG_BY_MM.values() for method in pair)),
             preset="ci",
             seeds=3,
-            cell_minutes=0.4,
+            cell_minutes=0.2,
         ),
         Suite(
             name="switches",
@@ -180,7 +181,7 @@ SUITES = {
             methods=("ash", *(f"baselines.switches:{name}" for name in SWITCHES)),
             preset="ci",
             seeds=3,
-            cell_minutes=0.4,
+            cell_minutes=0.2,
         ),
         Suite(
             name="speed",
@@ -188,9 +189,9 @@ SUITES = {
             scenes=("loose",),
             size="quick",
             methods=("ash", "ash_frugal", "res_128", "res_512", "wo_mot", "mlp", "static", "ddc"),
-            preset="cpu",
+            preset="brief",
             seeds=3,
-            cell_minutes=3.0,
+            cell_minutes=1.2,
         ),
         Suite(
             name="paper",
@@ -212,7 +213,7 @@ SUITES = {
             methods=("ash", "ddc", "ash_truth", "ddc_truth"),
             preset="ci",
             seeds=1,
-            cell_minutes=0.3,
+            cell_minutes=0.2,
             limit_minutes=20.0,
         ),
     )

@@ -6,6 +6,7 @@ import pytest
 import torch
 from captures import tube_model_config, write_tube_capture
 
+from ash.adam import Adam
 from ash.config import AshConfig
 from ash.decoders import ConvBlock, GlobalFeatures
 from ash.files import InputError
@@ -64,7 +65,7 @@ def test_every_preset_trains(name, capture, tmp_path, monkeypatch):
 
 
 def test_unknown_presets_are_refused_with_the_known_ones_named():
-    with pytest.raises(InputError, match="ci, cpu, frugal, paper, official"):
+    with pytest.raises(InputError, match="ci, brief, cpu, frugal, paper, official"):
         named("paperr")
 
 
@@ -178,10 +179,8 @@ def test_without_cropping_the_same_views_are_seen_whole(capture, tmp_path):
 
 
 def test_a_constant_schedule_keeps_the_learning_rates(capture, tmp_path, monkeypatch):
-    rates, step = [], torch.optim.Adam.step
-    monkeypatch.setattr(
-        torch.optim.Adam, "step", lambda self: (rates.append(self.param_groups[0]["lr"]), step(self))[1]
-    )
+    rates, step = [], Adam.step
+    monkeypatch.setattr(Adam, "step", lambda self: (rates.append(self.groups[0]["lr"]), step(self))[1])
     for schedule in ("constant", "cosine"):
         seen_by_steps(capture, tmp_path / schedule, schedule=schedule)
     assert rates[:6] == [2e-3] * 6

@@ -15,7 +15,7 @@ from ash.dataset import Camera, Capture, Motion, image_path, load_capture, write
 from ash.files import InputError, write_image
 from ash.protocol import Avatar, StageClock
 from baselines.bare_body import smpl
-from baselines.mlp import mlp, mlp_time
+from baselines.mlp import ASH_STEPS_PER_STEP, mlp, mlp_time
 from baselines.nearest import central_frame, move_image, nearest, pose_distances, see_root
 from baselines.oracle_texture import oracle_texture
 from baselines.static import of_one_frame, static
@@ -145,7 +145,7 @@ def test_mlp_at_equal_time_takes_fewer_steps_of_the_same_network(capture):
     seen = capture.training_only()
     steps, time = (make(seen, seed=0, preset="ci") for make in (mlp, mlp_time))
     assert steps.config.training.steps == 40
-    assert time.config.training.steps == round(40 / 5.0)
+    assert time.config.training.steps == round(40 / ASH_STEPS_PER_STEP["ci"])
     assert time.config.training.warmup_steps < time.config.training.steps
     assert torch.equal(*(torch.cat([p.flatten() for p in m.module.parameters()]) for m in (steps, time)))
     with pytest.raises(InputError, match="equal time"):
