@@ -103,8 +103,13 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def report(arguments: argparse.Namespace) -> int:
-    """Write the report of a run again."""
-    return _report(arguments.run)
+    """Write the report of a run again, and publish it where that is asked for."""
+    code = _report(arguments.run)
+    if arguments.publish is not None:
+        from benchmarks.report import publish
+
+        publish(arguments.run, arguments.publish)
+    return code
 
 
 def gate(arguments: argparse.Namespace) -> int:
@@ -257,6 +262,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_lpips(verb)
     verb = _verb(verbs, report, "report", "write the report of a run again")
     verb.add_argument("run", type=Path, metavar="RUN")
+    verb.add_argument("--publish", type=Path, metavar="DIR", help="copy all of it but the page there, to be committed")
     _add_gate(verbs)
     verb = _verb(verbs, merge, "merge", "put the cells of shards together and report")
     verb.add_argument("shards", type=Path, metavar="RUN", nargs="+")

@@ -5,11 +5,12 @@ Everything comes from the results of the run's cells; the page needs no network 
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from ash.files import write_atomic
+from ash.files import InputError, write_atomic
 from benchmarks import causes, conventions, courses, necessity, paper, tables
 from benchmarks.cells import CellResult
 from benchmarks.contrasts import Contrast
@@ -19,6 +20,8 @@ from benchmarks.results import tidy, write_csv
 from benchmarks.runs import Run, failures, results_of
 from benchmarks.scene_report import SceneReport, scene_report
 from benchmarks.scores import Scores
+
+PUBLISHED = ("report.md", "results.csv", "tables.tex", "chart_*.svg", "pictures_*.png", "worst_*.png")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -76,6 +79,22 @@ def write_report(run: Run) -> list[str]:
         short = tables.build(scores, scene.name, columns, title="")
         lines += [scene.headline, *(f"- {remark}" for remark in scene.remarks), "", tables.plain(short), ""]
     return [*lines, f"report: {folder / 'report.html'}"]
+
+
+def publish(run: Path, folder: Path) -> None:
+    """Copy what a repository should keep of a report, in place of what an earlier one left there.
+
+    Raises:
+        InputError: the report was not written.
+    """
+    found = [path for pattern in PUBLISHED for path in sorted(run.glob(pattern))]
+    if not (run / PUBLISHED[0]).exists():
+        raise InputError(f"{run}: expected {PUBLISHED[0]}, which `ash-bench report` writes")
+    for pattern in PUBLISHED:
+        for old in folder.glob(pattern):
+            old.unlink()
+    for path in found:
+        write_atomic(folder / path.name, path.read_bytes())
 
 
 def html_of(run: Run, results: Sequence[CellResult], sections: Sections, scenes: Sequence[SceneReport]) -> str:

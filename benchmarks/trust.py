@@ -43,7 +43,11 @@ class Trust:
 
 
 def measure(out: Path, data: Path, *, reruns: int, workers: int) -> Trust:
-    """Train what is missing, judge, and write `rates.md` and `rates.json` into `out`."""
+    """Train what is missing, judge, and write `rates.md` and `rates.json` into `out`.
+
+    Raises:
+        KeyboardInterrupt: trainings were interrupted; the next call goes on with them.
+    """
     suite = SUITES["ci"]
     spec = CaptureSpec(scene=suite.scenes[0], size=suite.size)
     folder = make_capture(spec, data, workers=workers)
@@ -61,6 +65,8 @@ def measure(out: Path, data: Path, *, reruns: int, workers: int) -> Trust:
     wanted += [cells_of(method, base) for method in SOUND_FOR.values()]
     wanted += [cells_of(_target(defect.__name__), other) for defect in DEFECTS]
     run_missing([cell for group in wanted for cell in group], suite, RunOptions(out=out, data=data, workers=workers))
+    if any(read_result(cell.folder) is None for group in wanted for cell in group):
+        raise KeyboardInterrupt("some trainings were interrupted")
 
     def baseline(method: str, seeds: range) -> Baseline:
         return summarise("ci", [_as(SOUND, cell) for cell in cells_of(method, seeds)])

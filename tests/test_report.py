@@ -12,13 +12,14 @@ import fakes
 import pytest
 from cells import config
 
-from benchmarks import charts, findings, tables
+from ash.files import InputError
+from benchmarks import charts, cli, findings, tables
 from benchmarks.cells import CellResult, Summary, failed_result
 from benchmarks.charts import Bar, Line, Panel, Point
 from benchmarks.engine import Limits, make_executor, plan_cells, run_cells
 from benchmarks.experiments import CaptureSpec, CellSpec
 from benchmarks.progress import Progress
-from benchmarks.report import write_report
+from benchmarks.report import publish, write_report
 from benchmarks.runs import Run, cell_for, read_run, write_run
 from benchmarks.scores import Scores
 
@@ -289,3 +290,19 @@ def test_a_failed_method_is_compared_with_nobody() -> None:
     assert findings.headline(fallen, "loose") == "On loose, DDC failed, so ASH and DDC cannot be compared."
     assert not any("exact surface, " in remark and "leads" in remark for remark in findings.remarks(fallen, "loose"))
     assert contrasts(fallen, "loose") == ()
+
+
+def test_a_published_report_replaces_the_one_before_and_leaves_the_rest_alone(run: Run, tmp_path: Path) -> None:
+    place = tmp_path / "reports" / "fakes"
+    place.mkdir(parents=True)
+    for name in ("chart_gone.svg", "findings.md"):
+        (place / name).write_text("before")
+    command = ["report", str(run.folder), "--publish", str(place)]
+    assert cli.main(command) == cli.FAILED, "one method failed, and the report says so"
+    there = {path.name for path in place.iterdir()}
+    assert {"report.md", "results.csv", "tables.tex", "chart_boxes.svg", "findings.md"} <= there
+    assert "chart_gone.svg" not in there and "report.html" not in there
+    assert (place / "report.md").read_bytes() == (run.folder / "report.md").read_bytes()
+    with pytest.raises(InputError, match=r"expected report\.md"):
+        publish(tmp_path, place)
+    assert (place / "report.md").exists()
