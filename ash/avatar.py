@@ -1,8 +1,10 @@
 """The ASH avatar, in the paper's order: template, textures, decoders, skinning, splatting. START READING HERE."""
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -22,6 +24,8 @@ from ash.textures import (
     build_lattice,
     normalised_motion,
 )
+
+Decode = Callable[[Conditions], Tensor]  # to raw parameters [n, o]
 
 
 class AshModel(nn.Module):
@@ -74,9 +78,15 @@ class AshModel(nn.Module):
     def _textures(self, motion: Motion, frame: int) -> Float[Tensor, "c r r"]:
         return torch.zeros(0, 1, 1) if self.textures is None else self.textures(self.template, motion, frame)
 
-    def decode(self, conditions: Conditions, *, static: bool = False) -> Float[Tensor, "n o"]:
-        """Stg.3: raw Gaussian parameters per texel. `static` leaves the decoders out (the warm-up of the base)."""
-        raw = self.base if self.decoders is None or static else self.base + self.decoders(conditions)
+    def decode(
+        self, conditions: Conditions, *, static: bool = False, decoders: Decode | None = None
+    ) -> Float[Tensor, "n o"]:
+        """Stg.3: raw Gaussian parameters per texel.
+
+        `static` leaves the decoders out (the warm-up of the base); `decoders` are others than the model's own.
+        """
+        decoders = decoders or self.decoders
+        raw = self.base if decoders is None or static else self.base + decoders(conditions)
         if self.refinement is None:
             return raw
         moved = self.lattice.interpolate(self.refinement()) / self.config.offset_unit_m
@@ -94,15 +104,31 @@ class AshModel(nn.Module):
             gaussians, **views_of(cameras), background=background, dilation=self.config.dilation, threads=threads
         )
 
-    def forward(self, motion: Motion, frame: int, camera: Camera, clock: StageClock | None = None) -> Splatted:
+    def forward(
+        self,
+        motion: Motion,
+        frame: int,
+        camera: Camera,
+        clock: StageClock | None = None,
+        *,
+        decoders: Decode | None = None,
+    ) -> Splatted:
         """Motion and camera to image: the whole of ASH, over black, on as many threads as torch is given."""
         threads = torch.get_num_threads()
         conditions = self.conditions(motion, frame, clock, threads)  # Stg.1, Stg.2
         with _stage(clock, "stg3"):
-            raw = self.decode(conditions)
+            raw = self.decode(conditions, decoders=decoders)
         with _stage(clock, "stg4"):
             gaussians = self.pose(raw, conditions, threads)
             return self.draw(gaussians, [camera], None, threads)
+
+
+def image_of(drawn: Splatted) -> np.ndarray:
+    """The first view as a method returns it: premultiplied RGBA, float32 `[h, w, 4]`."""
+    height, width = drawn.alpha.shape[1:]
+    image = torch.empty(height, width, 4)
+    image[..., :3], image[..., 3] = drawn.rgb[0], drawn.alpha[0]
+    return image.clamp_(0, 1).numpy()
 
 
 def views_of(cameras: list[Camera]) -> dict[str, Any]:

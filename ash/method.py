@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ash.adam import Adam
-from ash.avatar import AshModel
+from ash.avatar import AshModel, image_of
 from ash.blendshapes import LocalBlendshapes
 from ash.config import AshConfig, ModelConfig
 from ash.dataset import Camera, Capture, Motion, fewer_cameras
@@ -158,10 +158,7 @@ class AshAvatar:
     @torch.no_grad()
     def render(self, motion: Motion, frame: int, camera: Camera, *, clock: StageClock) -> np.ndarray:
         """Premultiplied RGBA, float32 `[h, w, 4]`."""
-        drawn = self.module(motion, frame, camera, clock)
-        image = torch.empty(camera.height, camera.width, 4)
-        image[..., :3], image[..., 3] = drawn.rgb[0], drawn.alpha[0]
-        return image.clamp_(0, 1).numpy()
+        return image_of(self.module(motion, frame, camera, clock))
 
     def template_vertices(self, motion: Motion, frame: int) -> np.ndarray:
         """The posed template, `[v, 3]` metres."""

@@ -1,0 +1,96 @@
+"""Playback of a trained avatar: template and history cached, the decoders on the engine that is fastest here.
+
+Engines are measured on the machine and in the process that plays, with as many threads as torch is given there. One
+counts only where its image agrees with that of the precision that was trained.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ash.avatar import Decode, image_of
+from ash.dataset import Camera, Motion
+from ash.method import AshAvatar
+from ash.protocol import StageClock
+from ash.textures import Conditions
+
+LEAST_AGREEMENT_DB = 45.0  # An image at 30 dB from the truth changes by less than 0.3 dB.
+ROUNDS = 5
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Engine:
+    """One way to run the decoders, and what it was found to be worth."""
+
+    name: str
+    decode: Decode
+    ms: float  # the fastest of a few decodings
+    agreement_db: float  # PSNR of its image against that of the trained precision, on the foreground
+
+
+class Player:
+    """Draws frames of a motion with a trained avatar, as fast as this machine can."""
+
+    def __init__(self, avatar: AshAvatar, motion: Motion, camera: Camera) -> None:
+        """Measures the engines on the motion's first frame, seen by `camera`."""
+        self._model, self._motion = avatar.module, motion
+        self.engines = self._measured(camera)
+        self.engine = min(self.engines, key=lambda engine: engine.ms, default=None)
+
+    @torch.no_grad()
+    def draw(self, frame: int, camera: Camera, *, clock: StageClock | None = None) -> np.ndarray:
+        """Premultiplied RGBA, float32 `[h, w, 4]`; stages are timed as the paper's `stg1` to `stg4`."""
+        decoders = None if self.engine is None else self.engine.decode
+        return image_of(self._model(self._motion, frame, camera, clock, decoders=decoders))
+
+    @torch.no_grad()
+    def _measured(self, camera: Camera) -> tuple[Engine, ...]:
+        """All engines that agree; none where the avatar has no decoders."""
+        decoders = self._model.decoders
+        if decoders is None:
+            return ()
+        conditions = self._model.conditions(self._motion, 0)
+        trained = image_of(self._model(self._motion, 0, camera))
+        found = []
+        for name, decode in (("float32", decoders), ("bfloat16", _in_bfloat16(decoders))):
+            image = image_of(self._model(self._motion, 0, camera, decoders=decode))
+            agreement = _psnr(image, trained)
+            if agreement >= LEAST_AGREEMENT_DB:
+                found.append(
+                    Engine(name=name, decode=decode, ms=_fastest_ms(decode, conditions), agreement_db=agreement)
+                )
+        return tuple(found)
+
+
+def _in_bfloat16(decoders: nn.Module) -> Decode:
+    """The decoders with weights and activations of half the size: faster where the processor multiplies them."""
+    half = deepcopy(decoders).to(torch.bfloat16)
+
+    def decode(conditions: Conditions) -> Tensor:
+        with torch.autocast(conditions.textures.device.type, torch.bfloat16):
+            raw: Tensor = half(conditions)
+        return raw.float()
+
+    return decode
+
+
+def _fastest_ms(decode: Callable[[Conditions], Tensor], conditions: Conditions) -> float:
+    best = math.inf
+    for _ in range(ROUNDS):
+        start = time.perf_counter()
+        decode(conditions)
+        best = min(best, time.perf_counter() - start)
+    return best * 1e3
+
+
+def _psnr(image: np.ndarray, reference: np.ndarray) -> float:
+    """In dB, where the reference is mostly covered."""
+    error = (image - reference)[reference[..., 3] > 0.5][:, :3]
+    mse = float(np.mean(error**2)) if error.size else 0.0
+    return -10 * math.log10(mse) if mse > 0 else math.inf
