@@ -31,11 +31,12 @@ class Avatar(Protocol):
     """An animatable avatar: learns from a capture, then renders any motion from any camera.
 
     A factory `make(capture: Capture, *, seed: int, preset: str) -> Avatar` is registered under the entry-point group
-    `ash_bench.methods`. A preset is a budget: every method knows at least `ci` (seconds) and `cpu` (minutes), and
-    raises ValueError for one it does not know. The capture handed to the factory and to `fit` holds training views
-    and training motion only, unless the suite lists the method among its oracles. A training that diverged raises
-    FloatingPointError. `log.jsonl` holds one object per line; `seconds` with `train_psnr` (dB, foreground, of a few
-    training views that the method kept from itself) or `loss` make the training curve of the report.
+    `ash_bench.methods`. A preset is a budget: every method knows at least `ci` (seconds), `brief` (half a minute) and
+    `cpu` (minutes), and raises ValueError for one it does not know. The capture handed to the factory and to `fit`
+    holds training views and training motion only, unless the suite lists the method among its oracles. A training that
+    diverged raises FloatingPointError. `log.jsonl` holds one object per line; `seconds` with `train_psnr` (dB,
+    foreground, of a few training views that the method kept from itself) or `loss` make the training curve of the
+    report.
     """
 
     def fit(self, capture: Capture, *, folder: Path) -> None:

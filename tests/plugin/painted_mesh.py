@@ -7,7 +7,7 @@ from ash.files import InputError
 from ash.rasterizing import project_vertices, rasterize_mesh
 from ash.template import skinned_template
 
-IMAGES = {"ci": 8, "cpu": 64}  # Budget: how many training images are looked at.
+IMAGES = {"ci": 8, "brief": 32, "cpu": 64}  # Budget: how many training images are looked at.
 
 
 class PaintedMesh:
