@@ -63,7 +63,10 @@ class PosedGeometry(Protocol):
     """What an avatar may offer besides, so that its geometry can be compared with the truth."""
 
     def template_vertices(self, motion: Motion, frame: int) -> np.ndarray:
-        """The posed template in frame `frame` of `motion`, float `[v, 3]` metres, vertices ordered as the capture's."""
+        """The posed template in frame `frame` of `motion`, float `[v, 3]` metres, vertices ordered as the capture's.
+
+        `[0, 3]` where they are others than the capture's.
+        """
 
     def gaussian_means(self, motion: Motion, frame: int) -> np.ndarray:
         """Centres of the posed Gaussians, float `[n, 3]` metres; `[0, 3]` for a method without any."""

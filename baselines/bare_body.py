@@ -2,13 +2,23 @@
 
 from dataclasses import replace
 
+import numpy as np
+
 from ash.config import TemplateConfig
-from ash.dataset import Capture, read_body
+from ash.dataset import Capture, Motion, read_body
 from ash.method import AshAvatar
 from ash.presets import named
 
 
-def smpl(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
+class BareBodyAvatar(AshAvatar):
+    """ASH on a mesh whose vertices are not those of the clothed template, even where there are as many."""
+
+    def template_vertices(self, motion: Motion, frame: int) -> np.ndarray:
+        """None that could be compared with the truth, `[0, 3]`."""
+        return np.zeros((0, 3))
+
+
+def smpl(capture: Capture, *, seed: int, preset: str) -> BareBodyAvatar:
     """ASH whose template is the bare body, skinned: clothes are whatever the offsets and the splats make of them."""
     config = replace(named(preset), seed=seed, template=TemplateConfig(kind="skinned"))
-    return AshAvatar(config, replace(capture, template=read_body(capture)))
+    return BareBodyAvatar(config, replace(capture, template=read_body(capture)))
