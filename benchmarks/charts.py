@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 
 FONT = "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-serif"
@@ -12,6 +12,11 @@ text{font-family:FONT;font-size:12px;fill:#1f2733}.dim{fill:#5d6878}.head{font-s
 .halo{paint-order:stroke;stroke:#ffffff;stroke-width:3px;stroke-linejoin:round}
 @media (prefers-color-scheme:dark){text{fill:#e6eaf0}.dim{fill:#9aa6b6}.grid{stroke:#2c3543}.axis,.front{stroke:#66717f}
 .paper,.hollow{fill:#12171f}.halo{stroke:#12171f}}""".replace("FONT", FONT)
+
+
+SPAN = 9.0  # dB that a chart shows below its best point
+FEW_POINTS, ROOM_PER_POINT = 8, 12.0  # From how many points on a chart grows, and by how many pixels each.
+APART = 17.0  # pixels between a point and a label that needs a line
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -75,10 +80,15 @@ class Axis:
 
 
 def scatter(panels: Sequence[Panel], *, x_title: str, y_title: str, width: float = 900.0, height: float = 400.0) -> str:
-    """Accuracy against speed: panels side by side that share both axes; x is logarithmic milliseconds."""
+    """Accuracy against speed: panels side by side that share both axes; x is logarithmic milliseconds.
+
+    What lies more than `SPAN` below the best stands at the lower edge with its value: it would press the rest together.
+    """
+    panels = _lifted(panels)
     everything = [point for panel in panels for point in panel.points]
     if not everything:
         return document("", width=width, height=60.0, title="no results")
+    height += ROOM_PER_POINT * max(0, max(len(panel.points) for panel in panels) - FEW_POINTS)
     left, right, top, bottom, gap = 58.0, 16.0, 44.0, 52.0, 28.0
     each = (width - left - right - gap * (len(panels) - 1)) / len(panels)
     y = linear_axis(
@@ -98,6 +108,18 @@ def scatter(panels: Sequence[Panel], *, x_title: str, y_title: str, width: float
     turned = f'transform="rotate(-90 16 {short(middle)})"'
     parts.append(text_at(16.0, middle, y_title, anchor="middle", kind="dim", extra=turned))
     return document("".join(parts), width=width, height=height, title=f"{y_title} against {x_title}")
+
+
+def _lifted(panels: Sequence[Panel]) -> list[Panel]:
+    """The panels, with points that lie far below all others raised to the floor and named with their value."""
+    floor = max((point.y for panel in panels for point in panel.points), default=0.0) - SPAN
+
+    def lift(point: Point) -> Point:
+        if point.y >= floor:
+            return point
+        return replace(point, y=floor, low=None, high=None, label=f"{point.label}: {point.y:.1f} ↓")
+
+    return [replace(panel, points=tuple(map(lift, panel.points))) for panel in panels]
 
 
 def curves(lines: Sequence[Line], *, x_title: str, y_title: str, width: float = 900.0, height: float = 320.0) -> str:
@@ -253,9 +275,20 @@ def _points(panel: Panel, x: Axis, y: Axis) -> str:
         parts.append(f'<circle cx="{short(px)}" cy="{short(py)}" r="5.5" {ink}>{title}</circle>')
     widths = [text_width(point.label) for point in panel.points]
     box = (x.start, y.end, x.end, y.start)
-    for point, place in zip(panel.points, place_labels(anchors, widths, box, whiskers), strict=True):
+    places = place_labels(anchors, widths, box, whiskers)
+    for point, anchor, place, width in zip(panel.points, anchors, places, widths, strict=True):
+        parts.append(_leader(anchor, place, width, point.colour))
         parts.append(text_at(*place, point.label, colour=point.colour, kind="halo"))
     return "".join(parts)
+
+
+def _leader(anchor: tuple[float, float], place: tuple[float, float], width: float, colour: str) -> str:
+    """A line from a point to its label where the label had to stand apart."""
+    near = min(max(anchor[0], place[0]), place[0] + width), min(max(anchor[1], place[1] - 9), place[1] + 1)
+    if math.dist(anchor, near) < APART:
+        return ""
+    ends = f'x1="{short(anchor[0])}" y1="{short(anchor[1])}" x2="{short(near[0])}" y2="{short(near[1])}"'
+    return f'<line {ends} stroke="{colour}" stroke-width="0.8" opacity="0.7"/>'
 
 
 def _front(anchors: Sequence[tuple[float, float]], x: Axis, y: Axis) -> str:

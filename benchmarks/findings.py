@@ -7,6 +7,7 @@ from benchmarks.names import EXACT, is_oracle, look_of
 from benchmarks.scores import Score, Scores
 
 TOO_CLOSE_DB = 0.1
+FEW_METHODS = 6
 
 
 def headline(scores: Scores, scene: str) -> str:
@@ -90,11 +91,17 @@ def _exact(scores: Scores, scene: str) -> str:
 
 
 def _cost(scores: Scores, scene: str) -> str:
-    parts = []
-    for method in scores.methods(scene):
-        frame = scores.get(scene, method, "speed", "", "frame_ms")
-        if frame and not is_oracle(method) and not scores.failed(scene, method):
-            parts.append(f"{look_of(method).title} {frame.mean:.0f} ms")
+    """Of many methods only the main two, the fastest and the slowest."""
+    found = [(method, scores.get(scene, method, "speed", "", "frame_ms")) for method in scores.methods(scene)]
+    known = [
+        (method, frame.mean)
+        for method, frame in found
+        if frame and not is_oracle(method) and not scores.failed(scene, method)
+    ]
+    if len(known) > FEW_METHODS:
+        ranked = sorted(known, key=lambda pair: pair[1])
+        known = [pair for pair in known if pair[0] in ("ash", "ddc") or pair in (ranked[0], ranked[-1])]
+    parts = [f"{look_of(method).title} {ms:.0f} ms" for method, ms in known]
     return f"A frame takes {', '.join(parts)} on one core." if parts else ""
 
 

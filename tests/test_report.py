@@ -178,7 +178,7 @@ def test_labels_overlap_neither_each_other_nor_points() -> None:
 
 def test_chart_positions_follow_the_values() -> None:
     points = tuple(
-        Point(x=x, y=y, label=f"m{x}", colour="#123456") for x, y in ((1.0, 10.0), (10.0, 20.0), (100.0, 25.0))
+        Point(x=x, y=y, label=f"m{x}", colour="#123456") for x, y in ((1.0, 18.0), (10.0, 22.0), (100.0, 24.0))
     )
     root = ElementTree.fromstring(charts.scatter([Panel(title="p", points=points)], x_title="x", y_title="y"))
     circles = root.findall("{http://www.w3.org/2000/svg}circle")
@@ -306,3 +306,27 @@ def test_a_published_report_replaces_the_one_before_and_leaves_the_rest_alone(ru
     with pytest.raises(InputError, match=r"expected report\.md"):
         publish(tmp_path, place)
     assert (place / "report.md").exists()
+
+
+def test_a_point_far_below_the_others_stands_at_the_floor_with_its_value() -> None:
+    near = [Point(x=10.0 + i, y=28.0 + i, label=f"near {i}", colour="#123456") for i in range(3)]
+    far = Point(x=20.0, y=11.0, label="far", colour="#654321")
+    alone, beside = (
+        charts.scatter([Panel(title="", points=tuple(p))], x_title="", y_title="") for p in (near, [*near, far])
+    )
+    assert "far: 11.0 ↓" in beside
+    heights = [[float(cy) for cy in re.findall(r'cy="([\d.]+)"', chart)] for chart in (alone, beside)]
+    assert heights[1][3] > max(heights[1][:3]), "below all others"
+    spread = [max(h[:3]) - min(h[:3]) for h in heights]
+    assert spread[1] > 0.15 * spread[0], "the others stay apart"
+
+
+def test_a_label_that_had_to_stand_apart_has_a_line_to_its_point() -> None:
+    crowd = [Point(x=10.0, y=28.0 + 0.02 * i, label=f"one of many {i}", colour="#123456") for i in range(12)]
+    lonely = [Point(x=10.0, y=34.0, label="alone", colour="#123456")]
+    crowd += lonely
+    lines = [
+        charts.scatter([Panel(title="", points=tuple(p))], x_title="", y_title="").count('stroke-width="0.8"')
+        for p in (crowd, lonely)
+    ]
+    assert lines[0] > 2 and lines[1] == 0
