@@ -32,6 +32,10 @@ class MlpDecoder(nn.Module):
         layers: list[nn.Module] = [nn.Linear(inputs, WIDTH), nn.ReLU()]
         for _ in range(LAYERS - 2):
             layers += [nn.Linear(WIDTH, WIDTH), nn.ReLU()]
+        for layer in layers:
+            if isinstance(layer, nn.Linear):  # As the U-Nets start, or nothing of the input is left at the head.
+                nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+                nn.init.zeros_(layer.bias)
         head = nn.Linear(WIDTH, raw_channels(config))
         nn.init.zeros_(head.weight)
         nn.init.zeros_(head.bias)
