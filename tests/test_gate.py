@@ -121,6 +121,12 @@ def test_a_baseline_survives_the_disk_and_is_checked(tmp_path: Path) -> None:
         judge(BASE, replace(BASE, suite="quick"))
 
 
+def test_the_committed_baseline_can_be_read() -> None:
+    baseline = read_baseline(Path(__file__).parent.parent / "reports" / "baseline.json")
+    assert baseline.suite == "ci"
+    assert all(len(entry.seeds) == 3 and not entry.failed and entry.times for entry in baseline.entries)
+
+
 def test_summary_and_junit() -> None:
     head = summarise("ci", run([24.4, 24.5, 24.45], mb=800.0))
     checks = [*judge(BASE, head), Check(what="a: <b> & c", verdict="pass", detail="")]
