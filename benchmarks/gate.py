@@ -3,8 +3,9 @@
 Three levels. Identical predictions prove that nothing changed. Otherwise qualities are compared by seed means: a loss
 fails when it is larger than the metric's margin and is established (Welch's test, corrected by Holm over all
 comparisons); an equally established rise is flagged as well, for a leak looks like progress. Costs: exact work counts,
-and, on a processor like the baseline's, peak memory and frame times, these as a ratio to a reference workload that was
-timed between the frames, because the machine's mood is in both. Elsewhere memory and times are not judged.
+and, on a processor like the baseline's, peak memory and times of frames and training, these as a ratio to a reference
+workload that was timed between the frames, because the machine's mood is in both. A training that became much shorter
+is flagged as well: it may have left something out. Elsewhere memory and times are not judged.
 """
 
 import math
@@ -33,6 +34,7 @@ GATED = (  # (split, region, metric): few, so that the correction for many compa
 EXACT_COUNTS = ("params", "gaussians")
 ALPHA = 0.05
 SLOWER = 1.15  # ratio of minima; run to run it varies by 3 % (8 % at worst) on a busy machine
+OTHER_TRAINING = 1.25  # ratio of training times, either way; unchanged code gave 0.93 to 1.08 in 20 runs
 STAGE_FLOOR = 0.1  # stages below this share of the reference workload are noise
 MORE_MEMORY = 1.10
 SINGLE_SEED_FACTOR = 5.0  # one seed knows no spread: only losses of several margins are believed
@@ -50,7 +52,7 @@ class Entry:
     qualities: dict[str, tuple[float, ...]]
     counts: dict[str, float]
     memory_mb: float
-    times: dict[str, float]  # frame and stages: least ms over least ms of the reference workload
+    times: dict[str, float]  # frame, stages, training: least time over least time of the reference workload
     failed: int
 
     @property
@@ -206,6 +208,8 @@ def _times(results: Sequence[CellResult]) -> dict[str, float]:
         if result.timing is not None:
             reference = min(result.timing.reference_ms)
             measured = {"frame": result.timing.frame_ms, **result.timing.stage_ms}
+            if (train_s := result.value("speed", "", "train_s")) is not None:
+                measured["training"] = (1e3 * train_s,)
             for name, values in measured.items():
                 ratios[name] = min(ratios.get(name, math.inf), min(values) / reference)
     return ratios
@@ -274,7 +278,10 @@ def _time_checks(base: Entry, now: Entry) -> list[Check]:
         if after is None or max(before, after) < STAGE_FLOOR:
             continue
         detail = f"{after / before:.2f} times the baseline's, each over the reference workload"
-        verdict: Verdict = "fail" if after > SLOWER * before else "pass"
+        slower = OTHER_TRAINING if name == "training" else SLOWER
+        verdict: Verdict = "fail" if after > slower * before else "pass"
+        if name == "training" and after * OTHER_TRAINING < before:
+            verdict = "unexplained improvement"
         checks.append(Check(what=f"{base.title}: time of {name}", verdict=verdict, detail=detail))
     return checks
 

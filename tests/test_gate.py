@@ -10,7 +10,9 @@ from benchmarks.cells import CellConfig, CellResult, Summary, Timing, ViewScore,
 from benchmarks.gate import Check, judge, junit, markdown, read_baseline, summarise, write_baseline
 
 
-def result(seed: int, *, psnr: float, ms: float = 10.0, mb: float = 400.0, params: float = 1000.0) -> CellResult:
+def result(
+    seed: int, *, psnr: float, ms: float = 10.0, mb: float = 400.0, params: float = 1000.0, train_s: float = 8.0
+) -> CellResult:
     config = CellConfig(
         scene="boxes", size="ci", capture_seed=0, capture="c", method="ash", preset="ci", seed=seed, code="0", truth="t"
     )
@@ -20,6 +22,7 @@ def result(seed: int, *, psnr: float, ms: float = 10.0, mb: float = 400.0, param
     rows += [
         Summary(split="memory", region="", metric="params", value=params),
         Summary(split="memory", region="", metric="peak_rss_mb", value=mb),
+        Summary(split="speed", region="", metric="train_s", value=train_s),
     ]
     view = ViewScore(split="novel_view", camera="a", frame=0, prediction=f"{psnr}", scores={})
     timing = Timing(frame_ms=(ms * 1.1, ms), stage_ms={"stg4": (ms / 2,), "stg1": (0.01,)}, reference_ms=(5.0, 6.0))
@@ -60,6 +63,13 @@ def test_costs() -> None:
     assert "time of stg1" not in verdicts(run(same, ms=12.0)), "too short to be timed"
     assert verdicts(run(same, mb=800.0))["peak memory"] == "fail"
     assert verdicts(run(same, params=1001.0))["params"] == "fail"
+
+
+def test_training_time_is_judged_both_ways() -> None:
+    found = {
+        train_s: verdicts(run([25.0, 25.1, 24.9], train_s=train_s))["time of training"] for train_s in (4.0, 8.5, 11.0)
+    }
+    assert found == {4.0: "unexplained improvement", 8.5: "pass", 11.0: "fail"}
 
 
 def test_on_another_machine_qualities_are_judged_and_costs_are_not() -> None:
