@@ -56,11 +56,12 @@ class Player:
         if decoders is None:
             return ()
         conditions = self._model.conditions(self._motion, 0)
-        trained = image_of(self._model(self._motion, 0, camera))
+        ways: dict[str, Decode] = {"float32": decoders, "bfloat16": _in_bfloat16(decoders)}
+        images = {name: image_of(self._model(self._motion, 0, camera, decoders=way)) for name, way in ways.items()}
+        trained = images["float32"]
         found = []
-        for name, decode in (("float32", decoders), ("bfloat16", _in_bfloat16(decoders))):
-            image = image_of(self._model(self._motion, 0, camera, decoders=decode))
-            agreement = _psnr(image, trained)
+        for name, decode in ways.items():
+            agreement = psnr(images[name][..., :3], trained[..., :3], trained[..., 3])
             if agreement >= LEAST_AGREEMENT_DB:
                 found.append(
                     Engine(name=name, decode=decode, ms=_fastest_ms(decode, conditions), agreement_db=agreement)
@@ -89,8 +90,8 @@ def _fastest_ms(decode: Callable[[Conditions], Tensor], conditions: Conditions) 
     return best * 1e3
 
 
-def _psnr(image: np.ndarray, reference: np.ndarray) -> float:
-    """In dB, where the reference is mostly covered."""
-    error = (image - reference)[reference[..., 3] > 0.5][:, :3]
+def psnr(image: np.ndarray, reference: np.ndarray, alpha: np.ndarray) -> float:
+    """Of float colours `[h, w, 3]` in dB, where `alpha` `[h, w]` is above one half; infinite where nothing differs."""
+    error = (image - reference)[alpha > 0.5]
     mse = float(np.mean(error**2)) if error.size else 0.0
     return -10 * math.log10(mse) if mse > 0 else math.inf

@@ -97,20 +97,24 @@ def time_interleaved(candidates: list[Candidate], *, rounds: int) -> dict[tuple[
 def rows_of(what: str, size: str, pass_: str, times: dict[tuple[str, int], list[float]]) -> list[SpeedRow]:
     """The candidates' rows; the first candidate is the one that the ratios refer to."""
     reference = min(next(iter(times.values())))
-    return [
-        SpeedRow(
-            what=what,
-            size=size,
-            pass_=pass_,
-            device="cpu",
-            threads=threads,
-            candidate=name,
-            min_ms=min(samples),
-            median_ms=statistics.median(samples),
-            ratio=reference / min(samples),
-        )
-        for (name, threads), samples in times.items()
-    ]
+    return [row_of(what, size, pass_, threads, name, samples, reference) for (name, threads), samples in times.items()]
+
+
+def row_of(
+    what: str, size: str, pass_: str, threads: int, candidate: str, samples: list[float], reference_ms: float
+) -> SpeedRow:
+    """One candidate's row; its ratio is `reference_ms` over its minimum."""
+    return SpeedRow(
+        what=what,
+        size=size,
+        pass_=pass_,
+        device="cpu",
+        threads=threads,
+        candidate=candidate,
+        min_ms=min(samples),
+        median_ms=statistics.median(samples),
+        ratio=reference_ms / min(samples),
+    )
 
 
 def speed_kernels(

@@ -6,9 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import median
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,7 +15,7 @@ from ash.avatar import AshModel, views_of
 from ash.config import AshConfig
 from ash.dataset import Camera, Capture, load_capture
 from ash.files import write_json
-from ash.inference import Player
+from ash.inference import Player, psnr
 from ash.losses import cache_target, l1_ssim_loss, l1_ssim_loss_naive
 from ash.method import AshAvatar
 from ash.presets import named
@@ -25,7 +23,7 @@ from ash.protocol import StageClock
 from ash.splatting import Splatted, splat_naive
 from ash.texels import place_naive, pose_naive
 from ash.training import Batch, draw_batch, load_training_images
-from benchmarks.speed import SpeedRow, as_json
+from benchmarks.speed import SpeedRow, as_json, row_of
 
 STAGES = ("stg1", "stg2", "stg3", "stg4")
 # ASH, appendix "Runtime Analysis": milliseconds on an A100 at 1285x940, by texels per side.
@@ -147,10 +145,9 @@ def agreement(avatar: AshAvatar, player: Player, preset: str, capture: Capture, 
     frame = capture.splits["train"].frames[-1]
     drawn = player.draw(frame, camera)
     truth = frame_by_definition(avatar.module, capture, frame, camera).clamp(0, 1).numpy()
-    error = float(np.mean((drawn[..., :3] - truth)[drawn[..., 3] > 0.5] ** 2))
-    psnr = -10 * math.log10(error) if error > 0 else math.inf
     engine = player.engine.name if player.engine else "none"
-    return Agreement(preset=preset, gaussians=avatar.gaussian_count(), psnr_db=psnr, engine=engine)
+    agrees = psnr(drawn[..., :3], truth, drawn[..., 3])
+    return Agreement(preset=preset, gaussians=avatar.gaussian_count(), psnr_db=agrees, engine=engine)
 
 
 def _time_frames(
@@ -177,9 +174,9 @@ def _time_frames(
                     samples[stage, count].append(clock.ms[stage])
                 samples["frame", count].append(elapsed)
     size = f"{camera.width}x{camera.height}"
-    rows = [_row("frame", size, "forward", 1, f"{preset}-naive", [naive_ms], naive_ms)]
+    rows = [row_of("frame", size, "forward", 1, f"{preset}-naive", [naive_ms], naive_ms)]
     for (what, count), taken in samples.items():
-        rows.append(_row(what, size, "forward", count, preset, taken, naive_ms if what == "frame" else math.nan))
+        rows.append(row_of(what, size, "forward", count, preset, taken, naive_ms if what == "frame" else math.nan))
     return rows
 
 
@@ -202,7 +199,7 @@ def _time_steps(avatar: AshAvatar, preset: str, capture: Capture, *, rounds: int
     size = f"{camera.width}x{camera.height}"
     reference = min(samples["naive"])
     return [
-        _row(
+        row_of(
             "train_step",
             size,
             "forward+backward",
@@ -231,22 +228,6 @@ def _step(avatar: AshAvatar, batch: Batch, optimiser: Adam, *, naive: bool) -> N
     optimiser.zero_grad()
     torch.stack(losses).mean().backward()  # type: ignore[no-untyped-call]
     optimiser.step()
-
-
-def _row(
-    what: str, size: str, pass_: str, threads: int, candidate: str, taken: list[float], naive_ms: float
-) -> SpeedRow:
-    return SpeedRow(
-        what=what,
-        size=size,
-        pass_=pass_,
-        device="cpu",
-        threads=threads,
-        candidate=candidate,
-        min_ms=min(taken),
-        median_ms=median(taken),
-        ratio=naive_ms / min(taken),
-    )
 
 
 def speed_capture(data: Path) -> Capture:

@@ -10,7 +10,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ import safetensors
 from ash.dataset import Camera, Capture, load_capture, verify_capture
 from ash.files import InputError, read_json, write_json
 from ash.protocol import Avatar, StageClock
+from benchmarks.experiments import find_method
 from benchmarks.sealing import Tampering, Trespass, seen_by_method, watched
 from benchmarks.timing import peak_memory_mb
 
@@ -85,8 +85,7 @@ def perform(trial: Trial, folder: Path) -> Outcome:
     """Build, train or load, draw, and look at what changed."""
     capture = load_capture(Path(trial.capture))
     views = few_views(capture)
-    module, _, function = trial.target.partition(":")
-    factory = getattr(import_module(module), function)
+    factory = find_method(trial.target).load()
     start = time.perf_counter()
     with seen_by_method(capture, folder / "input", oracle=trial.oracle) as seen:
         found = Outcome()
