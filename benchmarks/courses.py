@@ -5,12 +5,11 @@ from dataclasses import dataclass
 
 from benchmarks import margin, stability
 from benchmarks.cells import CellResult
-from benchmarks.names import look_of
+from benchmarks.names import SPLIT_WORDS, look_of
 from benchmarks.scores import Scores
 from benchmarks.small_multiples import Multiple, Rule, Sample, Series, small_multiples
 from benchmarks.stability import Course, Curve, Reliability
 
-SPLIT_HEADS = {"novel_view": "held-out views", "novel_pose": "held-out motion"}
 MARGIN_COLOUR, HONEST_COLOUR = "#2f6fde", "#dd6b20"
 
 
@@ -63,7 +62,7 @@ def margin_report(scores: Scores) -> MarginReport | None:
 
 def _stability(scene: str, curves: Sequence[Curve], results: Sequence[CellResult]) -> StabilityReport:
     charts = []
-    for split, title in SPLIT_HEADS.items():
+    for split, title in SPLIT_WORDS.items():
         shown = [_stress_chart(curve) for curve in curves if curve.split == split]
         charts.append((title, small_multiples(shown, y_title="foreground PSNR [dB]")))
     methods = [m for m in dict.fromkeys(c.method for curve in curves for c in curve.courses) if m != stability.TRIVIAL]
@@ -71,7 +70,7 @@ def _stability(scene: str, curves: Sequence[Curve], results: Sequence[CellResult
     for curve in curves:
         own = {course.method: course for course in curve.courses}
         entries = tuple(_entry(own.get(method)) for method in methods)
-        rows.append(Breakdown(axis=curve.title, split=SPLIT_HEADS[curve.split], entries=entries))
+        rows.append(Breakdown(axis=curve.title, split=SPLIT_WORDS[curve.split], entries=entries))
     return StabilityReport(
         scene=scene,
         charts=tuple(charts),
@@ -127,7 +126,7 @@ def _margin_chart(curve: margin.MarginCurve) -> Multiple:
     if curve.paper_db is not None:
         rules.append(Rule(y=curve.paper_db, label=f"the paper's {curve.paper_db:+.1f} dB"))
     return Multiple(
-        title=f"{curve.scene}, {SPLIT_HEADS[curve.split]}",
+        title=f"{curve.scene}, {SPLIT_WORDS[curve.split]}",
         x_title="template error [mm rms]",
         ticks=tuple((m.error_mm, f"{m.error_mm:g}") for m in curve.known),
         series=tuple(series),

@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks import contrasts, pareto
-from benchmarks.names import EXACT, is_oracle, look_of
+from benchmarks.names import EXACT, SPLIT_WORDS, is_oracle, look_of
 from benchmarks.scores import Score, Scores
 
 TOO_CLOSE_DB = 0.1
@@ -36,7 +36,7 @@ def remarks(scores: Scores, scene: str) -> list[str]:
 def frontier(scores: Scores, scene: str) -> tuple[str, ...]:
     """Who is beaten by nobody in accuracy and speed together, what the field covers, and what would have sufficed."""
     found = []
-    for split, where in (("novel_view", "held-out views"), ("novel_pose", "held-out motion")):
+    for split, where in SPLIT_WORDS.items():
         competing = contrasts.candidates(scores, scene, split)
         if len(competing) < 2:
             continue
@@ -62,10 +62,10 @@ def _duel(scores: Scores, scene: str) -> str:
     if fallen:
         return f"On {scene}, {' and '.join(fallen)} failed, so ASH and DDC cannot be compared."
     parts = []
-    for split, where in (("novel_view", "on held-out views"), ("novel_pose", "on held-out motion")):
+    for split, where in SPLIT_WORDS.items():
         ours, theirs = scores.fg(scene, "ash", split), scores.fg(scene, "ddc", split)
         if ours and theirs:
-            parts.append(f"{_standing(ours, theirs)} {where} ({ours.mean:.1f} against {theirs.mean:.1f} dB)")
+            parts.append(f"{_standing(ours, theirs)} on {where} ({ours.mean:.1f} against {theirs.mean:.1f} dB)")
     return f"On {scene}, ASH is {' and '.join(parts)}." if parts else f"On {scene}, ASH and DDC were not both scored."
 
 

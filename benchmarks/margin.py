@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from benchmarks.experiments import WRONG_BY_MM
+from benchmarks.names import SPLIT_WORDS
 from benchmarks.scores import Scores
 from benchmarks.statistics import mean_interval, welch
 
@@ -62,8 +63,8 @@ def margin_curves(scores: Scores) -> tuple[MarginCurve, ...]:
 def sentence(curve: MarginCurve) -> str:
     """The finding in one sentence."""
     first, last = curve.known[0], curve.known[-1]
-    where = {"novel_view": "held-out views", "novel_pose": "held-out motion"}[curve.split]
-    text = f"On {curve.scene}, {where}: ASH minus DDC goes from {first.mean:+.1f} dB at {first.error_mm:g} mm"
+    text = f"On {curve.scene}, {SPLIT_WORDS[curve.split]}: "
+    text += f"ASH minus DDC goes from {first.mean:+.1f} dB at {first.error_mm:g} mm"
     text += f" to {last.mean:+.1f} dB at {last.error_mm:g} mm of template error"
     crossing = curve.crossing_mm
     text += f"; the two are equal at {crossing:.1f} mm" if crossing is not None else "; one leads throughout"

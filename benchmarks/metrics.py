@@ -12,6 +12,7 @@ Regions, ours first, then those of others' conventions:
   composited by its own alpha; SSIM with the 7x7 box.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -256,6 +257,13 @@ def flicker(predicted: list[np.ndarray], truth: list[np.ndarray]) -> float:
 def vertex_error_mm(vertices: np.ndarray, truth: np.ndarray) -> float:
     """Root mean square distance in millimetres of corresponding vertices `[..., 3]` in metres."""
     return float(np.sqrt(np.mean(np.sum((np.asarray(vertices, np.float64) - truth) ** 2, -1)))) * 1e3
+
+
+def template_error_mm(vertices: Sequence[np.ndarray], truth: np.ndarray) -> float | None:
+    """`vertex_error_mm` over frames `[t, v, 3]`; None for no frames, or for vertices that are not the truth's."""
+    if not vertices or vertices[0].shape != truth.shape[1:]:
+        return None
+    return vertex_error_mm(np.stack(vertices), truth)
 
 
 def surface_distance_mm(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> float:

@@ -33,6 +33,7 @@ LOOKS = {
     "nearest": Look(title="nearest image", colour="#7a869a"),
     "oracle_texture": Look(title="best texture, exact mesh", colour="#b8860b"),
 }
+SPLIT_WORDS = {"novel_view": "held-out views", "novel_pose": "held-out motion"}  # In sentences; tables have titles.
 SPARE_COLOURS = ("#b8860b", "#c2415c", "#5b8c2a", "#7a869a", "#008fb3", "#a0522d")
 EXACT = {"ash": "ash_truth", "ddc": "ddc_truth"}  # A method and the same method given the exact surface.
 

@@ -143,8 +143,4 @@ def strip(truth: Capture, images: dict[tuple[str, int], np.ndarray]) -> np.ndarr
 
 
 def _template_mm(truth: Capture, vertices: dict[int, np.ndarray]) -> float | None:
-    known = read_template_truth(truth)
-    frames = list(vertices)
-    if not frames or vertices[frames[0]].shape != known.shape[1:]:
-        return None
-    return metrics.vertex_error_mm(np.stack([vertices[frame] for frame in frames]), known[frames])
+    return metrics.template_error_mm(list(vertices.values()), read_template_truth(truth)[list(vertices)])

@@ -309,10 +309,8 @@ def _geometry_summary(capture: Capture, posed: PosedFrames | None, views: tuple[
     template_truth = read_template_truth(capture)
     for split in IMAGE_SPLITS:
         frames = _frames_of(views, split)
-        vertices = [posed.vertices[frame] for frame in frames]
-        # A template of its own (a bare body, say) has no vertices that correspond to the capture's.
-        if frames and np.shape(vertices)[1:] == template_truth.shape[1:]:
-            error = metrics.vertex_error_mm(np.stack(vertices), template_truth[frames])
+        error = metrics.template_error_mm([posed.vertices[frame] for frame in frames], template_truth[frames])
+        if error is not None:  # A template of its own (a bare body, say) has no vertices that could be compared.
             rows.append(Summary(split=split, region="", metric="template_mm", value=error))
         distances = [_surface_distance(capture, posed.means[frame], frame) for frame in _few(frames) if posed.means]
         known = [distance for distance in distances if distance is not None]
