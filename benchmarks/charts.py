@@ -325,7 +325,9 @@ def _real_time(x: Axis, y: Axis) -> str:
         return ""
     at = short(x.at(frame_ms))
     line = f'<line class="axis" stroke-dasharray="2 4" x1="{at}" x2="{at}" y1="{short(y.start)}" y2="{short(y.end)}"/>'
-    return line + text_at(x.at(frame_ms) + 5, y.start - 7, "30 frames/s", kind="dim")
+    label = "30 frames/s"
+    side, anchor = (5, "start") if x.at(frame_ms) + text_width(label) < x.end else (-5, "end")
+    return line + text_at(x.at(frame_ms) + side, y.start - 7, label, anchor=anchor, kind="dim")
 
 
 def _apart(wanted: Sequence[float], gap: float, low: float, high: float) -> list[float]:
