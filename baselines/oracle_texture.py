@@ -45,8 +45,8 @@ class OracleTexture(DdcAvatar):
             return self.template.pose(motion, frame), self.module.texture.clamp(min=0)
 
 
-def oracle_texture(capture: Capture, *, seed: int, preset: str) -> OracleTexture:
-    """The exact surface with one texture, at the preset's budget."""
+def oracle_texture(capture: Capture, *, seed: int, preset: str, error_mm: float = 0.0) -> OracleTexture:
+    """The exact surface, or one that is wrong by `error_mm`, with one texture, at the preset's budget."""
     config = named(preset)
-    mesh = ddc_config(config, seed=seed, template=TemplateConfig(kind="exact"))
+    mesh = ddc_config(config, seed=seed, template=TemplateConfig(kind="exact", error_mm=error_mm))
     return OracleTexture(replace(mesh, texture=TEXTURE_FACTOR * config.model.texels), capture)

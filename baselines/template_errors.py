@@ -1,6 +1,6 @@
-"""ASH and DDC on the exact surface with a planted error of 2 to 16 mm rms: what the margin between them depends on.
+"""ASH, DDC and a fixed mesh on the exact surface with a planted error of 2 to 16 mm rms: what their margins depend on.
 
-Both get the same wrong surface in one seed. Zero is `ash_truth` and `ddc_truth`.
+All get the same wrong surface in one seed. Zero is `ash_truth`, `ddc_truth` and `oracle_texture`.
 """
 
 from dataclasses import replace
@@ -11,6 +11,7 @@ from ash.dataset import Capture
 from ash.method import AshAvatar
 from ash.presets import named
 from baselines.ddc import DdcAvatar, ddc_config
+from baselines.oracle_texture import oracle_texture
 
 
 def ash_off(capture: Capture, *, seed: int, preset: str, error_mm: float) -> AshAvatar:
@@ -27,3 +28,6 @@ def ddc_off(capture: Capture, *, seed: int, preset: str, error_mm: float) -> Ddc
 
 ash_2mm, ash_4mm, ash_8mm, ash_16mm = (partial(ash_off, error_mm=mm) for mm in (2.0, 4.0, 8.0, 16.0))
 ddc_2mm, ddc_4mm, ddc_8mm, ddc_16mm = (partial(ddc_off, error_mm=mm) for mm in (2.0, 4.0, 8.0, 16.0))
+texture_2mm, texture_4mm, texture_8mm, texture_16mm = (
+    partial(oracle_texture, error_mm=mm) for mm in (2.0, 4.0, 8.0, 16.0)
+)

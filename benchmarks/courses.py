@@ -36,8 +36,9 @@ class StabilityReport:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class MarginReport:
-    """The section on the margin against the template's error."""
+    """The section on quality and margin against the template's error: two SVG charts, and what they say."""
 
+    levels: str
     chart: str
     sentences: tuple[str, ...]
 
@@ -52,12 +53,14 @@ def stability_reports(results: Sequence[CellResult]) -> tuple[StabilityReport, .
 
 
 def margin_report(scores: Scores) -> MarginReport | None:
-    """The margin's chart and findings, or None where no templates of known error were run."""
+    """The charts and findings, or None where no templates of known error were run."""
     curves = margin.margin_curves(scores)
     if not curves:
         return None
+    levels = small_multiples([_level_chart(curve) for curve in curves], y_title="foreground PSNR [dB]", columns=2)
     chart = small_multiples([_margin_chart(curve) for curve in curves], y_title="ASH minus DDC [dB]", columns=2)
-    return MarginReport(chart=chart, sentences=tuple(margin.sentence(curve) for curve in curves))
+    sentences = tuple(margin.sentence(curve) for curve in curves)
+    return MarginReport(levels=levels, chart=chart, sentences=sentences)
 
 
 def _stability(scene: str, curves: Sequence[Curve], results: Sequence[CellResult]) -> StabilityReport:
@@ -113,6 +116,20 @@ def _stress_chart(curve: Curve) -> Multiple:
         ticks=tuple((place[severity], f"{severity:g}") for severity in severities),
         series=tuple(series),
         rules=() if curve.trivial is None else (Rule(y=curve.trivial, label=look_of(stability.TRIVIAL).title),),
+    )
+
+
+def _level_chart(curve: margin.MarginCurve) -> Multiple:
+    series = []
+    for level in curve.levels:
+        samples = tuple(Sample(x=mm, y=psnr.mean, low=psnr.low, high=psnr.high) for mm, psnr in level.qualities)
+        look = look_of(level.method)
+        series.append(Series(label=margin.LEVEL_TITLES[level.method], colour=look.colour, samples=samples))
+    return Multiple(
+        title=f"{curve.scene}, {SPLIT_WORDS[curve.split]}",
+        x_title="template error [mm rms]",
+        ticks=tuple((m.error_mm, f"{m.error_mm:g}") for m in curve.known),
+        series=tuple(series),
     )
 
 

@@ -1,15 +1,19 @@
-"""ASH minus DDC against the error of the template that both are given: the paper's margins, and where the two cross."""
+"""Quality against the error of the template that methods are given, and ASH minus DDC: where the two cross.
+
+A fixed mesh with the best texture stands beside them: what geometry of such an error is worth by itself.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from benchmarks.experiments import WRONG_BY_MM
+from benchmarks.experiments import ON_EXACT, WRONG_BY_MM
 from benchmarks.names import SPLIT_WORDS
 from benchmarks.scores import Scores
-from benchmarks.statistics import mean_interval, welch
+from benchmarks.statistics import Interval, mean_interval, welch
 
 # ASH (CVPR 2024), Table 1: PSNR of ASH minus DDC, tight and loose clothes.
 PAPER_DB = {"novel_view": {"tight": 4.6, "loose": 7.4}, "novel_pose": {"tight": 1.1, "loose": 0.7}}
+LEVEL_TITLES = dict(zip(ON_EXACT, ("ASH", "DDC", "fixed mesh, best texture"), strict=True))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -23,11 +27,20 @@ class Margin:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class Level:
+    """Foreground PSNR in dB of one method on templates of known error, least error first."""
+
+    method: str  # its name on the exact surface
+    qualities: tuple[tuple[float, Interval], ...]  # error in mm rms, mean over seeds
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class MarginCurve:
     """A scene and split: margins on templates of known error, least error first, and on the methods' own template."""
 
     scene: str
     split: str
+    levels: tuple[Level, ...]
     known: tuple[Margin, ...]
     honest: Margin | None
     paper_db: float | None  # the paper's margin on such clothes
@@ -50,13 +63,16 @@ def margin_curves(scores: Scores) -> tuple[MarginCurve, ...]:
     found = []
     for scene in scores.scenes:
         for split in PAPER_DB:
-            known = [_margin(scores, scene, split, ash, ddc, float(mm)) for mm, (ash, ddc) in WRONG_BY_MM.items()]
+            known = [_margin(scores, scene, split, ash, ddc, float(mm)) for mm, (ash, ddc, _) in WRONG_BY_MM.items()]
             there = tuple(margin for margin in known if margin is not None)
             if len(there) > 1:
                 template = scores.get(scene, "ash", split, "", "template_mm")
                 honest = _margin(scores, scene, split, "ash", "ddc", template.mean) if template else None
                 paper = PAPER_DB[split].get(scene)
-                found.append(MarginCurve(scene=scene, split=split, known=there, honest=honest, paper_db=paper))
+                levels = _levels(scores, scene, split)
+                found.append(
+                    MarginCurve(scene=scene, split=split, levels=levels, known=there, honest=honest, paper_db=paper)
+                )
     return tuple(found)
 
 
@@ -75,6 +91,20 @@ def sentence(curve: MarginCurve) -> str:
     if curve.honest is not None:
         text += f"; with the honest template ({curve.honest.error_mm:.1f} mm) it is {curve.honest.mean:+.1f} dB"
     return text + "."
+
+
+def _levels(scores: Scores, scene: str, split: str) -> tuple[Level, ...]:
+    found = []
+    for column, method in enumerate(ON_EXACT):
+        values = {
+            mm: scores.values(scene, row[column], split, "foreground", "psnr")
+            for mm, row in WRONG_BY_MM.items()
+            if not scores.failed(scene, row[column])
+        }
+        qualities = tuple((float(mm), mean_interval(quality)) for mm, quality in values.items() if quality)
+        if qualities:
+            found.append(Level(method=method, qualities=qualities))
+    return tuple(found)
 
 
 def _margin(scores: Scores, scene: str, split: str, ash: str, ddc: str, error_mm: float) -> Margin | None:

@@ -69,6 +69,7 @@ def write_report(run: Run) -> list[str]:
         for index, (_, chart) in enumerate(found.charts):
             write_atomic(folder / f"chart_stability_{found.scene}_{index}.svg", chart.encode())
     if sections.margin is not None:
+        write_atomic(folder / "chart_levels.svg", sections.margin.levels.encode())
         write_atomic(folder / "chart_margin.svg", sections.margin.chart.encode())
         lines = [*sections.margin.sentences, ""]
     write_atomic(folder / "tables.tex", latex_of(scenes).encode())
@@ -132,6 +133,7 @@ def markdown_of(run: Run, results: Sequence[CellResult], sections: Sections, sce
     parts += [_need_rows(matrix) for matrix in sections.needs]
     parts += [_stability_rows(found) for found in sections.stability]
     if sections.margin is not None:
+        parts += ["### Quality against the template's error", "![Quality](chart_levels.svg)"]
         parts += ["### ASH minus DDC against the template's error", "![Margin](chart_margin.svg)"]
         parts.append("\n".join(f"- {sentence}" for sentence in sections.margin.sentences))
     for scene in scenes:

@@ -19,6 +19,7 @@ from baselines.mlp import ASH_STEPS_PER_STEP, mlp, mlp_time
 from baselines.nearest import central_frame, move_image, nearest, pose_distances, see_root
 from baselines.oracle_texture import oracle_texture
 from baselines.static import of_one_frame, static
+from benchmarks.experiments import WRONG_BY_MM, find_method
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +125,13 @@ def test_oracle_texture_recovers_a_texture_on_the_exact_surface(capture, tmp_pat
     again = oracle_texture(redrawn, seed=1, preset="ci")
     again.load(tmp_path / "model.safetensors")
     np.testing.assert_array_equal(draw(again, redrawn, "cam0", 1), draw(made, redrawn, "cam0", 1))
+
+
+def test_what_is_wrong_by_so_much_is_wrong_by_so_much_whoever_draws_it(capture):
+    for error_mm, row in WRONG_BY_MM.items():
+        for method in row:
+            avatar = find_method(method).load()(capture, seed=0, preset="ci")
+            assert (avatar.config.template.kind, avatar.config.template.error_mm) == ("exact", error_mm), method
 
 
 def test_the_bare_body_is_the_template_and_a_capture_without_one_is_refused(capture, tmp_path):

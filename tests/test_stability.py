@@ -73,6 +73,20 @@ def test_the_margin_is_read_off_templates_of_known_error() -> None:
     assert margin.margin_curves(Scores(results[:6])) == ()
 
 
+def test_quality_on_templates_of_known_error_has_a_curve_per_method_and_shows_no_failed_one() -> None:
+    known = {"ash_truth": 30.0, "ddc_truth": 31.0, "oracle_texture": 29.0, "ash_4mm": 27.0, "ddc_4mm": 26.0}
+    results = [cell(method, psnr, seed=seed) for method, psnr in known.items() for seed in range(3)]
+    results += [failed_result(cell("texture_4mm", 20.0).config, "diverged", "NaN")]
+    scores = Scores(results)
+    view = margin.margin_curves(scores)[0]
+    found = {level.method: [(mm, quality.mean) for mm, quality in level.qualities] for level in view.levels}
+    expected = {"ash_truth": [(0.0, 30.0), (4.0, 27.0)], "ddc_truth": [(0.0, 31.0), (4.0, 26.0)]}
+    assert found == {**expected, "oracle_texture": [(0.0, 29.0)]}
+    report = courses.margin_report(scores)
+    assert report is not None
+    assert "fixed mesh, best texture" in "".join(ElementTree.fromstring(report.levels).itertext())
+
+
 def test_charts_are_svg_with_a_mark_where_a_method_breaks() -> None:
     (report,) = courses.stability_reports(course((30.0, 26.0, 12.0, 11.0)))
     for _, chart in report.charts:
