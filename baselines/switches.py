@@ -1,6 +1,6 @@
 """ASH with one switch turned: where paper and release differ, and what the fast presets add to both.
 
-Methods by their path (`baselines.switches:wo_base`): they are rows of the suite `switches` and of no other.
+Methods by their path (`baselines.switches:wo_base`): they are rows of the suites `switches` and `template`.
 """
 
 from collections.abc import Callable
@@ -59,5 +59,11 @@ wo_heading = _turned(model={"yaw_normalise": False})
 two_trunks = _turned(model={"shared_trunk": False})
 averaged = _turned(training={"ema": 0.99})
 blendshapes = _turned(model={"head": "blendshapes"})
-skinned_template = _turned(template={"kind": "skinned"})
 learned_template = _turned(template={"kind": "learned"})
+
+# How the template comes about, where a surface per frame ("chamfer") is what ASH learns it from.
+by_vertices = _turned(template={"kind": "learned", "supervision": "vertices"})
+by_images = _turned(template={"kind": "learned", "supervision": "images"})
+by_graph = _turned(template={"kind": "learned", "network": "graph"})
+unlearned = _turned(template={"kind": "skinned"})
+refined = _turned(model={"refine": True}, template={"kind": "learned"})

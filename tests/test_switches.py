@@ -8,10 +8,11 @@ import pytest
 from captures import tiny_preset, write_tube_capture
 
 from ash import presets
+from ash.config import TemplateConfig
 from ash.dataset import Capture
 from ash.protocol import StageClock
 from baselines import switches
-from benchmarks.experiments import SUITES, SWITCHES, find_method
+from benchmarks.experiments import LEARNED, ORACLES, SUITES, SWITCHES, find_method
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +50,19 @@ def test_a_switch_learns_draws_and_matters(
     assert np.array_equal(image, plain) == name.endswith("_template")
 
 
-def test_the_suite_names_them_by_their_path() -> None:
+@pytest.mark.parametrize("name", LEARNED)
+def test_a_way_to_the_template_is_learned_and_draws(name: str, capture: Capture, tmp_path: Path) -> None:
+    avatar = getattr(switches, name)(capture, seed=0, preset="ci")
+    assert (avatar.template.learned is None) == (name == "unlearned")
+    avatar.fit(capture, folder=tmp_path / name)
+    assert np.isfinite(avatar.render(capture.motion, 3, capture.cameras["cam0"], clock=StageClock())).all()
+    assert (avatar.config.template, avatar.config.model.refine) != (TemplateConfig(kind="learned"), False)
+
+
+def test_the_suites_name_them_by_their_path() -> None:
     methods = SUITES["switches"].methods
     assert methods[0] == "ash" and len(methods) == 1 + len(SWITCHES)
-    assert all(find_method(method).is_ours and callable(find_method(method).load()) for method in methods)
+    learned = [method for method in SUITES["template"].methods if ":" in method]
+    assert len(learned) == len(LEARNED)
+    assert all(find_method(m).is_ours and callable(find_method(m).load()) for m in (*methods, *learned))
+    assert [method for method in learned if method in ORACLES] == ["baselines.switches:by_vertices"]
