@@ -1,14 +1,17 @@
 """Playback of a trained avatar: template and history cached, the decoders on the engine that is fastest here.
 
 Engines are measured on the machine and in the process that plays, with as many threads as torch is given there. One
-counts only where its image agrees with that of the precision that was trained.
+counts only where its image agrees with that of the precision that was trained. OpenVINO is one where it is installed
+(`pip install ash-bench[openvino]`).
 """
 
 import math
 import time
+import warnings
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
 
 import numpy as np
 import torch
@@ -16,6 +19,7 @@ from torch import Tensor, nn
 
 from ash.avatar import Decode, image_of
 from ash.dataset import Camera, Motion
+from ash.decoders import Decoders
 from ash.method import AshAvatar
 from ash.protocol import StageClock
 from ash.textures import Conditions
@@ -57,6 +61,8 @@ class Player:
             return ()
         conditions = self._model.conditions(self._motion, 0)
         ways: dict[str, Decode] = {"float32": decoders, "bfloat16": _in_bfloat16(decoders)}
+        if isinstance(decoders, Decoders) and find_spec("openvino") is not None:
+            ways["openvino"] = _in_openvino(decoders, conditions)
         images = {name: image_of(self._model(self._motion, 0, camera, decoders=way)) for name, way in ways.items()}
         trained = images["float32"]
         found = []
@@ -77,6 +83,41 @@ def _in_bfloat16(decoders: nn.Module) -> Decode:
         with torch.autocast(conditions.textures.device.type, torch.bfloat16):
             raw: Tensor = half(conditions)
         return raw.float()
+
+    return decode
+
+
+class _OfTensors(nn.Module):
+    """The decoders as a function of tensors alone, so that they can be traced."""
+
+    def __init__(self, decoders: Decoders, conditions: Conditions) -> None:
+        super().__init__()
+        self.decoders, self.conditions = decoders, conditions
+
+    def forward(self, textures: Tensor, root_translation: Tensor) -> Tensor:
+        raw: Tensor = self.decoders(replace(self.conditions, textures=textures, root_translation=root_translation))
+        return raw
+
+
+def _in_openvino(decoders: Decoders, conditions: Conditions) -> Decode:
+    """The decoders compiled by OpenVINO, in the precision that it takes for this processor's best."""
+    import openvino  # Optional, and half a second that training does not need.
+    from openvino.frontend import FrontEndManager
+    from openvino.frontend.pytorch.ts_decoder import TorchScriptPythonDecoder
+
+    def inputs(seen: Conditions) -> tuple[Tensor, Tensor]:
+        return seen.textures.contiguous(), seen.root_translation
+
+    # Not by `openvino.convert_model`, which reports its use over the network.
+    with warnings.catch_warnings(action="ignore"):  # Sizes become constants when traced, as they should.
+        traced = torch.jit.trace(_OfTensors(decoders, conditions), inputs(conditions), check_trace=False)  # type: ignore[no-untyped-call]
+    source = TorchScriptPythonDecoder(traced)
+    frontend = FrontEndManager().load_by_framework("pytorch")
+    options = {"INFERENCE_NUM_THREADS": torch.get_num_threads(), "PERFORMANCE_HINT": "LATENCY"}
+    compiled = openvino.Core().compile_model(frontend.convert(frontend.load(source)), "CPU", options)
+
+    def decode(seen: Conditions) -> Tensor:
+        return torch.from_numpy(compiled([tensor.numpy() for tensor in inputs(seen)])[0])
 
     return decode
 
