@@ -4,14 +4,13 @@ After SqueezeMe (Iandola et al. 2025) and Pruned Local Blendshapes (2026): each 
 correctives of its Gaussians, weighted by a linear map of the motion nearby.
 """
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from ash.config import ModelConfig
-from ash.dataset import Skeleton
 from ash.decoders import raw_channels
+from ash.deforming import near_joints
 from ash.skinning import sparse_skin_weights
 from ash.template import Template
 from ash.textures import Conditions, TexelLattice
@@ -31,7 +30,7 @@ class LocalBlendshapes(nn.Module):
         self.spread: Tensor
         self.register_buffer("regions", skin.joints, persistent=False)
         self.register_buffer("shares", skin.weights, persistent=False)
-        self.register_buffer("near", neighbours(template.skeleton), persistent=False)
+        self.register_buffer("near", near_joints(template.skeleton), persistent=False)
         self.register_buffer("mean", torch.zeros(joints, config.window * 3))
         self.register_buffer("spread", torch.ones(joints, config.window * 3))
         features = config.window * 3
@@ -57,12 +56,3 @@ class LocalBlendshapes(nn.Module):
 
     def _angles(self, motion: Float[Tensor, "k d"]) -> Float[Tensor, "j f"]:
         return motion[:, 3:].unflatten(1, (-1, 3)).transpose(0, 1).flatten(1)
-
-
-def neighbours(skeleton: Skeleton) -> Bool[Tensor, "j j"]:
-    """Which joints' motion a region looks at: its own joint's, the parent's, the children's."""
-    near = np.eye(len(skeleton.parents), dtype=bool)
-    for joint, parent in enumerate(skeleton.parents):
-        if parent >= 0:
-            near[joint, parent] = near[parent, joint] = True
-    return torch.from_numpy(near)

@@ -4,7 +4,7 @@ Trained on its own and then frozen: the Gaussians and the mesh baseline both sta
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ash.config import TemplateConfig
@@ -54,8 +54,15 @@ class LinearDeformation(nn.Module):
 
 def joint_reach(mesh: TemplateMesh, skeleton: Skeleton) -> Float[Tensor, "v j"]:
     """How much every joint matters at every vertex: its skinning weight, and half its neighbours'."""
-    parents = torch.from_numpy(skeleton.parents)
-    near = torch.eye(len(parents), dtype=torch.float64)
-    child = (parents >= 0).nonzero().squeeze(1)
-    near[child, parents[child]] = near[parents[child], child] = NEIGHBOUR_JOINT
+    near = near_joints(skeleton).double()
+    near = torch.where(torch.eye(len(near), dtype=torch.bool), near, NEIGHBOUR_JOINT * near)
     return (torch.from_numpy(mesh.skin_weights) @ near).float()
+
+
+def near_joints(skeleton: Skeleton) -> Bool[Tensor, "j j"]:
+    """What is near each joint: itself, its parent, its children."""
+    parents = torch.from_numpy(skeleton.parents)
+    child = (parents >= 0).nonzero().squeeze(1)
+    near = torch.eye(len(parents), dtype=torch.bool)
+    near[child, parents[child]] = near[parents[child], child] = True
+    return near

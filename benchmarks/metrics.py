@@ -133,19 +133,20 @@ def ssim_map(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
 def _similarity(predicted: np.ndarray, truth: np.ndarray, *, blank: int, **options: Any) -> np.ndarray:
     """scikit-image's SSIM per pixel `[h, w]`. Where both images are `blank` far and wide it is 1 and not computed."""
     similarity = np.ones(truth.shape[:2])
-    window = _occupied((predicted != blank).any(-1) | (truth != blank).any(-1), SSIM_MARGIN)
+    window = occupied((predicted != blank).any(-1) | (truth != blank).any(-1), SSIM_MARGIN)
     if window is not None:
         _, inside = structural_similarity(truth[window], predicted[window], channel_axis=2, full=True, **options)
         similarity[window] = inside.mean(-1)
     return similarity
 
 
-def _occupied(mask: np.ndarray, margin: int) -> tuple[slice, slice] | None:
+def occupied(mask: np.ndarray, margin: int) -> tuple[slice, slice] | None:
     """The rows and columns that hold a mask and a margin around it; None where it is empty."""
     places = np.argwhere(mask)
     if len(places) == 0:
         return None
-    (top, left), (bottom, right) = np.maximum(places.min(0) - margin, 0), places.max(0) + margin + 1
+    top, left = np.maximum(places.min(0) - margin, 0)
+    bottom, right = np.minimum(places.max(0) + margin + 1, mask.shape)
     return slice(top, bottom), slice(left, right)
 
 
@@ -157,7 +158,7 @@ def flip_map(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     import flip_evaluator
 
     error = np.zeros(truth.shape[:2])
-    window = _occupied((predicted != 0).any(-1) | (truth != 0).any(-1), FLIP_MARGIN)
+    window = occupied((predicted != 0).any(-1) | (truth != 0).any(-1), FLIP_MARGIN)
     if window is None:
         return error
     pair = [np.ascontiguousarray(image[window], dtype=np.float32) / np.float32(255) for image in (truth, predicted)]

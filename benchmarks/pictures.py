@@ -154,14 +154,9 @@ def missing_pictures(folder: Path, error: InputError) -> str:
 
 def _crop(images: Sequence[np.ndarray]) -> tuple[slice, slice]:
     """The rows and columns that any image covers, with a margin."""
-    height, width = images[0].shape[:2]
     covered = np.any([image[..., 3] > 8 for image in images], axis=0)
-    if not covered.any():
-        return slice(0, height), slice(0, width)
-    (top, left), (bottom, right) = np.argwhere(covered).min(0), np.argwhere(covered).max(0) + 1
-    margin = max(3, round(MARGIN * max(bottom - top, right - left)))
-    rows = slice(max(0, top - margin), min(height, bottom + margin))
-    return rows, slice(max(0, left - margin), min(width, right + margin))
+    extent = max(covered.any(axis).sum() for axis in (0, 1))
+    return metrics.occupied(covered, max(3, round(MARGIN * extent))) or (slice(None), slice(None))
 
 
 def on_paper(on_black: np.ndarray) -> np.ndarray:

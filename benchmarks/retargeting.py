@@ -136,9 +136,9 @@ def strip(truth: Capture, images: dict[tuple[str, int], np.ndarray]) -> np.ndarr
     camera = split.cameras[0]
     frames = [split.frames[i] for i in spread(len(split.frames), STRIP_FRAMES)]
     pairs = [(metrics.on_black(truth.image(camera, frame)), images[camera, frame]) for frame in frames]
-    seen = np.argwhere(np.any([image[..., 3] > 0 for pair in pairs for image in pair], axis=0))
-    (top, left), (bottom, right) = seen.min(0), seen.max(0) + 1
-    rows = [[on_paper(pair[row][top:bottom, left:right]) for pair in pairs] for row in range(2)]
+    seen = np.any([image[..., 3] > 0 for pair in pairs for image in pair], axis=0)
+    window = metrics.occupied(seen, 0) or (slice(None), slice(None))
+    rows = [[on_paper(pair[row][window]) for pair in pairs] for row in range(2)]
     return np.concatenate([np.concatenate(row, axis=1) for row in rows], axis=0)
 
 

@@ -2,8 +2,9 @@ import torch
 from captures import tube_model_config
 from figures import tube_mesh, tube_motion, tube_skeleton
 
-from ash.blendshapes import LocalBlendshapes, neighbours
+from ash.blendshapes import LocalBlendshapes
 from ash.dataset import Skeleton
+from ash.deforming import near_joints
 from ash.skinning import RigidTransforms
 from ash.template import RestDeformation, Template
 from ash.textures import Conditions, build_lattice, normalised_motion
@@ -45,7 +46,7 @@ def test_untrained_blendshapes_return_zero_and_then_learn_everything():
 def test_a_region_follows_its_neighbours_and_no_one_else():
     chain = Skeleton(names=tuple("abcd"), parents=torch.tensor([-1, 0, 1, 1]).numpy(), heads=torch.zeros(4, 3).numpy())
     expected = [[1, 1, 0, 0], [1, 1, 1, 1], [0, 1, 1, 0], [0, 1, 0, 1]]
-    assert neighbours(chain).int().tolist() == expected
+    assert near_joints(chain).int().tolist() == expected
     decoder = head()
     torch.nn.init.normal_(decoder.shapes)
     decoder.near = torch.eye(2, dtype=torch.bool)
