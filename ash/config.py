@@ -1,5 +1,6 @@
 """What defines a run of ASH: frozen dataclasses, checked when they are made. Presets are functions in `ash.presets`."""
 
+import math
 from dataclasses import dataclass
 
 from ash.files import InputError
@@ -79,6 +80,9 @@ class TrainingConfig:
     crop: bool = True  # draw only around the subject; the release draws whole frames
     precision: str = "float32"  # of the decoders while they learn; "bfloat16": autocast
     ema: float = 0.0  # decay of an average of the weights, which is then the result; 0: none
+    texture_noise: float = (
+        0.0  # smooth shifts of the standardised motion-aware textures while they learn; not in the paper
+    )
     camera_share: float = 1.0  # of the training cameras, evenly spread
     checkpoint_seconds: float = 60.0
 
@@ -90,6 +94,8 @@ class TrainingConfig:
         one_of("precision", self.precision, ("float32", "bfloat16"))
         if not 0 <= self.ema < 1:
             raise InputError(f"ema: expected a decay of at least 0 and below 1, got {self.ema}")
+        if not 0 <= self.texture_noise < math.inf:
+            raise InputError(f"texture_noise: expected a finite standard deviation, got {self.texture_noise}")
         if not 0 < self.camera_share <= 1:
             raise InputError(f"camera_share: expected more than 0 and at most 1, got {self.camera_share}")
         if self.steps < 1 or self.views_per_step < 1 or not 0 <= self.warmup_steps <= self.steps:
@@ -138,8 +144,11 @@ class AshConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse a warm-up that the model cannot take."""
+        """Refuse training that the model cannot take."""
         if self.training.warmup == "static" and not self.model.base:
             raise InputError("warmup='static' trains the base alone and needs base=True")
         if self.training.warmup in ("analytic", "fitted") and not self.model.motion:
             raise InputError(f"warmup={self.training.warmup!r} trains the decoders and needs motion=True")
+        model = self.model
+        if self.training.texture_noise > 0 and not (model.motion and model.standardise and model.head == "unet"):
+            raise InputError("texture_noise is for U-Nets that see standardised textures (standardise=True)")

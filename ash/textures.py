@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
@@ -19,6 +20,8 @@ from ash.skinning import (
     unitquat_to_rotvec,
 )
 from ash.template import Template
+
+NOISE_GRID = 4
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -162,6 +165,13 @@ def texture_statistics(textures: list[Float[Tensor, "c r r"]]) -> tuple[Float[Te
     covered = (mean != 0).any(0)
     deviations = torch.stack([(texture - mean)[:, covered] for texture in textures])
     return mean, deviations.square().mean((0, 2)).sqrt().clamp(min=1e-3)[:, None, None]
+
+
+def smooth_noise(shape: torch.Size, seed: tuple[int, ...]) -> Float[Tensor, "c h w"]:
+    """Normal numbers on a coarse grid, linear between them: what varies over a body, not over its texels."""
+    coarse = np.random.default_rng(seed).standard_normal((1, shape[0], NOISE_GRID, NOISE_GRID), np.float32)
+    grid = torch.from_numpy(coarse)
+    return nn.functional.interpolate(grid, size=shape[1:], mode="bilinear", align_corners=True)[0]
 
 
 class TextureDrawer(nn.Module):

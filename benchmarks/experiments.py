@@ -112,6 +112,7 @@ SWITCHES = (
     "wo_standardise",
     "wo_heading",
     "two_trunks",
+    "noisy_textures",
     "averaged",
     "blendshapes",
     "learned_template",

@@ -14,6 +14,7 @@ from ash.initialising import released_gaussians
 from ash.method import AshAvatar
 from ash.presets import PRESETS, named
 from ash.skinning import rotate, unitquat_to_rotmat
+from ash.textures import smooth_noise
 from ash.training import draw_batch, fit, load_training_images, view_loss
 
 
@@ -65,7 +66,7 @@ def test_every_preset_trains(name, capture, tmp_path, monkeypatch):
 
 
 def test_unknown_presets_are_refused_with_the_known_ones_named():
-    with pytest.raises(InputError, match="ci, brief, cpu, frugal, paper, official"):
+    with pytest.raises(InputError, match="ci, brief, cpu, thorough, frugal, paper, official"):
         named("paperr")
 
 
@@ -198,3 +199,36 @@ def test_bfloat16_is_a_matter_of_the_decoders_alone(capture):
     assert rough.dtype == torch.float32
     assert 0 < float((rough - exact).abs().max()) < 0.05 * float((exact - avatar.module.base.detach()).abs().max())
     assert torch.equal(avatar._decode(conditions, static=True), avatar.module.base)
+
+
+def test_noise_in_the_textures_is_for_learning_alone_and_another_one_in_every_step(capture):
+    noisy = AshAvatar(small(named("ci"), texture_noise=0.5), capture)
+    plain = AshAvatar(small(named("ci")), capture)
+    seen = []
+    for avatar in (noisy, plain):
+        torch.nn.init.normal_(avatar.module.decoders.nets[0].head.weight, std=0.1, generator=torch.manual_seed(1))
+        camera = [capture.cameras["cam1"]]
+        draw = [avatar.draw_training_views(0, camera, torch.zeros(3), step).detach() for step in (2, 2, 3, 1)]
+        with torch.no_grad():
+            draw.append(avatar.draw_training_views(0, camera, torch.zeros(3), 2))
+        seen.append(draw)
+    (first, again, later, warm_up, still), (clean, _, _, clean_warm_up, _) = seen
+    assert torch.equal(first, again) and not torch.equal(first, later)
+    assert not torch.equal(first, clean)
+    assert torch.equal(still, clean) and torch.equal(warm_up, clean_warm_up)
+
+
+def test_noise_is_smooth_standard_and_a_function_of_its_seed():
+    noise = smooth_noise(torch.Size((6, 32, 32)), (0, 3, 1))
+    assert torch.equal(noise, smooth_noise(torch.Size((6, 32, 32)), (0, 3, 1)))
+    assert not torch.equal(noise, smooth_noise(torch.Size((6, 32, 32)), (0, 3, 2)))
+    corners = torch.stack([smooth_noise(torch.Size((6, 32, 32)), (s, 3, 1))[:, 0, 0] for s in range(200)])
+    assert abs(corners.std() - 1) < 0.1 and abs(corners.mean()) < 0.1
+    assert noise.diff(dim=2).abs().max() < 0.5
+
+
+@pytest.mark.parametrize("model", [{"head": "blendshapes", "shuffle": 1}, {"standardise": False}, {"motion": False}])
+def test_noise_without_standardised_textures_is_refused(model):
+    base = named("ci")
+    with pytest.raises(InputError, match="texture_noise"):
+        replace(base, model=replace(base.model, **model), training=replace(base.training, texture_noise=0.5))
