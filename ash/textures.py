@@ -22,6 +22,7 @@ from ash.skinning import (
 from ash.template import Template
 
 NOISE_GRID = 4
+BOUND = 3.0  # Of standardised textures: what lies farther out was hardly ever learned from, or never.
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -177,8 +178,8 @@ def smooth_noise(shape: torch.Size, seed: tuple[int, ...]) -> Float[Tensor, "c h
 class TextureDrawer(nn.Module):
     """Stg.2 as a network sees it: the motion-aware textures of a frame, standardised if asked.
 
-    What is standardised is a deviation from the mean training texture, in units of its channel's spread (not in the
-    paper). Mean and spread are part of a checkpoint.
+    What is standardised is a deviation from the mean training texture, in units of its channel's spread, at most three
+    of them (not in the paper). Mean and spread are part of a checkpoint.
     """
 
     def __init__(self, lattice: TexelLattice, *, window: int, yaw_normalise: bool, standardise: bool) -> None:
@@ -198,7 +199,7 @@ class TextureDrawer(nn.Module):
     def forward(self, template: Template, motion: Motion, frame: int) -> Float[Tensor, "c r r"]:
         """The textures of a frame, `c = 6 window` channels."""
         textures = self._draw(template, motion, frame)
-        return (textures - self.mean) / self.spread if self.standardise else textures
+        return ((textures - self.mean) / self.spread).clamp(-BOUND, BOUND) if self.standardise else textures
 
     def _draw(self, template: Template, motion: Motion, frame: int) -> Float[Tensor, "c r r"]:
         return motion_aware_textures(
