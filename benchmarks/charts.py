@@ -21,7 +21,10 @@ APART = 17.0  # pixels between a point and a label that needs a line
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Point:
-    """A method in a scatter chart. A hollow one is a bound, not a competitor; `low` and `high` are its interval."""
+    """A method in a scatter chart. A hollow one is a bound, not a competitor; `low` and `high` are its interval.
+
+    One that is not `named` shows its label to the pointer only.
+    """
 
     x: float
     y: float
@@ -31,6 +34,7 @@ class Point:
     low: float | None = None
     high: float | None = None
     ringed: bool = False
+    named: bool = True
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -117,7 +121,7 @@ def _lifted(panels: Sequence[Panel]) -> list[Panel]:
     def lift(point: Point) -> Point:
         if point.y >= floor:
             return point
-        return replace(point, y=floor, low=None, high=None, label=f"{point.label}: {point.y:.1f} ↓")
+        return replace(point, y=floor, low=None, high=None, label=f"{point.label}: {point.y:.1f} ↓", named=True)
 
     return [replace(panel, points=tuple(map(lift, panel.points))) for panel in panels]
 
@@ -273,10 +277,14 @@ def _points(panel: Panel, x: Axis, y: Axis) -> str:
             ring = f'stroke="{point.colour}" stroke-width="1.4" fill="none"'
             parts.append(f'<circle class="ring" cx="{short(px)}" cy="{short(py)}" r="9.5" {ring}/>')
         parts.append(f'<circle cx="{short(px)}" cy="{short(py)}" r="5.5" {ink}>{title}</circle>')
-    widths = [text_width(point.label) for point in panel.points]
+    nameless = [
+        (px - 6, py - 6, px + 6, py + 6) for p, (px, py) in zip(panel.points, anchors, strict=True) if not p.named
+    ]
+    named = [(point, anchor) for point, anchor in zip(panel.points, anchors, strict=True) if point.named]
+    widths = [text_width(point.label) for point, _ in named]
     box = (x.start, y.end, x.end, y.start)
-    places = place_labels(anchors, widths, box, whiskers)
-    for point, anchor, place, width in zip(panel.points, anchors, places, widths, strict=True):
+    places = place_labels([anchor for _, anchor in named], widths, box, [*whiskers, *nameless])
+    for (point, anchor), place, width in zip(named, places, widths, strict=True):
         parts.append(_leader(anchor, place, width, point.colour))
         parts.append(text_at(*place, point.label, colour=point.colour, kind="halo"))
     return "".join(parts)

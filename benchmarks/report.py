@@ -61,6 +61,8 @@ def write_report(run: Run) -> list[str]:
     write_csv(folder / "results.csv", tidy(results))
     for scene in scenes:
         write_atomic(folder / f"chart_{scene.name}.svg", scene.chart.encode())
+        if scene.effects:
+            write_atomic(folder / f"chart_effects_{scene.name}.svg", scene.effects.encode())
         if scene.comparisons:
             write_atomic(folder / f"pictures_{scene.name}.png", png(contact_sheet(scene.comparisons)))
         if scene.worst:
@@ -138,6 +140,7 @@ def markdown_of(run: Run, results: Sequence[CellResult], sections: Sections, sce
         parts.append("\n".join(f"- {sentence}" for sentence in sections.margin.sentences))
     for scene in scenes:
         parts += [f"## {scene.name}", f"**{scene.headline}**", "\n".join(f"- {remark}" for remark in scene.remarks)]
+        parts += [f"![Differences with intervals](chart_effects_{scene.name}.svg)"] if scene.effects else []
         parts.append(_contrast_rows(scene.contrasts))
         parts.append(f"![Accuracy against speed](chart_{scene.name}.svg)")
         parts += [

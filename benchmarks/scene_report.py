@@ -9,6 +9,7 @@ from benchmarks import charts, contrasts, conventions, findings, pareto, tables
 from benchmarks.cells import Cell
 from benchmarks.charts import Bar, Line, Panel, Point
 from benchmarks.contrasts import Contrast
+from benchmarks.forest import Effect, ForestPanel, forest
 from benchmarks.metrics import METRICS
 from benchmarks.names import EXACT, is_oracle, look_of
 from benchmarks.pictures import Comparison, comparisons_of, gallery, missing_pictures
@@ -21,6 +22,8 @@ COSTS = ("frame_ms", *STAGES, "train_s", "peak_rss_mb", "params", "gaussians")
 STAGE_NAMES = ("Stg.1 template", "Stg.2 textures", "Stg.3 decoders", "Stg.4 skin and draw", "other")
 STAGE_COLOURS = ("#2f6fde", "#2a9d8f", "#dd6b20", "#9b59b6", "#8a94a3")
 PICTURED = ("ash", "ddc", "ash_truth", "ddc_truth")
+MANY_CONTRASTS = 6  # Rows from which contrasts are drawn as well as listed.
+MANY_POINTS = 14  # Methods from which only those that matter to accuracy against speed are named in its chart.
 SMOOTH = 7  # Points of the training log under the running median: single batches differ by decibels.
 
 
@@ -46,6 +49,7 @@ class SceneReport:
     more: tuple[Table, ...]
     exact: tuple[Exact, ...]
     contrasts: tuple[Contrast, ...]
+    effects: str
     frontier: tuple[str, ...]
     conventions: tuple[conventions.Comparison, ...]
     comparisons: tuple[Comparison, ...]
@@ -58,6 +62,7 @@ class SceneReport:
 def scene_report(run: Run, scores: Scores, scene: str) -> SceneReport:
     """Compute the part of one scene."""
     comparisons, worst, no_pictures = _pictures(run, scores, scene)
+    established = contrasts.contrasts(scores, scene)
     return SceneReport(
         name=scene,
         headline=findings.headline(scores, scene),
@@ -67,7 +72,8 @@ def scene_report(run: Run, scores: Scores, scene: str) -> SceneReport:
         cost=tables.build(scores, scene, tables.cost_columns(COSTS), title=f"Cost on {scene}"),
         more=_more_tables(scores, scene),
         exact=tuple(_exact_pairs(scores, scene)),
-        contrasts=contrasts.contrasts(scores, scene),
+        contrasts=established,
+        effects=_effects(established),
         frontier=findings.frontier(scores, scene),
         conventions=_conventions(scores, scene),
         comparisons=tuple(comparisons),
@@ -170,6 +176,9 @@ def _panel(scores: Scores, scene: str, split: str, title: str) -> Panel:
     if sufficient is not None:
         points[index[sufficient.name]] = replace(points[index[sufficient.name]], ringed=True)
     note = f"noise ceiling {ceiling.mean:.1f} dB" if ceiling else ""
+    if len(points) > MANY_POINTS:
+        named = {*best, *EXACT, *EXACT.values(), sufficient.name if sufficient else ""}
+        points = [replace(point, named=method in named) for method, point in zip(index, points, strict=True)]
     return Panel(title=title, points=tuple(points), links=links, front=tuple(index[m] for m in best), note=note)
 
 
@@ -184,6 +193,18 @@ def _point(method: str, frame: Score, quality: Score) -> Point:
         low=None if spread is None else quality.mean - spread,
         high=None if spread is None else quality.mean + spread,
     )
+
+
+def _effects(found: Sequence[Contrast]) -> str:
+    """The contrasts as a chart, where they are many enough for a table to be hard to read."""
+    panels = []
+    for split, title in list(tables.SPLIT_TITLES.items())[:2]:
+        effects = tuple(
+            Effect(label=c.title, mean=c.test.mean, low=c.test.low, high=c.test.high) for c in found if c.split == split
+        )
+        panels.append(ForestPanel(title=title, effects=effects))
+    many = max(len(panel.effects) for panel in panels) >= MANY_CONTRASTS
+    return forest(panels, x_title="ASH minus the row [dB]") if many else ""
 
 
 def _exact_pairs(scores: Scores, scene: str) -> list[Exact]:
