@@ -20,7 +20,7 @@ from ash.files import InputError, write_atomic
 from ash.initialising import blank_gaussians, initial_gaussians, released_gaussians, texel_pitch
 from ash.protocol import StageClock
 from ash.templates import template_of
-from ash.textures import Conditions, TexelLattice, build_lattice, normalised_motion, smooth_noise
+from ash.textures import Conditions, TexelLattice, build_lattice, normalised_motion, unsettled
 from ash.training import TrainingImages, draw_batch, fit, load_module, load_training_images, read_safetensors, view_loss
 
 WARMUP_OPACITY_WEIGHT = 0.1  # As in the release.
@@ -94,19 +94,14 @@ class AshAvatar:
         """Stages 3 and 4 on cached conditions; the base alone while the static warm-up lasts."""
         static = self.config.training.warmup == "static" and step < self.config.training.warmup_steps
         conditions = self._conditions_of(frame)
-        raw = self._decode(conditions if static else self._unsettled(conditions, step), static=static)
+        if not static:
+            noisy = unsettled(conditions.textures, self.config.training.texture_noise, seed=self.config.seed, step=step)
+            conditions = replace(conditions, textures=noisy)
+        raw = self._decode(conditions, static=static)
         try:
             return self.module.draw(self.module.pose(raw, conditions), cameras, background).rgb
         except InputError as error:  # Cameras and background come from the capture: the Gaussians are at fault.
             raise FloatingPointError(f"Gaussians that cannot be drawn ({error})") from error
-
-    def _unsettled(self, conditions: Conditions, step: int) -> Conditions:
-        """The conditions with other noise in every step that learns: decoders that see it rely less on exact poses."""
-        sigma = self.config.training.texture_noise
-        if sigma == 0 or not torch.is_grad_enabled():
-            return conditions
-        noise = smooth_noise(conditions.textures.shape, (self.config.seed, 3, step))
-        return replace(conditions, textures=conditions.textures + sigma * noise)
 
     def _decode(self, conditions: Conditions, *, static: bool = False) -> Tensor:
         """Stage 3 as it learns, in the precision of the configuration."""

@@ -168,6 +168,13 @@ def texture_statistics(textures: list[Float[Tensor, "c r r"]]) -> tuple[Float[Te
     return mean, deviations.square().mean((0, 2)).sqrt().clamp(min=1e-3)[:, None, None]
 
 
+def unsettled(textures: Float[Tensor, "c r r"], sigma: float, *, seed: int, step: int) -> Float[Tensor, "c r r"]:
+    """Standardised textures with other noise in every step that learns: who sees it relies less on exact poses."""
+    if sigma == 0 or not torch.is_grad_enabled():
+        return textures
+    return textures + sigma * smooth_noise(textures.shape, (seed, 3, step))
+
+
 def smooth_noise(shape: torch.Size, seed: tuple[int, ...]) -> Float[Tensor, "c h w"]:
     """Normal numbers on a coarse grid, linear between them: what varies over a body, not over its texels."""
     coarse = np.random.default_rng(seed).standard_normal((1, shape[0], NOISE_GRID, NOISE_GRID), np.float32)

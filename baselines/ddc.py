@@ -28,7 +28,7 @@ from ash.refining import Refinement
 from ash.template import PosedTemplate, Template
 from ash.templates import template_of
 from ash.texels import LIGHT_COEFFICIENTS
-from ash.textures import TextureDrawer, build_lattice
+from ash.textures import TextureDrawer, build_lattice, unsettled
 from ash.training import fit, load_module, load_training_images, read_safetensors
 
 # Texture pixels per Gaussian of ASH's lattice, per side: the mesh must not be starved. At 256x256 a body's pixel is
@@ -165,8 +165,10 @@ class DdcAvatar:
         if frame not in self._posed:
             self._posed[frame] = self.template.pose(self._motion, frame)
             self._conditions[frame] = self.module.textures(self.template, self._motion, frame)
-        static = self.config.training.warmup == "static" and step < self.config.training.warmup_steps
-        texture = self.module.texture if static else self.module.dynamic_texture(self._conditions[frame])
+        training = self.config.training
+        conditions = unsettled(self._conditions[frame], training.texture_noise, seed=self.config.seed, step=step)
+        static = training.warmup == "static" and step < training.warmup_steps
+        texture = self.module.texture if static else self.module.dynamic_texture(conditions)
         with torch.set_grad_enabled(step % VERTICES_EVERY == 0):
             posed = self.module.refined(self._posed[frame])
         return torch.stack([self.module.draw(texture, posed, c, background)[..., :3] for c in cameras])

@@ -86,3 +86,16 @@ def _psnr(made, capture) -> float:
         drawn = made.render(capture.motion, frame, capture.cameras[camera], clock=StageClock())
         errors.append(((drawn[..., :3] - truth[..., :3])[truth[..., 3] > 0.95] ** 2).mean())
     return float(-10 * np.log10(np.mean(errors)))
+
+
+def test_noise_in_the_textures_is_for_learning_alone(capture):
+    config = named("ci")
+    config = replace(config, training=replace(config.training, texture_noise=0.5, warmup_steps=2))
+    avatar = DdcAvatar(ddc_config(config, seed=0, template=TemplateConfig(kind="exact")), capture)
+    for parameter in avatar.module.network.parameters():
+        parameter.data += 0.05 * torch.randn(parameter.shape, generator=torch.manual_seed(0))
+    cameras = [capture.cameras["cam1"]]
+    learned = [avatar.draw_training_views(0, cameras, torch.zeros(3), step).detach() for step in (2, 3)]
+    with torch.no_grad():
+        still = [avatar.draw_training_views(0, cameras, torch.zeros(3), step) for step in (2, 3)]
+    assert not torch.equal(*learned) and torch.equal(*still)
