@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.charts import Axis, document, linear_axis, short, text_at, text_width
 
 ROW, TOP, BELOW = 22.0, 44.0, 46.0
-NUMBERS = 162.0  # pixels for what is written beside a panel
+NUMBERS = 176.0  # pixels for what is written beside a panel
 ROOMY = 1.6  # Shown are this many times the extent of the middle eighty per cent; arrows point to what lies beyond.
 ABOVE, BELOW_ZERO, UNSURE = "#2f6fde", "#dd6b20", "#8a94a3"  # Where the interval lies, or that it holds zero.
 
