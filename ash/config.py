@@ -80,9 +80,7 @@ class TrainingConfig:
     crop: bool = True  # draw only around the subject; the release draws whole frames
     precision: str = "float32"  # of the decoders while they learn; "bfloat16": autocast
     ema: float = 0.0  # decay of an average of the weights, which is then the result; 0: none
-    texture_noise: float = (
-        0.0  # smooth shifts of the standardised motion-aware textures while they learn; not in the paper
-    )
+    texture_noise: float = 0.0  # in the standardised motion-aware textures while decoders learn; not in the paper
     camera_share: float = 1.0  # of the training cameras, evenly spread
     checkpoint_seconds: float = 60.0
 

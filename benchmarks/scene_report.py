@@ -22,7 +22,7 @@ COSTS = ("frame_ms", *STAGES, "train_s", "peak_rss_mb", "params", "gaussians")
 STAGE_NAMES = ("Stg.1 template", "Stg.2 textures", "Stg.3 decoders", "Stg.4 skin and draw", "other")
 STAGE_COLOURS = ("#2f6fde", "#2a9d8f", "#dd6b20", "#9b59b6", "#8a94a3")
 PICTURED = ("ash", "ddc", "ash_truth", "ddc_truth")
-MANY_CONTRASTS = 6  # Rows from which contrasts are drawn as well as listed.
+MANY_CONTRASTS = 5  # Rows from which contrasts are drawn as well as listed.
 MANY_POINTS = 18  # Methods from which only those that matter to accuracy against speed are named in its chart.
 SMOOTH = 7  # Points of the training log under the running median: single batches differ by decibels.
 
