@@ -9,6 +9,7 @@ from benchmarks import charts, contrasts, conventions, findings, pareto, tables
 from benchmarks.cells import Cell
 from benchmarks.charts import Bar, Line, Panel, Point
 from benchmarks.contrasts import Contrast
+from benchmarks.experiments import WRONG_BY_MM
 from benchmarks.forest import Effect, ForestPanel, forest
 from benchmarks.metrics import METRICS
 from benchmarks.names import EXACT, is_oracle, look_of
@@ -24,6 +25,7 @@ STAGE_COLOURS = ("#2f6fde", "#2a9d8f", "#dd6b20", "#9b59b6", "#8a94a3")
 PICTURED = ("ash", "ddc", "ash_truth", "ddc_truth")
 MANY_CONTRASTS = 5  # Rows from which contrasts are drawn as well as listed.
 MANY_POINTS = 18  # Methods from which only those that matter to accuracy against speed are named in its chart.
+PLANTED = {method for mm, row in WRONG_BY_MM.items() if mm > 0 for method in row}  # They have a chart of their own.
 SMOOTH = 7  # Points of the training log under the running median: single batches differ by decibels.
 
 
@@ -164,7 +166,7 @@ def _panel(scores: Scores, scene: str, split: str, title: str) -> Panel:
     index: dict[str, int] = {}
     for method in scores.methods(scene):
         frame, quality = scores.get(scene, method, "speed", "", "frame_ms"), scores.fg(scene, method, split)
-        if frame is None or quality is None or scores.failed(scene, method):
+        if frame is None or quality is None or scores.failed(scene, method) or method in PLANTED:
             continue
         index[method] = len(points)
         points.append(_point(method, frame, quality))
