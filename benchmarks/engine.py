@@ -106,6 +106,7 @@ def run_cells(plan: Plan, executor: Executor, limits: Limits, progress: Progress
     """
     for cell in plan.todo:
         write_config(cell)
+    _stopping.clear()  # Not when a run is over: a thread that the interruption kept from its executor may still look.
     futures: dict[Future[str], Cell] = {}
     try:
         for cell in plan.todo:
@@ -121,7 +122,6 @@ def run_cells(plan: Plan, executor: Executor, limits: Limits, progress: Progress
             future.cancel()
         stop_children()
         executor.shutdown(wait=True, cancel_futures=True)
-        _stopping.clear()
         raise
 
 

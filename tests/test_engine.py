@@ -4,6 +4,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import fakes
@@ -147,6 +149,25 @@ def test_interrupting_ends_the_children_and_the_cell_can_be_resumed(capture: Pat
         wait_for(lambda child=child: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE)
         assert read_result(target.folder) is None
         assert len(plan_cells([target]).todo) == 1
+
+
+def test_a_thread_that_its_executor_forgot_takes_an_interruption_for_no_failure(capture: Path, tmp_path: Path) -> None:
+    class Forgetful(ThreadPoolExecutor):
+        def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+            """As where SIGINT strikes between the start of a thread and its registration."""
+
+    class Impatient(Progress):
+        def tick(self, *, running: Sequence[str] = ()) -> None:
+            wait_for_child(os.getpid())
+            raise KeyboardInterrupt
+
+    target, executor = cell("sleeping", capture, tmp_path), Forgetful(1)
+    progress = Impatient("", 1, expected_s=1.0, workers=1, stream=io.StringIO())
+    with pytest.raises(KeyboardInterrupt):
+        run_cells(plan_cells([target]), executor, Limits(seconds=60.0, memory_mb=4096), progress)
+    ThreadPoolExecutor.shutdown(executor)
+    assert read_result(target.folder) is None
+    assert len(run([cell("good", capture, tmp_path)]).todo) == 1, "the next run is not stopped"
 
 
 def test_a_cell_that_was_told_to_stop_is_unfinished_and_not_failed(capture: Path, tmp_path: Path) -> None:
