@@ -165,13 +165,17 @@ class DdcAvatar:
         if frame not in self._posed:
             self._posed[frame] = self.template.pose(self._motion, frame)
             self._conditions[frame] = self.module.textures(self.template, self._motion, frame)
-        training = self.config.training
-        conditions = unsettled(self._conditions[frame], training.texture_noise, seed=self.config.seed, step=step)
-        static = training.warmup == "static" and step < training.warmup_steps
-        texture = self.module.texture if static else self.module.dynamic_texture(conditions)
+        texture = self._training_texture(frame, step)
         with torch.set_grad_enabled(step % VERTICES_EVERY == 0):
             posed = self.module.refined(self._posed[frame])
         return torch.stack([self.module.draw(texture, posed, c, background)[..., :3] for c in cameras])
+
+    def _training_texture(self, frame: int, step: int) -> Float[Tensor, "3 t t"]:
+        training = self.config.training
+        if training.warmup == "static" and step < training.warmup_steps:
+            return self.module.texture
+        seen = unsettled(self._conditions[frame], training.texture_noise, seed=self.config.seed, step=step)
+        return self.module.dynamic_texture(seen)
 
     @torch.no_grad()
     def render(self, motion: Motion, frame: int, camera: Camera, *, clock: StageClock) -> np.ndarray:

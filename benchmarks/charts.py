@@ -261,7 +261,8 @@ def _points(panel: Panel, x: Axis, y: Axis) -> str:
         dashes = f'stroke="{panel.points[a].colour}" stroke-width="1.2" stroke-dasharray="3 3" opacity="0.75"'
         parts.append(f'<line x1="{short(x1)}" y1="{short(y1)}" x2="{short(x2)}" y2="{short(y2)}" {dashes}/>')
     whiskers = []
-    for point, (px, _) in zip(panel.points, anchors, strict=True):
+    pairs = list(zip(panel.points, anchors, strict=True))
+    for point, (px, _) in pairs:
         if point.low is not None and point.high is not None:
             low, high = y.at(point.low), y.at(point.high)
             caps = f"M{short(px - 4)} {short(low)}h8M{short(px - 4)} {short(high)}h8"
@@ -270,17 +271,15 @@ def _points(panel: Panel, x: Axis, y: Axis) -> str:
                 f'stroke="{point.colour}" stroke-width="1.3" fill="none"/>'
             )
             whiskers.append((px - 4, min(low, high), px + 4, max(low, high)))
-    for point, (px, py) in zip(panel.points, anchors, strict=True):
+    for point, (px, py) in pairs:
         ink = f'class="hollow" stroke="{point.colour}" stroke-width="2"' if point.hollow else f'fill="{point.colour}"'
         title = f"<title>{escape(point.label)}: {point.y:.2f} at {point.x:.1f} ms</title>"
         if point.ringed:
             ring = f'stroke="{point.colour}" stroke-width="1.4" fill="none"'
             parts.append(f'<circle class="ring" cx="{short(px)}" cy="{short(py)}" r="9.5" {ring}/>')
         parts.append(f'<circle cx="{short(px)}" cy="{short(py)}" r="5.5" {ink}>{title}</circle>')
-    nameless = [
-        (px - 6, py - 6, px + 6, py + 6) for p, (px, py) in zip(panel.points, anchors, strict=True) if not p.named
-    ]
-    named = [(point, anchor) for point, anchor in zip(panel.points, anchors, strict=True) if point.named]
+    nameless = [(px - 6, py - 6, px + 6, py + 6) for point, (px, py) in pairs if not point.named]
+    named = [(point, anchor) for point, anchor in pairs if point.named]
     widths = [text_width(point.label) for point, _ in named]
     box = (x.start, y.end, x.end, y.start)
     places = place_labels([anchor for _, anchor in named], widths, box, [*whiskers, *nameless])

@@ -125,12 +125,7 @@ def _level_chart(curve: margin.MarginCurve) -> Multiple:
         samples = tuple(Sample(x=mm, y=psnr.mean, low=psnr.low, high=psnr.high) for mm, psnr in level.qualities)
         look = look_of(level.method)
         series.append(Series(label=margin.LEVEL_TITLES[level.method], colour=look.colour, samples=samples))
-    return Multiple(
-        title=f"{curve.scene}, {SPLIT_WORDS[curve.split]}",
-        x_title="template error [mm rms]",
-        ticks=tuple((m.error_mm, f"{m.error_mm:g}") for m in curve.known),
-        series=tuple(series),
-    )
+    return _against_error(curve, series)
 
 
 def _margin_chart(curve: margin.MarginCurve) -> Multiple:
@@ -142,6 +137,10 @@ def _margin_chart(curve: margin.MarginCurve) -> Multiple:
     rules = [Rule(y=0.0, label="")]
     if curve.paper_db is not None:
         rules.append(Rule(y=curve.paper_db, label=f"the paper's {curve.paper_db:+.1f} dB"))
+    return _against_error(curve, series, rules)
+
+
+def _against_error(curve: margin.MarginCurve, series: Sequence[Series], rules: Sequence[Rule] = ()) -> Multiple:
     return Multiple(
         title=f"{curve.scene}, {SPLIT_WORDS[curve.split]}",
         x_title="template error [mm rms]",

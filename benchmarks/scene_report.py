@@ -200,18 +200,18 @@ def _point(method: str, frame: Score, quality: Score) -> Point:
 def _effects(found: Sequence[Contrast]) -> str:
     """The contrasts as a chart, where they are many enough for a table to be hard to read."""
     panels = []
-    for split, title in list(tables.SPLIT_TITLES.items())[:2]:
+    for split in contrasts.RANKED_SPLITS:
         effects = tuple(
             Effect(label=c.title, mean=c.test.mean, low=c.test.low, high=c.test.high) for c in found if c.split == split
         )
-        panels.append(ForestPanel(title=title, effects=effects))
+        panels.append(ForestPanel(title=tables.SPLIT_TITLES[split], effects=effects))
     many = max(len(panel.effects) for panel in panels) >= MANY_CONTRASTS
     return forest(panels, x_title="ASH minus the row [dB]") if many else ""
 
 
 def _exact_pairs(scores: Scores, scene: str) -> list[Exact]:
     found = []
-    for split, title in list(tables.SPLIT_TITLES.items())[:2]:
+    for split in contrasts.RANKED_SPLITS:
         quads = [[scores.fg(scene, name, split) for name in pair] for pair in EXACT.items()]
         failed = any(scores.failed(scene, name) for pair in EXACT.items() for name in pair)
         if failed or any(score is None for pair in quads for score in pair):
@@ -222,7 +222,7 @@ def _exact_pairs(scores: Scores, scene: str) -> list[Exact]:
             for method, (honest, exact) in zip(EXACT, values, strict=True)
         )
         margins = tuple(f"{values[0][i] - values[1][i]:+.2f}" for i in (0, 1))
-        found.append(Exact(split=title, rows=rows, margin=(margins[0], margins[1])))
+        found.append(Exact(split=tables.SPLIT_TITLES[split], rows=rows, margin=(margins[0], margins[1])))
     return found
 
 

@@ -36,13 +36,15 @@ def test_what_is_played_is_what_was_trained(capture, model):
     names = {engine.name for engine in player.engines}
     assert names == {"float32", "bfloat16"} | ({"openvino"} if avatar.config.model.head == "unet" else set())
     assert player.engine.ms == min(engine.ms for engine in player.engines)
-    for frame in (0, 3):
-        clock = StageClock()
-        drawn = player.draw(frame, camera, clock=clock)
-        trained = avatar.render(capture.motion, frame, camera, clock=StageClock())
-        assert psnr(drawn[..., :3], trained[..., :3], trained[..., 3]) > LEAST_AGREEMENT_DB - 5
-        assert np.abs(drawn - trained).max() < 0.1
-        assert list(clock.ms) == ["stg1", "stg2", "stg3", "stg4"]
+    for engine in player.engines:  # Which of them is fastest changes from run to run.
+        player.engine = engine
+        for frame in (0, 3):
+            clock = StageClock()
+            drawn = player.draw(frame, camera, clock=clock)
+            trained = avatar.render(capture.motion, frame, camera, clock=StageClock())
+            np.testing.assert_allclose(drawn, trained, atol=0.05 if engine.name == "openvino" else 0.02)
+            assert psnr(drawn[..., :3], trained[..., :3], trained[..., 3]) > LEAST_AGREEMENT_DB
+            assert list(clock.ms) == ["stg1", "stg2", "stg3", "stg4"]
 
 
 def test_decoders_matter_to_the_picture(capture):
