@@ -1,1 +1,1 @@
-"""The method: ASH, Animatable Gaussian Splats (Pang et al., CVPR 2024). Start reading in `ash.avatar`."""
+"""The method: ASH, Animatable Gaussian Splats (Pang et al., CVPR 2024). Start reading in `ash.model`."""

@@ -1,145 +1,269 @@
-"""The ASH avatar, in the paper's order: template, textures, decoders, skinning, splatting. START READING HERE."""
+"""ASH as a method of the suite: builds the model from a capture, warms it up, trains it, renders with it."""
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import safetensors.torch
 import torch
-from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
-from ash.config import ModelConfig
-from ash.dataset import Camera, Motion
-from ash.gaussians import Gaussians
-from ash.protocol import StageClock
-from ash.refining import Refinement
-from ash.splatting import Splatted, splat
-from ash.template import Template
-from ash.texels import LIGHT_COEFFICIENTS, place, pose
-from ash.textures import (
-    Conditions,
-    TexelLattice,
-    TextureDrawer,
-    build_lattice,
-    normalised_motion,
-)
+from ash.blendshapes import LocalBlendshapes
+from ash.capture.dataset import Camera, Capture, Pose, fewer_cameras
+from ash.checkpoints import contiguous_state, load_module, read_safetensors
+from ash.config import AshConfig, ModelConfig
+from ash.decoders import Decoders
+from ash.files import InputError, write_atomic
+from ash.gaussians.gaussians import Gaussians
+from ash.gaussians.initialising import blank_gaussians, initial_gaussians, released_gaussians, texel_pitch
+from ash.kept import Kept
+from ash.model import AshModel, Decode, image_of
+from ash.protocol import StageClock, TrainingOutcome
+from ash.searching import Build, Candidate, Choice, brief_training, sufficient, with_choice, write_choice
+from ash.template.motion import normalised_motion
+from ash.template.template import Template
+from ash.template_learning.learning import template_of
+from ash.textures import Conditions, TexelLattice, TextureDrawer, build_lattice, unsettled
+from ash.training.adam import Adam
+from ash.training.batches import TrainingImages, draw_batch, load_training_images
+from ash.training.loop import fit, view_loss
 
-Decode = Callable[[Conditions], Tensor]  # to raw parameters [n, o]
+WARMUP_OPACITY_WEIGHT = 0.1  # As in the release.
+FITTED_FRAMES = 4
+FITTED_STEPS = 100
+
+MakeDecoders = Callable[[ModelConfig, TexelLattice], torch.nn.Module]
 
 
-class AshModel(nn.Module):
-    """The learned part of ASH, and how the stages are joined. `base` and `light` are not in the paper."""
+class AshAvatar:
+    """The Avatar protocol (see `ash.protocol`) for ASH and for every ablation that is a configuration of it."""
 
     def __init__(
         self,
-        config: ModelConfig,
-        template: Template,
-        lattice: TexelLattice,
-        initial: Float[Tensor, "n o"],
-        decoders: nn.Module | None,
+        config: AshConfig,
+        capture: Capture,
+        *,
+        make_decoders: MakeDecoders | None = None,
+        template: Template | None = None,
     ) -> None:
-        """`initial`: raw parameters per texel, to which the decoders add theirs; no decoders: they are all there is.
-
-        Decoders map `Conditions` to `[n, o]`; those of the paper are `ash.decoders.Decoders`.
-        """
-        super().__init__()
+        """`template`: one to stand on, where it exists already."""
+        capture = fewer_cameras(capture, config.training.camera_share)
+        self.template = template or template_of(config.template, capture, seed=config.seed)
+        self.choice: Choice | None = None
+        if config.search and config.model.motion and config.model.head == "unet" and make_decoders is None:
+            self.choice = sufficient(self._brief(config), config, capture)
+            config = _sized(config, self.choice.candidate, self.choice.fade)
+        torch.manual_seed(config.seed)
         self.config = config
-        self.template = template
-        self.lattice = lattice
-        self.textures: TextureDrawer | None = None
-        if decoders is not None and config.head == "unet":
-            self.textures = TextureDrawer(
-                lattice if config.shuffle == 1 else build_lattice(template.mesh, config.decoded_texels),
-                window=config.window,
-                yaw_normalise=config.yaw_normalise,
-                standardise=config.standardise,
-            )
-        self.base = nn.Parameter(initial.clone(), requires_grad=config.base)
-        self.decoders = decoders
-        self.refinement = Refinement(template.mesh) if config.refine else None
-        self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.light else None
+        self.lattice = build_lattice(capture.template, config.model.texels)
+        self.analytic = initial_gaussians(config.model, capture, self.template, self.lattice)
+        decoders = None
+        if config.model.motion:
+            decoders = make_decoders(config.model, self.lattice) if make_decoders else self._decoders()
+        self.module = AshModel(config.model, self.template, self.lattice, self._start(capture), decoders)
+        if self.module.textures is not None:
+            self.module.textures.observe(self.template, capture.motion, capture.splits["train"].frames)
+        if isinstance(decoders, LocalBlendshapes):
+            window, frames = config.model.window, capture.splits["train"].frames
+            decoders.observe([normalised_motion(Pose(capture.motion, frame), window=window) for frame in frames])
+        self._conditions = Kept(self._make_conditions)  # The template is frozen while ASH learns.
+        self._motion = capture.motion
+        self._outcome: TrainingOutcome | None = None
 
-    def conditions(self, motion: Motion, frame: int, clock: StageClock | None = None, threads: int = 1) -> Conditions:
-        """Stg.1 and Stg.2: pose the template, and draw what the decoders see."""
-        with _stage(clock, "stg1"):
-            posed = self.template.pose(motion, frame)
-        with _stage(clock, "stg2"):
-            canonical, normals, transforms = place(self.lattice, posed, threads=threads)
-            return Conditions(
-                textures=self._textures(motion, frame),
-                motion=normalised_motion(motion, frame, window=self.config.window),
-                root_translation=torch.from_numpy(motion.dofs[frame, :3]).float(),
-                canonical=canonical,
-                normals=normals,
-                transforms=transforms,
-            )
+    def _brief(self, config: AshConfig) -> Build:
+        """How the search builds its candidates: on this template."""
 
-    def _textures(self, motion: Motion, frame: int) -> Float[Tensor, "c r r"]:
-        return torch.zeros(0, 1, 1) if self.textures is None else self.textures(self.template, motion, frame)
+        def build(candidate: Candidate, capture: Capture) -> AshAvatar:
+            sized = _sized(config, candidate, config.model.fade)
+            return AshAvatar(replace(sized, training=brief_training(sized.training)), capture, template=self.template)
 
-    def decode(
-        self, conditions: Conditions, *, static: bool = False, decoders: Decode | None = None
-    ) -> Float[Tensor, "n o"]:
-        """Stg.3: raw Gaussian parameters per texel.
+        return build
 
-        `static` leaves the decoders out (the warm-up of the base); `decoders` are others than the model's own.
-        """
-        decoders = decoders or self.decoders
-        raw = self.base if decoders is None or static else self.base + decoders(conditions)
-        if self.refinement is None:
-            return raw
-        moved = self.lattice.interpolate(self.refinement()) / self.config.offset_unit_m
-        return torch.cat([raw[:, :3] + moved, raw[:, 3:]], 1)
+    def texture_drawer(self) -> TextureDrawer | None:
+        """Stg.2 of the decoders; None without any."""
+        return self.module.textures
 
-    def pose(self, raw: Float[Tensor, "n o"], conditions: Conditions, threads: int = 1) -> Gaussians:
-        """Activate the raw parameters and carry them from canonical to posed space (Eq. 5)."""
-        return pose(raw, conditions, self.config, self.light, threads=threads)
+    def _decoders(self) -> torch.nn.Module:
+        if self.config.model.head == "blendshapes":
+            return LocalBlendshapes(self.config.model, self.lattice, self.template)
+        return Decoders(self.config.model, self.lattice)
 
-    def draw(
-        self, gaussians: Gaussians, cameras: list[Camera], background: Tensor | None, threads: int = 1
-    ) -> Splatted:
-        """Stg.4: splat into cameras of one size."""
-        return splat(
-            gaussians, **views_of(cameras), background=background, dilation=self.config.dilation, threads=threads
+    def _start(self, capture: Capture) -> Tensor:
+        if self.config.model.base:
+            return self.analytic
+        posed = self.template.pose(Pose(capture.motion, capture.splits["train"].frames[0]))
+        pitch = float(texel_pitch(self.lattice, posed.canonical).median())
+        return blank_gaussians(self.config.model, len(self.lattice.texels), pitch)
+
+    def fit(self, capture: Capture, *, folder: Path) -> None:
+        """Warm up and train; see `ash.training.loop.fit`."""
+        images = load_training_images(fewer_cameras(capture, self.config.training.camera_share))
+        if self.choice is not None:
+            write_choice(self.choice, folder / "log.jsonl")
+        self._outcome = fit(
+            self,
+            images,
+            self.config.training,
+            seed=self.config.seed,
+            folder=folder,
+            before_start=lambda: self._warm_up(images),
         )
 
-    def forward(
-        self,
-        motion: Motion,
-        frame: int,
-        camera: Camera,
-        clock: StageClock | None = None,
-        *,
-        decoders: Decode | None = None,
-    ) -> Splatted:
-        """Motion and camera to image: the whole of ASH, over black, on as many threads as torch is given."""
-        threads = torch.get_num_threads()
-        conditions = self.conditions(motion, frame, clock, threads)  # Stg.1, Stg.2
-        with _stage(clock, "stg3"):
-            raw = self.decode(conditions, decoders=decoders)
-        with _stage(clock, "stg4"):
-            gaussians = self.pose(raw, conditions, threads)
-            return self.draw(gaussians, [camera], None, threads)
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """The decoders, the base and the light, each with its own learning rate."""
+        training, module = self.config.training, self.module
+        groups: list[dict[str, Any]] = []
+        if module.decoders is not None:
+            groups.append({"params": list(module.decoders.parameters()), "lr": training.learning_rate})
+        if module.base.requires_grad:
+            groups.append({"params": [module.base], "lr": training.base_learning_rate})
+        if module.refinement is not None:
+            groups.append({"params": list(module.refinement.parameters()), "lr": training.base_learning_rate})
+        if module.light is not None:
+            groups.append({"params": [module.light], "lr": training.base_learning_rate})
+        return groups
+
+    def draw_training_views(self, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
+        """Stages 3 and 4 on cached conditions; the base alone while the static warm-up lasts."""
+        static = self.config.training.warmup == "static" and step < self.config.training.warmup_steps
+        conditions = self._conditions_of(frame)
+        if not static:
+            noisy = unsettled(conditions.textures, self.config.training.texture_noise, seed=self.config.seed, step=step)
+            conditions = replace(conditions, textures=noisy)
+        raw = self._decode(conditions, static=static)
+        try:
+            return self.module.draw(self.module.pose(raw, conditions), cameras, background).rgb
+        except InputError as error:  # Cameras and background come from the capture: the Gaussians are at fault.
+            raise FloatingPointError(f"Gaussians that cannot be drawn ({error})") from error
+
+    def corrections(self, frame: int) -> Tensor | None:
+        """What the decoders add to the base in a training frame, raw parameters `[n, o]`."""
+        decoders = self.module.decoders
+        return None if decoders is None else decoders(self._conditions_of(frame))
+
+    def fade_to(self, mean: Tensor) -> None:
+        """What counts far from the training motion in place of what the decoders say there."""
+        self.module.fade_to(mean)
+
+    def _decode(self, conditions: Conditions, *, static: bool = False) -> Tensor:
+        """Stage 3 as it learns, in the precision of the configuration."""
+        half = self.config.training.precision == "bfloat16"
+        with torch.autocast("cpu", torch.bfloat16, enabled=half):
+            return self.module.decode(conditions, static=static).float()
+
+    def _conditions_of(self, frame: int) -> Conditions:
+        return self._conditions[frame]
+
+    @torch.no_grad()
+    def _make_conditions(self, frame: int) -> Conditions:
+        return self.module.conditions(Pose(self._motion, frame))
+
+    def _warm_up(self, images: TrainingImages) -> None:
+        """ASH Eq. 8: regress the decoders to known Gaussians before anything is rendered through them."""
+        training = self.config.training
+        if training.warmup == "analytic":
+            self._regress(images.frames, self._released_target)
+        elif training.warmup == "fitted":
+            chosen = images.frames[:: max(1, len(images.frames) // FITTED_FRAMES)]
+            fitted = {frame: self._fit_frame(images, frame) for frame in chosen}
+            self._regress(chosen, fitted.__getitem__)
+
+    def _released_target(self, frame: int) -> Tensor:
+        return released_gaussians(self.config.model, self.analytic, self._conditions_of(frame))
+
+    def _fit_frame(self, images: TrainingImages, frame: int) -> Tensor:
+        """Pseudo ground truth of one frame: positions stay on the template, everything else is fitted to its views."""
+        alone = replace(images, frames=(frame,))
+        raw = self.analytic.clone().requires_grad_()
+        optimiser = Adam([{"params": [raw], "lr": self.config.training.base_learning_rate}])
+        conditions = self._conditions_of(frame)
+        for step in range(FITTED_STEPS):
+            batch = draw_batch(alone, self.config.training, self.config.seed, step)
+            fixed = torch.cat([torch.zeros_like(raw[:, :3]), raw[:, 3:]], 1)
+            drawn = self.module.draw(self.module.pose(fixed, conditions), batch.cameras, batch.background).rgb
+            optimiser.zero_grad()
+            view_loss(drawn, batch, self.config.training).backward()  # type: ignore[no-untyped-call]
+            optimiser.step()
+        return torch.cat([torch.zeros_like(raw[:, :3]), raw[:, 3:]], 1).detach()
+
+    def _regress(self, frames: Sequence[int], target: Callable[[int], Tensor]) -> None:
+        assert self.module.decoders is not None
+        training = self.config.training
+        optimiser = Adam([{"params": list(self.module.decoders.parameters()), "lr": training.learning_rate}])
+        weights = torch.ones(self.analytic.shape[1])
+        weights[10] = WARMUP_OPACITY_WEIGHT
+        for step in range(training.warmup_steps):
+            frame = frames[step % len(frames)]
+            raw = self._decode(self._conditions_of(frame))
+            loss = (weights * (raw - target(frame)) ** 2).mean()
+            optimiser.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            optimiser.step()
+
+    @torch.no_grad()
+    def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
+        """Premultiplied RGBA, float32 `[h, w, 4]`."""
+        return image_of(self.module(pose, camera, clock))
+
+    def template_vertices(self, pose: Pose) -> np.ndarray:
+        """The posed template, `[v, 3]` metres."""
+        posed, refinement = self.template.pose(pose), self.module.refinement
+        if refinement is None:
+            return posed.vertices.numpy()
+        with torch.no_grad():
+            return posed.transforms.apply(posed.canonical + refinement()).numpy()
+
+    def outcome(self) -> TrainingOutcome | None:
+        """How training ended; None before it did."""
+        return with_choice(self._outcome, self.choice)
+
+    def template_seconds(self) -> float | None:
+        """What learning the template took, once for all methods that stand on it; None where it was not learned."""
+        return None if self.template.learned is None else self.template.learned.seconds
+
+    @torch.no_grad()
+    def gaussian_means(self, pose: Pose) -> np.ndarray:
+        """Centres of the posed Gaussians, `[n, 3]` metres."""
+        return self.gaussians(pose).means.numpy()
+
+    @torch.no_grad()
+    def gaussians(self, pose: Pose, *, clock: StageClock | None = None, decoders: Decode | None = None) -> Gaussians:
+        """The posed Gaussians: world, metres; by other `decoders` than the model's own where they are given."""
+        return self.module.gaussians(pose, clock, decoders=decoders)
+
+    @property
+    def dilation(self) -> float:
+        """What its pictures add to both axes of every projected Gaussian, px^2."""
+        return self.config.model.dilation
+
+    def parameter_count(self) -> int:
+        """Numbers that training may change."""
+        return sum(p.numel() for p in self.module.parameters() if p.requires_grad)
+
+    def gaussian_count(self) -> int:
+        """One per covered texel."""
+        return len(self.lattice.texels)
+
+    def save(self, path: Path) -> None:
+        """Write the weights."""
+        write_atomic(path, safetensors.torch.save(contiguous_state(self.module)))
+
+    def load(self, path: Path) -> None:
+        """Read the weights that `save` wrote."""
+        load_module(self.module, read_safetensors(path)[0], path)
 
 
-def image_of(drawn: Splatted) -> np.ndarray:
-    """The first view as a method returns it: premultiplied RGBA, float32 `[h, w, 4]`."""
-    height, width = drawn.alpha.shape[1:]
-    image = torch.empty(height, width, 4)
-    image[..., :3], image[..., 3] = drawn.rgb[0], drawn.alpha[0]
-    return image.clamp_(0, 1).numpy()
-
-
-def views_of(cameras: list[Camera]) -> dict[str, Any]:
-    """Cameras of one size as the splatter takes them."""
-    return {
-        "viewmats": torch.stack([torch.from_numpy(c.viewmat).float() for c in cameras]),
-        "Ks": torch.stack([torch.from_numpy(c.K).float() for c in cameras]),
-        "width": cameras[0].width,
-        "height": cameras[0].height,
-    }
-
-
-def _stage(clock: StageClock | None, name: str) -> AbstractContextManager[None]:
-    return clock.stage(name) if clock is not None else nullcontext()
+def _sized(config: AshConfig, candidate: Candidate, fade: float) -> AshConfig:
+    """The configuration at a candidate's size; its search is over."""
+    model = config.model
+    model = replace(
+        model,
+        width=max(1, model.width >> candidate.halvings),
+        window=model.window if candidate.history else 1,
+        global_features=model.global_features and candidate.place,
+        fade=fade,
+    )
+    training = replace(config.training, texture_noise=candidate.noise or config.training.texture_noise)
+    return replace(config, model=model, training=training, search=False)

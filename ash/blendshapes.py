@@ -9,10 +9,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ash.config import ModelConfig
-from ash.decoders import raw_channels
-from ash.deforming import near_joints
-from ash.skinning import sparse_skin_weights
-from ash.template import Template
+from ash.gaussians.gaussians import raw_channels
+from ash.template.skinning import near_joints, sparse_skin_weights
+from ash.template.template import Template
 from ash.textures import Conditions, TexelLattice
 
 

@@ -34,6 +34,7 @@ class ModelConfig:
     offset_unit_m: float = 0.01  # metres per unit of a decoded offset; the release decodes metres
     quat_frame: str = "canonical"  # "canonical": rotations and SH turn with the surface; "world": as released
     standardise: bool = False  # decoders see deviations from the mean training texture, in its units; not in the paper
+    fade: float = 0.0  # novelty of a pose, in spreads, at which corrections fade to 1/e; 0: never; not in the paper
     base: bool = False  # learned static texels with the decoders as residual; not in the paper
     refine: bool = False  # images also move the template's vertices, alike in all frames; the paper's future work
     light: bool = False  # colour times exp(SH2 of the posed normal), 27 numbers; not in the paper
@@ -57,6 +58,10 @@ class ModelConfig:
             raise InputError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
         if min(self.window, self.width, self.rank) < 1 or self.dilation < 0 or self.offset_unit_m <= 0:
             raise InputError("window, width and rank must be at least 1, dilation at least 0, offset_unit_m positive")
+        if not 0 <= self.fade < math.inf:
+            raise InputError(f"fade: expected a finite novelty of at least 0, got {self.fade}")
+        if self.fade and not (self.standardise and self.head == "unet" and self.decoded_texels % 4 == 0):
+            raise InputError("fade compares standardised textures: it needs U-Nets, standardise=True and 4 texels")
         if self.refine and not self.offset:
             raise InputError("refine moves Gaussians by their canonical offset and needs offset=True")
         if not (self.motion or self.base):
@@ -67,7 +72,7 @@ class ModelConfig:
 class TrainingConfig:
     """The loop: Adam, a warm-up, then L1 + SSIM (ASH Eq. 9)."""
 
-    steps: int
+    steps: int  # at most: training ends where it has nothing more to gain, see `ash.training.stopping`
     views_per_step: int  # images of one frame that share one decoding
     warmup: str  # "static": the base alone first; "analytic": as released; "fitted": the paper's per-frame fits; "none"
     warmup_steps: int
@@ -76,22 +81,26 @@ class TrainingConfig:
     learning_rate: float  # of the networks
     base_learning_rate: float = 1e-2  # of the static texels
     background: str = "random"  # "random": a new colour every step, so that opacity is learned; "black": the paper's
-    schedule: str = "cosine"  # of the learning rates; "constant": as released
+    schedule: str = "open"  # learning rates fall once a plateau or a limit is near; "constant": never, as released
     crop: bool = True  # draw only around the subject; the release draws whole frames
     precision: str = "float32"  # of the decoders while they learn; "bfloat16": autocast
     ema: float = 0.0  # decay of an average of the weights, which is then the result; 0: none
     texture_noise: float = 0.0  # in the standardised motion-aware textures while decoders learn; not in the paper
     camera_share: float = 1.0  # of the training cameras, evenly spread
+    seconds: float = math.inf  # of CPU time, at most
+    snapshots: bool = False  # keep the weights of half a minute, of 42 s, of a minute, ... of half an hour
     checkpoint_seconds: float = 60.0
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
         one_of("warmup", self.warmup, ("static", "analytic", "fitted", "none"))
         one_of("background", self.background, ("random", "black"))
-        one_of("schedule", self.schedule, ("cosine", "constant"))
+        one_of("schedule", self.schedule, ("open", "constant"))
         one_of("precision", self.precision, ("float32", "bfloat16"))
         if not 0 <= self.ema < 1:
             raise InputError(f"ema: expected a decay of at least 0 and below 1, got {self.ema}")
+        if not self.seconds > 0:
+            raise InputError(f"seconds: expected more than 0, got {self.seconds}")
         if not 0 <= self.texture_noise < math.inf:
             raise InputError(f"texture_noise: expected a finite standard deviation, got {self.texture_noise}")
         if not 0 < self.camera_share <= 1:
@@ -139,6 +148,7 @@ class AshConfig:
     model: ModelConfig
     training: TrainingConfig
     template: TemplateConfig = TemplateConfig()
+    search: bool = False  # choose the size of the decoders on a training sequence left out; not in the paper
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -6,12 +6,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+import ash.native.unet
 from ash.config import ModelConfig
+from ash.gaussians.gaussians import GEOMETRY_CHANNELS, raw_channels
 from ash.textures import Conditions, TexelLattice
 
-GEOMETRY_CHANNELS = 11  # offset 3, log-scale 3, quaternion 4, opacity logit 1
 GLOBAL_FEATURES = 16
 OCTAVES = 6
+NATIVE_CHANNELS = 256  # at the bottleneck: beyond, a layer's weights no longer fit the caches, and torch is faster
 
 
 class ConvBlock(nn.Sequential):
@@ -39,6 +41,8 @@ class UNet(nn.Module):
         self, inputs: int, outputs: int, *, width: int, levels: int, norm: str, bottleneck_features: int = 0
     ) -> None:
         super().__init__()
+        self.plain = norm == "none"  # convolutions and ReLU alone, as the native kernels have them
+        self.bottleneck_features = bottleneck_features
         widths = [width * 2**level for level in range(levels + 1)]
         self.first = ConvBlock(inputs, width, norm)
         self.down = nn.ModuleList(ConvBlock(a, b, norm) for a, b in pairwise(widths))
@@ -55,7 +59,45 @@ class UNet(nn.Module):
     def forward(
         self, texture: Float[Tensor, "b c h w"], features: Float[Tensor, " p"] | None = None
     ) -> Float[Tensor, "b o h w"]:
-        """Map a texture to a texture; `features` are broadcast over the bottleneck."""
+        """Map a texture to a texture; `features` are broadcast over the bottleneck.
+
+        `forward_naive` is the definition; a single float32 image on the CPU goes through native kernels.
+        """
+        if not self._takes_natively(texture):
+            return self.forward_naive(texture, features)
+        height, width = texture.shape[2:]
+        shape = ash.native.unet.UNetShape(
+            height,
+            width,
+            texture.shape[1],
+            self.head.out_channels,
+            self.head.in_channels,
+            len(self.down),
+            self.bottleneck_features,
+        )
+        return ash.native.unet.unet(shape, texture[0], features, self._layers(), torch.get_num_threads())[None]
+
+    def _takes_natively(self, texture: Tensor) -> bool:
+        levels = len(self.down)
+        whole = len(texture) == 1 and levels > 0 and not any(size % 2**levels for size in texture.shape[2:])
+        small = self.head.in_channels * 2**levels <= NATIVE_CHANNELS
+        of_its_kind = texture.dtype == self.head.weight.dtype == torch.float32 and texture.device.type == "cpu"
+        as_it_is = not (texture.requires_grad or torch.jit.is_tracing() or torch.is_autocast_enabled("cpu"))
+        return self.plain and whole and small and of_its_kind and as_it_is
+
+    def _layers(self) -> list[tuple[Tensor, Tensor]]:
+        """Weights and bias of every layer: the blocks down, then each way up and its block, then the head."""
+        layers: list[nn.Module] = [*self.first.children()]
+        for block in self.down:
+            layers += block.children()
+        for up, merge in zip(self.up, self.merge, strict=True):
+            layers += [up, *merge.children()]
+        return [(layer.weight, layer.bias) for layer in (*layers, self.head) if not isinstance(layer, nn.ReLU)]
+
+    def forward_naive(
+        self, texture: Float[Tensor, "b c h w"], features: Float[Tensor, " p"] | None = None
+    ) -> Float[Tensor, "b o h w"]:
+        """The network as it is defined, layer by layer."""
         skips = [self.first(texture)]
         for block in self.down:
             skips.append(block(nn.functional.max_pool2d(skips[-1], 2)))
@@ -98,11 +140,6 @@ class GlobalFeatures(nn.Module):
         translation = translation / self.scale
         angles = translation[:, None] * 2.0 ** torch.arange(OCTAVES, device=translation.device)
         return self.mlp(torch.cat([translation, angles.sin().flatten(), angles.cos().flatten()]))
-
-
-def raw_channels(config: ModelConfig) -> int:
-    """Raw parameters per Gaussian: `GEOMETRY_CHANNELS`, then rgb for each spherical harmonic."""
-    return GEOMETRY_CHANNELS + 3 * (config.sh_degree + 1) ** 2
 
 
 class Decoders(nn.Module):

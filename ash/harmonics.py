@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ash.skinning import unitquat_to_rotmat
+from ash.rotations import unitquat_to_rotmat
 
 SH_C0 = 0.28209479177387814
 

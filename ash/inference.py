@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ash.avatar import Decode, image_of
-from ash.dataset import Camera, Motion
+from ash.avatar import AshAvatar
+from ash.capture.dataset import Camera, Motion, Pose
 from ash.decoders import Decoders
-from ash.method import AshAvatar
+from ash.model import Decode, image_of
 from ash.protocol import StageClock
 from ash.textures import Conditions
 
@@ -51,7 +51,7 @@ class Player:
     def draw(self, frame: int, camera: Camera, *, clock: StageClock | None = None) -> np.ndarray:
         """Premultiplied RGBA, float32 `[h, w, 4]`; stages are timed as the paper's `stg1` to `stg4`."""
         decoders = None if self.engine is None else self.engine.decode
-        return image_of(self._model(self._motion, frame, camera, clock, decoders=decoders))
+        return image_of(self._model(Pose(self._motion, frame), camera, clock, decoders=decoders))
 
     @torch.no_grad()
     def _measured(self, camera: Camera) -> tuple[Engine, ...]:
@@ -59,11 +59,13 @@ class Player:
         decoders = self._model.decoders
         if decoders is None:
             return ()
-        conditions = self._model.conditions(self._motion, 0)
+        conditions = self._model.conditions(Pose(self._motion, 0))
         ways: dict[str, Decode] = {"float32": decoders, "bfloat16": _in_bfloat16(decoders)}
         if isinstance(decoders, Decoders) and find_spec("openvino") is not None:
             ways["openvino"] = _in_openvino(decoders, conditions)
-        images = {name: image_of(self._model(self._motion, 0, camera, decoders=way)) for name, way in ways.items()}
+        images = {
+            name: image_of(self._model(Pose(self._motion, 0), camera, decoders=way)) for name, way in ways.items()
+        }
         trained = images["float32"]
         found = []
         for name, decode in ways.items():

@@ -1,11 +1,18 @@
 """Whole configurations by name. A preset is a function that returns one; an ablation replaces the field it is about."""
 
-from dataclasses import replace
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Generic, TypeVar
 
+from ash.avatar import AshAvatar
+from ash.capture.dataset import Capture
 from ash.config import AshConfig, ModelConfig, TemplateConfig, TrainingConfig
-from ash.dataset import Capture
+from ash.fields import replaced
 from ash.files import InputError
-from ash.method import AshAvatar
+from ash.protocol import Avatar
+
+Config = TypeVar("Config")
 
 
 def ci() -> AshConfig:
@@ -21,6 +28,7 @@ def ci() -> AshConfig:
         shuffle=2,
         sh_degree=0,
         standardise=True,
+        fade=1.5,
         base=True,
         light=True,
         dilation=0.05,
@@ -33,32 +41,44 @@ def ci() -> AshConfig:
         l1_weight=0.8,
         ssim_weight=0.2,
         learning_rate=2e-3,
+        ema=0.99,
     )
     return AshConfig(model=model, training=training)
 
 
 def cpu() -> AshConfig:
-    """Minutes on one core: the default, at 256x256."""
+    """Two and a half minutes on one core, or less where nothing more is learned: the default, at 256x256."""
     base = ci()
+    training = replace(base.training, steps=60_000, warmup_steps=200, learning_rate=1e-3, base_learning_rate=2e-2)
     return replace(
         base,
         model=replace(base.model, texels=256, shuffle=4, width=16, levels=3),
-        training=replace(base.training, steps=1100, warmup_steps=200, learning_rate=1e-3, base_learning_rate=2e-2),
+        training=replace(training, seconds=150.0),
         template=TemplateConfig(kind="learned"),
     )
 
 
 def thorough() -> AshConfig:
-    """`cpu` for four minutes: three times its steps, and noise in what the decoders see against learning by heart."""
+    """`cpu` until nothing more is learned, at most half an hour of one core."""
     base = cpu()
-    training = replace(base.training, steps=3500, base_learning_rate=4e-2, texture_noise=1.0)
-    return replace(base, model=replace(base.model, dilation=0.0), training=training)
+    return replace(base, training=replace(base.training, seconds=1800.0))
+
+
+def budget() -> AshConfig:
+    """`thorough`, with the weights of half a minute, of 42 seconds, ... of half an hour kept: accuracy against time."""
+    base = thorough()
+    return replace(base, training=replace(base.training, snapshots=True))
+
+
+def fit() -> AshConfig:
+    """`cpu` with decoders no larger than the scene needs, found in a short search before: see `ash.searching`."""
+    return replace(cpu(), search=True)
 
 
 def brief() -> AshConfig:
-    """`cpu` with a third of its steps, half a decibel below it: tables with three seeds within an hour on two cores."""
+    """`cpu` for 400 steps, far from its plateau: tables with three seeds within an hour on two cores."""
     base = cpu()
-    return replace(base, training=replace(base.training, steps=400, warmup_steps=80))
+    return replace(base, training=replace(base.training, steps=400, warmup_steps=80, seconds=math.inf))
 
 
 def frugal() -> AshConfig:
@@ -66,7 +86,7 @@ def frugal() -> AshConfig:
     base = cpu()
     return replace(
         base,
-        model=replace(base.model, texels=128, shuffle=1, head="blendshapes", rank=6, global_features=False),
+        model=replace(base.model, texels=128, shuffle=1, head="blendshapes", rank=6, global_features=False, fade=0.0),
     )
 
 
@@ -119,7 +139,9 @@ PRESETS = {
     "ci": ci,
     "brief": brief,
     "cpu": cpu,
+    "fit": fit,
     "thorough": thorough,
+    "budget": budget,
     "frugal": frugal,
     "paper": paper,
     "official": official,
@@ -133,11 +155,22 @@ def named(name: str) -> AshConfig:
     return PRESETS[name]()
 
 
-def ash(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """ASH as the preset says."""
-    return AshAvatar(replace(named(preset), seed=seed), capture)
+@dataclass(frozen=True, kw_only=True)
+class Recipe(Generic[Config]):
+    """A factory of avatars that offers its configuration (`ash.protocol.Configurable`)."""
+
+    config: Callable[[str], Config]  # what a preset means
+    build: Callable[[Config, Capture], Avatar]
+
+    def __call__(self, capture: Capture, *, seed: int, preset: str, config: Config | None = None) -> Any:
+        """The avatar, untrained; `config` takes the place of what the preset says."""
+        wanted: Any = self.config(preset) if config is None else config
+        return self.build(replace(wanted, seed=seed), capture)
+
+    def but(self, changes: Mapping[str, Any]) -> "Recipe[Config]":
+        """The same with other values at dotted keys; a function gives its value from the preset's configuration."""
+        return replace(self, config=lambda preset: replaced(self.config(preset), changes, of=preset))
 
 
-def ash_truth(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """ASH on the exact surface: an oracle, to see what the template's error costs."""
-    return AshAvatar(replace(named(preset), seed=seed, template=TemplateConfig(kind="exact")), capture)
+ash = Recipe(config=named, build=AshAvatar)
+ash_truth = ash.but({"template": TemplateConfig(kind="exact")})  # An oracle: what the template's error costs.

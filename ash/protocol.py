@@ -2,14 +2,19 @@
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ash.dataset import Camera, Capture, Motion
+from ash.capture.dataset import Camera, Capture, Pose
+from ash.gaussians.gaussians import Gaussians
+
+# Raw parameters and texture values alike are visible from a hundredth on; dead decoders differ by nothing at all.
+NO_CORRECTION = 1e-3
 
 
 class StageClock:
@@ -26,6 +31,18 @@ class StageClock:
         self.ms[name] += (time.perf_counter() - start) * 1e3
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DressedMesh:
+    """A textured mesh in one frame, as any viewer can show it."""
+
+    vertices: np.ndarray  # [v, 3] float32, metres, world
+    normals: np.ndarray  # [v, 3] float32, unit, world
+    faces: np.ndarray  # [f, 3] int64 into vertices
+    uvs: np.ndarray  # [u, 2] float32, u to the right, v up
+    uv_faces: np.ndarray  # [f, 3] int64 into uvs
+    texture: np.ndarray  # [t, t, 3] uint8 sRGB, first row at v = 1
+
+
 @runtime_checkable
 class Avatar(Protocol):
     """An animatable avatar: learns from a capture, then renders any motion from any camera.
@@ -36,13 +53,14 @@ class Avatar(Protocol):
     holds training views and training motion only, unless the suite lists the method among its oracles. A training that
     diverged raises FloatingPointError. `log.jsonl` holds one object per line; `seconds` with `train_psnr` (dB,
     foreground, of a few training views that the method kept from itself) or `loss` make the training curve of the
-    report.
+    report. Files `snapshots/SECONDS.safetensors` in the folder of `fit`, which `load` reads, make its chart of accuracy
+    against training seconds.
     """
 
     def fit(self, capture: Capture, *, folder: Path) -> None:
         """Learn. Checkpoints and `log.jsonl` go to `folder`; called again there, it resumes to the same result."""
 
-    def render(self, motion: Motion, frame: int, camera: Camera, *, clock: StageClock) -> np.ndarray:
+    def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
         """The avatar in frame `frame` of `motion`, float32 `[h, w, 4]`: colour premultiplied by alpha, sRGB in 0..1."""
 
     def parameter_count(self) -> int:
@@ -59,17 +77,50 @@ class Avatar(Protocol):
 
 
 @runtime_checkable
+class Configurable(Protocol):
+    """What a factory may offer besides: a configuration, each field of which is a flag and a key of a suite's file.
+
+    `factory.config(preset)` is a frozen dataclass, of dataclasses if need be, that checks itself in `__post_init__`;
+    the comments beside its fields are their documentation. Called with the keyword `config`, the factory takes that in
+    place of what the preset says. The seed stays an argument of its own: it overrules a field `seed`.
+    """
+
+    config: Callable[[str], Any]
+
+    def __call__(self, capture: Capture, *, seed: int, preset: str, config: Any = None) -> Avatar:
+        """Make the avatar, untrained."""
+
+
+@runtime_checkable
 class PosedGeometry(Protocol):
     """What an avatar may offer besides, so that its geometry can be compared with the truth."""
 
-    def template_vertices(self, motion: Motion, frame: int) -> np.ndarray:
+    def template_vertices(self, pose: Pose) -> np.ndarray:
         """The posed template in frame `frame` of `motion`, float `[v, 3]` metres, vertices ordered as the capture's.
 
         `[0, 3]` where they are others than the capture's.
         """
 
-    def gaussian_means(self, motion: Motion, frame: int) -> np.ndarray:
+    def gaussian_means(self, pose: Pose) -> np.ndarray:
         """Centres of the posed Gaussians, float `[n, 3]` metres; `[0, 3]` for a method without any."""
+
+
+@runtime_checkable
+class PosesGaussians(Protocol):
+    """What an avatar made of Gaussians may offer besides, so that it can be played from any side and exported."""
+
+    dilation: float  # px^2 that its pictures add to both axes of every projected Gaussian
+
+    def gaussians(self, pose: Pose) -> Gaussians:
+        """The posed Gaussians in frame `frame` of `motion`: world, metres, colours as seen from anywhere."""
+
+
+@runtime_checkable
+class DressesMesh(Protocol):
+    """What an avatar made of a textured mesh may offer besides, so that it can be exported."""
+
+    def dressed_mesh(self, pose: Pose) -> DressedMesh:
+        """The posed mesh in frame `frame` of `motion`, with the texture of that frame."""
 
 
 @runtime_checkable
@@ -80,11 +131,38 @@ class LearnsTemplate(Protocol):
         """What the job took when it was done; None where the template was not learned."""
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TrainingOutcome:
+    """How a training ended. Scores are foreground PSNR, dB, of training views that no step saw."""
+
+    steps: int
+    seconds: float  # CPU time
+    ended_by: str  # "plateau": the last third of the steps gained less than 0.1 dB; "steps", "seconds": a limit was met
+    gained: float | None = None  # over the last third of the steps, dB; None: too short to tell
+    reserved_psnr: float | None = None  # at the end; None: the capture is too small to reserve views
+    choice: str = ""  # of a search for what the scene needs, and the CPU seconds that it took when it was made
+    search_seconds: float = 0.0
+    correction_spread: float | None = None  # of what decoders add, between frames, rms; None: there are no decoders
+
+    @property
+    def carries_nothing(self) -> bool:
+        """Whether there are decoders whose output is the same in every frame: the avatar is then a static one."""
+        return self.correction_spread is not None and self.correction_spread < NO_CORRECTION
+
+
+@runtime_checkable
+class TellsOutcome(Protocol):
+    """What an avatar may offer besides that knows how its training ended."""
+
+    def outcome(self) -> TrainingOutcome | None:
+        """How `fit` ended; None before it did."""
+
+
 @runtime_checkable
 class Drawn(Protocol):
     """Whatever draws frames: an avatar, or its display."""
 
-    def render(self, motion: Motion, frame: int, camera: Camera, *, clock: StageClock) -> np.ndarray:
+    def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
         """As `Avatar.render`."""
 
 

@@ -1,5 +1,7 @@
 """Stg.2: the texel lattice and the motion-aware textures (ASH Sec. 3.2, Eq. 4)."""
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,21 +9,21 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from ash.dataset import Motion, TemplateMesh
+from ash.capture.dataset import Motion, Pose, TemplateMesh
 from ash.files import InputError
-from ash.rasterizing import rasterize_mesh
-from ash.skinning import (
+from ash.mesh.rasterizing import rasterize_mesh
+from ash.rotations import (
     RigidTransforms,
-    quat_multiply,
     root_yaw,
-    rotate,
-    rotvec_to_unitquat,
     unitquat_to_rotmat,
-    unitquat_to_rotvec,
 )
-from ash.template import Template
+from ash.template.motion import about_y
+from ash.template.skinning import blend_transforms
+from ash.template.template import Template
 
 NOISE_GRID = 4
+POOL = 4  # Texels per side that are one when frames are compared: poses differ over limbs, not over texels.
+COMPARED_FRAMES = 512  # Training frames, evenly taken, that a new frame is compared with.
 BOUND = 3.0  # Of standardised textures: what lies farther out was hardly ever learned from, or never.
 
 
@@ -40,53 +42,18 @@ class TexelLattice:
 
     def interpolate(self, values: Float[Tensor, "v c"]) -> Float[Tensor, "n c"]:
         """Eq. 4 for any per-vertex quantity."""
-        return self._blend(values, self.barycentric)
+        weights = self.barycentric.to(values)
+        return nn.functional.embedding_bag(self.corners, values, per_sample_weights=weights, mode="sum")
 
     def interpolate_transforms(self, transforms: RigidTransforms) -> RigidTransforms:
-        """Per-texel transform T of Eq. 5: the dual quaternions of the three corners, blended.
-
-        Signs are aligned with the corner of the largest weight, as in skinning.
-        """
-        # The dual part of (q, t) is t q / 2; blending it and multiplying by the conjugate of the blend gives the
-        # translation.
-        dual = torch.cat([transforms.quats, dual_parts(transforms.quats, transforms.translations)], -1)
-        blended = self._blend(dual, self._aligned_weights(transforms.quats))
-        blended = blended / blended[:, :4].norm(dim=-1, keepdim=True)
-        return RigidTransforms(quats=blended[:, :4], translations=_translation(blended[:, :4], blended[:, 4:]))
-
-    def _blend(self, values: Float[Tensor, "v c"], weights: Float[Tensor, "n 3"]) -> Float[Tensor, "n c"]:
-        # A bag is a gather and a weighted sum in one: ten times as fast as the two in turn.
-        return nn.functional.embedding_bag(self.corners, values, per_sample_weights=weights.to(values), mode="sum")
-
-    def _aligned_weights(self, quats: Float[Tensor, "v 4"]) -> Float[Tensor, "n 3"]:
-        """Barycentric weights, negative for a corner whose quaternion lies in the other hemisphere."""
-        corners = quats[self.corners]
-        strongest = self.barycentric.argmax(1)[:, None, None].expand(-1, 1, 4)
-        opposite = (corners * corners.gather(1, strongest)).sum(-1) < 0
-        return torch.where(opposite, -self.barycentric, self.barycentric)
+        """Per-texel transform T of Eq. 5: the transforms of the three corners, blended."""
+        return blend_transforms(transforms, self.corners, self.barycentric.to(transforms.quats))
 
     def to_texture(self, values: Float[Tensor, "n c"]) -> Float[Tensor, "c r r"]:
         """Scatter per-texel values into a texture that is zero elsewhere."""
         texture = values.new_zeros(self.resolution * self.resolution, values.shape[1])
         texture[self.texels] = values
         return texture.T.reshape(-1, self.resolution, self.resolution)
-
-    def from_texture(self, texture: Float[Tensor, "c r r"]) -> Float[Tensor, "n c"]:
-        """Gather the covered texels."""
-        return texture.flatten(1).T[self.texels]
-
-
-def dual_parts(quats: Float[Tensor, "n 4"], translations: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-    """Dual part t q / 2 of each rigid transform as a dual quaternion (q, t q / 2)."""
-    w, u = quats[..., :1], quats[..., 1:]
-    real = -(translations * u).sum(-1, keepdim=True)
-    return 0.5 * torch.cat([real, w * translations + torch.linalg.cross(translations, u)], -1)
-
-
-def _translation(real: Float[Tensor, "n 4"], dual: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
-    w, u = real[..., :1], real[..., 1:]
-    dw, du = dual[..., :1], dual[..., 1:]
-    return 2 * (w * du - dw * u - torch.linalg.cross(du, u))
 
 
 def build_lattice(mesh: TemplateMesh, resolution: int) -> TexelLattice:
@@ -115,6 +82,7 @@ class Conditions:
     """What Stg.1 and Stg.2 hand to the decoders for one frame; nothing in it is learned with the avatar."""
 
     textures: Float[Tensor, "c r r"]  # motion-aware textures
+    trust: float  # in 0..1: how much of the decoders' output counts in this frame
     motion: Float[Tensor, "k d"]  # the normalised motion window, newest frame first
     root_translation: Float[Tensor, " 3"]  # metres
     canonical: Float[Tensor, "n 3"]  # texel positions on the canonical template, Eq. 4
@@ -123,49 +91,42 @@ class Conditions:
 
 
 @torch.no_grad()
-def normalised_motion(motion: Motion, frame: int, *, window: int) -> Float[Tensor, "k d"]:
-    """Degrees of freedom of a window of frames, newest first, without where the newest stands and faces (ASH Sec. 3.1).
-
-    Root translations become R_y(-yaw) (t_k - t_f), and root rotations are turned by -yaw, as in the release.
-    """
-    dofs = torch.from_numpy(motion.dofs[motion.window(frame, window)])
-    yaw = root_yaw(dofs[0])
-    unturn = _about_y(-yaw).expand(len(dofs), 4)
-    translation = rotate(unturn, dofs[:, :3] - dofs[0, :3])
-    root = quat_multiply(unturn, rotvec_to_unitquat(dofs[:, 3:6]))
-    return torch.cat([translation, unitquat_to_rotvec(root), dofs[:, 6:]], dim=1).float()
-
-
-@torch.no_grad()
 def motion_aware_textures(
-    template: Template, lattice: TexelLattice, motion: Motion, frame: int, *, window: int, yaw_normalise: bool
+    template: Template, lattice: TexelLattice, pose: Pose, *, window: int, yaw_normalise: bool
 ) -> Float[Tensor, "c r r"]:
     """Normal and position textures of a window of frames, newest first: `c = 6 window` channels.
 
     Positions (metres) are relative to the root of the newest frame, so the textures do not change when the whole
     motion is moved; with `yaw_normalise` they do not change either when it is turned about the vertical axis.
     """
-    dofs = torch.from_numpy(motion.dofs[frame]).float()
+    dofs = torch.from_numpy(pose.dofs).float()
     root = dofs[:3] + torch.from_numpy(template.skeleton.heads[0]).float()
-    posed = [template.pose(motion, int(past)) for past in motion.window(frame, window)]
+    posed = [template.pose(Pose(pose.motion, int(past))) for past in pose.window(window)]
     vectors = torch.stack([v for p in posed for v in (p.normals, p.vertices - root)], 1)
     # Interpolated first and turned then: a texture has fewer texels than the mesh has vertices.
     texels = lattice.interpolate(vectors.flatten(1)).unflatten(1, (-1, 3))
     if yaw_normalise:
-        texels = texels @ unitquat_to_rotmat(_about_y(root_yaw(dofs)))  # x R = R^T x: turned back
+        texels = texels @ unitquat_to_rotmat(about_y(root_yaw(dofs)))  # x R = R^T x: turned back
     return lattice.to_texture(texels.flatten(1))
 
 
 @torch.no_grad()
-def texture_statistics(textures: list[Float[Tensor, "c r r"]]) -> tuple[Float[Tensor, "c r r"], Float[Tensor, "c 1 1"]]:
+def texture_statistics(
+    textures: Iterable[Float[Tensor, "c r r"]],
+) -> tuple[Float[Tensor, "c r r"], Float[Tensor, "c 1 1"]]:
     """Mean texture over frames, and per channel the standard deviation from it over frames and covered texels.
 
     A body's positions differ by a metre between texels and by centimetres between frames; only the latter is motion.
+    Frames are taken one by one: memory does not grow with them.
     """
-    mean = torch.stack(textures).mean(0)
+    count, total, squares = 0, torch.zeros(()), torch.zeros(())
+    for texture in textures:
+        exact = texture.double()
+        count, total, squares = count + 1, total + exact, squares + exact.square()
+    mean = total / count
     covered = (mean != 0).any(0)
-    deviations = torch.stack([(texture - mean)[:, covered] for texture in textures])
-    return mean, deviations.square().mean((0, 2)).sqrt().clamp(min=1e-3)[:, None, None]
+    variance = (squares / count - mean.square())[:, covered].mean(1).clamp(min=0)
+    return mean.float(), variance.sqrt().float().clamp(min=1e-3)[:, None, None]
 
 
 def unsettled(textures: Float[Tensor, "c r r"], sigma: float, *, seed: int, step: int) -> Float[Tensor, "c r r"]:
@@ -186,34 +147,55 @@ class TextureDrawer(nn.Module):
     """Stg.2 as a network sees it: the motion-aware textures of a frame, standardised if asked.
 
     What is standardised is a deviation from the mean training texture, in units of its channel's spread, at most three
-    of them (not in the paper). Mean and spread are part of a checkpoint.
+    of them (not in the paper). Mean, spread and the frames that others are compared with are part of a checkpoint.
     """
 
-    def __init__(self, lattice: TexelLattice, *, window: int, yaw_normalise: bool, standardise: bool) -> None:
+    def __init__(
+        self, lattice: TexelLattice, *, window: int, yaw_normalise: bool, standardise: bool, fade: float = 0.0
+    ) -> None:
+        """`fade`: see `trust`; 0: what is decoded always counts."""
         super().__init__()
         self.lattice, self.window, self.yaw_normalise, self.standardise = lattice, window, yaw_normalise, standardise
+        self.fade = fade
         self.mean: Tensor
         self.spread: Tensor
+        self.seen: Tensor  # [t, d]: the newest frame's textures of training frames, coarse
         if standardise:
             self.register_buffer("mean", torch.zeros(6 * window, lattice.resolution, lattice.resolution))
             self.register_buffer("spread", torch.ones(6 * window, 1, 1))
+        if fade:
+            self.register_buffer("seen", torch.zeros(0, 6 * (lattice.resolution // POOL) ** 2))
 
     def observe(self, template: Template, motion: Motion, frames: tuple[int, ...]) -> None:
         """Take mean and spread from the frames of a training motion."""
         if self.standardise:
-            self.mean, self.spread = texture_statistics([self._draw(template, motion, frame) for frame in frames])
+            self.mean, self.spread = texture_statistics(self._draw(template, Pose(motion, frame)) for frame in frames)
+        if self.fade:
+            some = frames[:: -(-len(frames) // COMPARED_FRAMES)]
+            self.seen = torch.stack([self._coarse(self(template, Pose(motion, frame))) for frame in some])
 
-    def forward(self, template: Template, motion: Motion, frame: int) -> Float[Tensor, "c r r"]:
+    def forward(self, template: Template, pose: Pose) -> Float[Tensor, "c r r"]:
         """The textures of a frame, `c = 6 window` channels."""
-        textures = self._draw(template, motion, frame)
+        textures = self._draw(template, pose)
         return ((textures - self.mean) / self.spread).clamp(-BOUND, BOUND) if self.standardise else textures
 
-    def _draw(self, template: Template, motion: Motion, frame: int) -> Float[Tensor, "c r r"]:
-        return motion_aware_textures(
-            template, self.lattice, motion, frame, window=self.window, yaw_normalise=self.yaw_normalise
-        )
+    @torch.no_grad()
+    def novelty(self, textures: Float[Tensor, "c r r"]) -> float:
+        """How far a frame lies from the nearest training frame: root mean square over the body, in spreads."""
+        covered = self.lattice.texels.numel() / self.lattice.resolution**2
+        nearest = (self.seen - self._coarse(textures)).square().mean(1).min()
+        return float((nearest / covered).sqrt())
 
+    def trust(self, textures: Float[Tensor, "c r r"]) -> float:
+        """How much of what is decoded from these textures counts: 1 in training frames, fading with their novelty.
 
-def _about_y(angle: Float[Tensor, ""]) -> Float[Tensor, " 4"]:
-    zero = torch.zeros_like(angle)
-    return rotvec_to_unitquat(torch.stack([zero, angle, zero]))
+        exp(-(novelty / fade)^2). What decoders learned from some poses is false far from them, where their mean over
+        training frames is better. Not in the paper.
+        """
+        return math.exp(-((self.novelty(textures) / self.fade) ** 2)) if self.fade else 1.0
+
+    def _coarse(self, textures: Float[Tensor, "c r r"]) -> Float[Tensor, " d"]:
+        return nn.functional.avg_pool2d(textures[:6], POOL).flatten()
+
+    def _draw(self, template: Template, pose: Pose) -> Float[Tensor, "c r r"]:
+        return motion_aware_textures(template, self.lattice, pose, window=self.window, yaw_normalise=self.yaw_normalise)

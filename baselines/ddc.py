@@ -14,22 +14,30 @@ import numpy as np
 import safetensors.torch
 import torch
 from jaxtyping import Float
+from scipy import ndimage
 from torch import Tensor, nn
 
+import ash.native.shading
+from ash.capture.dataset import Camera, Capture, Pose, TemplateMesh
+from ash.checkpoints import contiguous_state, load_module, read_safetensors
 from ash.config import AshConfig, ModelConfig, TemplateConfig, TrainingConfig
-from ash.dataset import Camera, Capture, Motion, TemplateMesh
 from ash.decoders import UNet
-from ash.drawing import draw_mesh, textured, topology_of
 from ash.files import write_atomic
-from ash.initialising import initial_texture
-from ash.presets import named
-from ash.protocol import Display, StageClock
-from ash.refining import Refinement
-from ash.template import PosedTemplate, Template
-from ash.templates import template_of
-from ash.texels import LIGHT_COEFFICIENTS
+from ash.gaussians.initialising import initial_texture
+from ash.gaussians.texels import LIGHT_COEFFICIENTS
+from ash.harmonics import sh_basis
+from ash.kept import Kept
+from ash.mesh.drawing import draw_mesh, textured, topology_of
+from ash.presets import Recipe, named
+from ash.protocol import Display, DressedMesh, StageClock, TrainingOutcome
+from ash.searching import Build, Candidate, Choice, brief_training, sufficient, with_choice, write_choice
+from ash.template.refining import Refinement
+from ash.template.template import PosedTemplate, Template
+from ash.template_learning.learning import template_of
 from ash.textures import TextureDrawer, build_lattice, unsettled
-from ash.training import fit, load_module, load_training_images, read_safetensors
+from ash.training.batches import load_training_images
+from ash.training.loop import fit
+from baselines.display import MeshDisplay
 
 # Texture pixels per Gaussian of ASH's lattice, per side: the mesh must not be starved. At 256x256 a body's pixel is
 # 9 mm wide, twice 256 texels are 3 mm apart and more shows nothing; at full size pixels of 2.5 mm ask for four times.
@@ -50,6 +58,8 @@ class DdcConfig:
     levels: int
     norm: str
     standardise: bool
+    fade: float
+    search: bool
     light: bool
     training: TrainingConfig
     template: TemplateConfig
@@ -69,6 +79,8 @@ def ddc_config(ash: AshConfig, *, seed: int, template: TemplateConfig) -> DdcCon
         levels=model.levels,
         norm=model.norm,
         standardise=model.standardise,
+        fade=model.fade,
+        search=ash.search,
         light=model.light,
         training=ash.training,
         template=template,
@@ -90,6 +102,9 @@ class DdcModel(nn.Module):
         self.uvs = torch.from_numpy(mesh.uvs).float()
         self.topology = topology_of(template.faces)
         self.texture = nn.Parameter(initial.clone())
+        self.mean_correction: Tensor
+        if config.fade:
+            self.register_buffer("mean_correction", torch.zeros_like(initial))
         self.refinement = Refinement(mesh) if config.refine else None
         self.network = UNet(
             6 * config.window,
@@ -101,10 +116,24 @@ class DdcModel(nn.Module):
         self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.light else None
 
     def dynamic_texture(self, conditions: Float[Tensor, "c r r"]) -> Float[Tensor, "3 t t"]:
-        """The texture of a frame: decoded at the resolution of the motion-aware textures and shuffled up."""
-        seen = conditions[None].contiguous(memory_format=torch.channels_last)
-        factor = self.config.texture // self.config.texels
-        return self.texture + nn.functional.pixel_shuffle(self.network(seen), factor)[0]
+        """The texture of a frame; far from the training motion the mean correction counts (`TextureDrawer.trust`)."""
+        trust = self.textures.trust(conditions)
+        if trust == 1 and self.texture.dtype == torch.float32 and self.texture.device.type == "cpu":
+            return ash.native.shading.add_shuffled(self.texture, self._decoded(conditions), self.shuffle)
+        added = self.correction(conditions)
+        return self.texture + (added if trust == 1 else self.mean_correction.lerp(added, trust))
+
+    def correction(self, conditions: Float[Tensor, "c r r"]) -> Float[Tensor, "3 t t"]:
+        """What the network adds: decoded at the resolution of the motion-aware textures and shuffled up."""
+        return nn.functional.pixel_shuffle(self._decoded(conditions), self.shuffle)
+
+    @property
+    def shuffle(self) -> int:
+        """Texture pixels per decoded one, per side."""
+        return self.config.texture // self.config.texels
+
+    def _decoded(self, conditions: Float[Tensor, "c r r"]) -> Float[Tensor, "o r r"]:
+        return self.network(conditions[None].contiguous(memory_format=torch.channels_last))[0]  # type: ignore[no-any-return]
 
     def draw(
         self, texture: Float[Tensor, "3 t t"], posed: PosedTemplate, camera: Camera, background: Tensor
@@ -128,27 +157,52 @@ class DdcModel(nn.Module):
 class DdcAvatar:
     """The Avatar protocol (see `ash.protocol`) for the mesh baseline."""
 
-    def __init__(self, config: DdcConfig, capture: Capture) -> None:
+    def __init__(self, config: DdcConfig, capture: Capture, *, template: Template | None = None) -> None:
+        """`template`: one to stand on, where it exists already."""
+        self.template = template or template_of(config.template, capture, seed=config.seed)
+        self.choice: Choice | None = None
+        if config.search:
+            self.choice = sufficient(self._brief(config), config, capture)
+            config = _sized(config, self.choice.candidate, self.choice.fade)
         torch.manual_seed(config.seed)
         self.config = config
-        self.template = template_of(config.template, capture, seed=config.seed)
         initial = initial_texture(capture, self.template, build_lattice(capture.template, config.texture))
         textures = TextureDrawer(
             build_lattice(capture.template, config.texels),
             window=config.window,
             yaw_normalise=config.yaw_normalise,
             standardise=config.standardise,
+            fade=config.fade,
         )
         textures.observe(self.template, capture.motion, capture.splits["train"].frames)
         self.module = DdcModel(config, capture.template, self.template, textures, initial)
         self._motion = capture.motion
-        self._conditions: dict[int, Tensor] = {}  # The template is frozen: each training frame is posed once.
-        self._posed: dict[int, PosedTemplate] = {}
+        self._outcome: TrainingOutcome | None = None
+        # The template is frozen: each training frame is posed once, as far as there is room.
+        self._conditions: Kept[int, Tensor] = Kept(
+            lambda frame: self.module.textures(self.template, Pose(capture.motion, frame))
+        )
+        self._posed: Kept[int, PosedTemplate] = Kept(lambda frame: self.template.pose(Pose(capture.motion, frame)))
+
+    def _brief(self, config: DdcConfig) -> Build:
+        """How the search builds its candidates: on this template."""
+
+        def build(candidate: Candidate, capture: Capture) -> DdcAvatar:
+            sized = _sized(config, candidate, config.fade)
+            return DdcAvatar(replace(sized, training=brief_training(sized.training)), capture, template=self.template)
+
+        return build
+
+    def texture_drawer(self) -> TextureDrawer:
+        """Stg.2 of the network."""
+        return self.module.textures
 
     def fit(self, capture: Capture, *, folder: Path) -> None:
-        """Train texture and network on the training images; see `ash.training.fit`."""
+        """Train texture and network on the training images; see `ash.training.loop.fit`."""
         images = load_training_images(capture)
-        fit(self, images, self.config.training, seed=self.config.seed, folder=folder)
+        if self.choice is not None:
+            write_choice(self.choice, folder / "log.jsonl")
+        self._outcome = fit(self, images, self.config.training, seed=self.config.seed, folder=folder)
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """The network, and the texture with the light, as ASH's decoders and base."""
@@ -162,57 +216,103 @@ class DdcAvatar:
 
     def draw_training_views(self, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
         """The texture of the frame, drawn into each camera; the static texture alone while the warm-up lasts."""
-        if frame not in self._posed:
-            self._posed[frame] = self.template.pose(self._motion, frame)
-            self._conditions[frame] = self.module.textures(self.template, self._motion, frame)
         texture = self._training_texture(frame, step)
-        with torch.set_grad_enabled(step % VERTICES_EVERY == 0):
-            posed = self.module.refined(self._posed[frame])
+        with torch.set_grad_enabled(torch.is_grad_enabled() and step % VERTICES_EVERY == 0):
+            posed = self.module.refined(self._posed_in(frame))
         return torch.stack([self.module.draw(texture, posed, c, background)[..., :3] for c in cameras])
+
+    def corrections(self, frame: int) -> Tensor | None:
+        """What the network adds to the static texture in a training frame, `[3, t, t]`."""
+        return self.module.correction(self._conditions_of(frame))
+
+    def fade_to(self, mean: Tensor) -> None:
+        """What counts far from the training motion in place of what the network says there."""
+        if self.config.fade:
+            self.module.mean_correction.copy_(mean)
+
+    def _posed_in(self, frame: int) -> PosedTemplate:
+        return self._posed[frame]
+
+    def _conditions_of(self, frame: int) -> Float[Tensor, "c r r"]:
+        return self._conditions[frame]
 
     def _training_texture(self, frame: int, step: int) -> Float[Tensor, "3 t t"]:
         training = self.config.training
         if training.warmup == "static" and step < training.warmup_steps:
             return self.module.texture
-        seen = unsettled(self._conditions[frame], training.texture_noise, seed=self.config.seed, step=step)
-        return self.module.dynamic_texture(seen)
+        seen = unsettled(self._conditions_of(frame), training.texture_noise, seed=self.config.seed, step=step)
+        return self.module.texture + self.module.correction(seen)  # Noise is no novelty.
 
     @torch.no_grad()
-    def render(self, motion: Motion, frame: int, camera: Camera, *, clock: StageClock) -> np.ndarray:
+    def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
         """Premultiplied RGBA, float32 `[h, w, 4]`."""
-        posed, texture = self.dress(motion, frame, clock)
+        posed, texture = self.dress(pose, clock)
         with clock.stage("stg4"):
             return self.module.draw(texture, posed, camera, torch.zeros(3)).clamp(0, 1).numpy()
 
     @torch.no_grad()
-    def dress(self, motion: Motion, frame: int, clock: StageClock) -> tuple[PosedTemplate, Float[Tensor, "3 t t"]]:
+    def dress(self, pose: Pose, clock: StageClock) -> tuple[PosedTemplate, Float[Tensor, "3 t t"]]:
         """The posed template of a frame and its texture: everything but the picture.
 
         Training may leave negative colours between texels; no display knows those, and held-out views are better
         without them.
         """
         with clock.stage("stg1"):
-            posed = self.module.refined(self.template.pose(motion, frame))
+            posed = self.module.refined(self.template.pose(pose))
         with clock.stage("stg2"):
-            conditions = self.module.textures(self.template, motion, frame)
+            conditions = self.module.textures(self.template, pose)
         with clock.stage("stg3"):
             return posed, self.module.dynamic_texture(conditions).clamp(min=0)
 
+    @torch.no_grad()
+    def dressed_mesh(self, pose: Pose) -> DressedMesh:
+        """The posed mesh with the texture of the frame, lit as at the texels' normals."""
+        posed, texture = self.dress(pose, StageClock())
+        lit = texture * self._gain(posed)
+        mesh = self.template.mesh
+        return DressedMesh(
+            vertices=posed.vertices.numpy(),
+            normals=posed.normals.numpy(),
+            faces=mesh.faces,
+            uvs=mesh.uvs.astype(np.float32),
+            uv_faces=mesh.uv_faces,
+            texture=(255 * lit.clamp(0, 1)).round().byte().permute(1, 2, 0).numpy(),
+        )
+
+    def _gain(self, posed: PosedTemplate) -> Float[Tensor, "3 t t"]:
+        """What the light multiplies every texel by; beside the charts, as at the nearest texel of one."""
+        light, size = self.module.light, self.config.texture
+        if light is None:
+            return torch.ones(3, size, size)
+        lattice = build_lattice(self.template.mesh, size)
+        normals = torch.nn.functional.normalize(lattice.interpolate(posed.normals), dim=-1)
+        covered = np.zeros(size * size, dtype=bool)
+        covered[lattice.texels.numpy()] = True
+        beside = ~covered.reshape(size, size)
+        nearest = ndimage.distance_transform_edt(beside, return_distances=False, return_indices=True).astype(np.int64)
+        gain = lattice.to_texture((sh_basis(normals, 2) @ light).exp())
+        return gain[:, torch.from_numpy(nearest[0]), torch.from_numpy(nearest[1])]
+
     def open_display(self) -> Display:
         """OpenGL's picture of the avatar, as it would be shown."""
-        from baselines.display import DdcDisplay
+        module = self.module
+        return MeshDisplay(
+            self.dress, faces=module.template.faces, uvs=module.uvs, uv_faces=module.uv_faces, light=module.light
+        )
 
-        return DdcDisplay(self)
-
-    def template_vertices(self, motion: Motion, frame: int) -> np.ndarray:
+    def template_vertices(self, pose: Pose) -> np.ndarray:
         """The posed template, `[v, 3]` metres."""
-        return self.module.refined(self.template.pose(motion, frame)).vertices.detach().numpy()
+        return self.module.refined(self.template.pose(pose)).vertices.detach().numpy()
+
+    def outcome(self) -> TrainingOutcome | None:
+        """How training ended; None before it did."""
+        return with_choice(self._outcome, self.choice)
 
     def template_seconds(self) -> float | None:
         """What learning the template took, once for all methods that stand on it; None where it was not learned."""
         return None if self.template.learned is None else self.template.learned.seconds
 
-    def gaussian_means(self, motion: Motion, frame: int) -> np.ndarray:
+    def gaussian_means(self, pose: Pose) -> np.ndarray:
         """A mesh has none."""
         return np.zeros((0, 3))
 
@@ -226,21 +326,34 @@ class DdcAvatar:
 
     def save(self, path: Path) -> None:
         """Write the weights."""
-        write_atomic(path, safetensors.torch.save({n: t.contiguous() for n, t in self.module.state_dict().items()}))
+        write_atomic(path, safetensors.torch.save(contiguous_state(self.module)))
 
     def load(self, path: Path) -> None:
         """Read the weights that `save` wrote."""
         load_module(self.module, read_safetensors(path)[0], path)
 
 
-def ddc(capture: Capture, *, seed: int, preset: str) -> DdcAvatar:
-    """The mesh baseline on the template that ASH gets."""
+def _sized(config: DdcConfig, candidate: Candidate, fade: float) -> DdcConfig:
+    """The configuration at a candidate's size; its search is over. A mesh has no Phi."""
+    return replace(
+        config,
+        width=max(1, config.width >> candidate.halvings),
+        window=config.window if candidate.history else 1,
+        fade=fade,
+        training=replace(config.training, texture_noise=candidate.noise or config.training.texture_noise),
+        search=False,
+    )
+
+
+def _of_preset(preset: str) -> DdcConfig:
     config = named(preset)
-    mesh = ddc_config(config, seed=seed, template=config.template)
     texture = TEXTURE_FACTORS.get(preset, TEXTURE_FACTOR) * config.model.texels
-    return DdcAvatar(replace(mesh, texture=texture), capture)
+    return replace(ddc_config(config, seed=0, template=config.template), texture=texture)
 
 
-def ddc_truth(capture: Capture, *, seed: int, preset: str) -> DdcAvatar:
-    """The mesh baseline on the exact surface: an oracle, to see when a mesh wins."""
-    return DdcAvatar(ddc_config(named(preset), seed=seed, template=TemplateConfig(kind="exact")), capture)
+def _on_exact(preset: str) -> DdcConfig:
+    return ddc_config(named(preset), seed=0, template=TemplateConfig(kind="exact"))
+
+
+ddc = Recipe(config=_of_preset, build=DdcAvatar)  # On the template that ASH gets.
+ddc_truth = Recipe(config=_on_exact, build=DdcAvatar)  # An oracle on the exact surface, to see when a mesh wins.

@@ -5,19 +5,20 @@ averaged. The light, which depends on the normal alone, travels as vertex colour
 """
 
 import os
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from torch import Tensor
 
-from ash.dataset import Camera, Motion
-from ash.drawing import SUPERSAMPLING
+from ash.capture.dataset import Camera, Pose
 from ash.files import InputError
 from ash.harmonics import sh_basis
+from ash.mesh.drawing import SUPERSAMPLING
 from ash.protocol import StageClock
-from ash.template import PosedTemplate
-from baselines.ddc import DdcAvatar
+from ash.template.template import PosedTemplate
 
 NEAR, FAR = 0.1, 50.0  # metres
 TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # Our cameras look along +z with y down, OpenGL's along -z with y up.
@@ -71,26 +72,33 @@ def _one_sample_renderer(pyrender: Any) -> Any:
     return OffScreen(64, 64)
 
 
-class DdcDisplay:
-    """Draws a DDC avatar. Has `render` as an avatar has, so that it is timed and compared in the same way."""
+class MeshDisplay:
+    """Draws a mesh avatar. Has `render` as an avatar has, so that it is timed and compared in the same way."""
 
-    def __init__(self, avatar: DdcAvatar) -> None:
-        """Open an OpenGL context.
+    def __init__(
+        self,
+        dress: Callable[[Pose, StageClock], tuple[PosedTemplate, Tensor]],
+        *,
+        faces: Int[Tensor, "f 3"],
+        uvs: Float[Tensor, "u 2"],
+        uv_faces: Int[Tensor, "f 3"],
+        light: Float[Tensor, "9 3"] | None,
+    ) -> None:
+        """Open an OpenGL context. `dress`: the posed template of a frame and its texture `[3, t, t]`.
 
         Raises:
             InputError: there is no off-screen OpenGL here.
         """
-        self.avatar = avatar
+        self.dress, self.light = dress, light
         self.pyrender = pyrender_or_refuse()
         try:
             self.renderer = _one_sample_renderer(self.pyrender)
         except Exception as error:
             raise InputError(f"no off-screen OpenGL here ({type(error).__name__}: {error})") from error
-        module = avatar.module
         # OpenGL knows one UV per vertex: vertices at seams are listed once per UV.
-        pairs = torch.stack([module.template.faces.reshape(-1), module.uv_faces.reshape(-1)], 1)
+        pairs = torch.stack([faces.reshape(-1), uv_faces.reshape(-1)], 1)
         corners, index = torch.unique(pairs, dim=0, return_inverse=True)
-        self.vertex, self.uvs = corners[:, 0], module.uvs[corners[:, 1]].numpy()
+        self.vertex, self.uvs = corners[:, 0], uvs[corners[:, 1]].numpy()
         self.faces = index.reshape(-1, 3).numpy()
 
     def close(self) -> None:
@@ -98,19 +106,19 @@ class DdcDisplay:
         self.renderer.delete()
 
     @torch.no_grad()
-    def render(self, motion: Motion, frame: int, camera: Camera, *, clock: StageClock) -> np.ndarray:
+    def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
         """Premultiplied RGBA, float32 `[h, w, 4]`, as the avatar's own `render`."""
-        posed, texture = self.avatar.dress(motion, frame, clock)
+        posed, texture = self.dress(pose, clock)
         with clock.stage("stg4"):
             return self._draw(posed, texture, camera)
 
-    def _draw(self, posed: PosedTemplate, texture: torch.Tensor, camera: Camera) -> Float[np.ndarray, "h w 4"]:
+    def _draw(self, posed: PosedTemplate, texture: Tensor, camera: Camera) -> Float[np.ndarray, "h w 4"]:
         # Texels are stored in eight bits between 0 and 1; what exceeds 1 is scaled down, and up again with the light.
         scale = texture.max().clamp(min=1.0)
         material = self._material((texture / scale).clamp(0, 1))
         light = torch.ones_like(posed.normals)
-        if self.avatar.module.light is not None:
-            light = (sh_basis(posed.normals, 2) @ self.avatar.module.light).exp()
+        if self.light is not None:
+            light = (sh_basis(posed.normals, 2) @ self.light).exp()
         colours = torch.cat([scale * light, torch.ones_like(light[:, :1])], 1)
         primitive = self.pyrender.Primitive(
             positions=posed.vertices[self.vertex].numpy(),
@@ -134,7 +142,7 @@ class DdcDisplay:
         total = sum(drawn[y::SUPERSAMPLING, x::SUPERSAMPLING].astype(np.uint16) for y in steps for x in steps)
         return np.asarray(total, np.float32) / np.float32(255 * SUPERSAMPLING**2)
 
-    def _material(self, texture: torch.Tensor) -> Any:
+    def _material(self, texture: Tensor) -> Any:
         pixels = (255 * texture).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
         sampler = self.pyrender.Sampler(magFilter=LINEAR, minFilter=LINEAR, wrapS=CLAMP_TO_EDGE, wrapT=CLAMP_TO_EDGE)
         image = self.pyrender.Texture(sampler=sampler, source=pixels, source_channels="RGB")

@@ -6,12 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from ash.avatar import AshAvatar
+from ash.capture.dataset import Capture
 from ash.config import AshConfig, ModelConfig
-from ash.dataset import Capture
-from ash.decoders import raw_channels
 from ash.files import InputError
-from ash.method import AshAvatar
-from ash.presets import named
+from ash.gaussians.gaussians import raw_channels
+from ash.presets import Recipe, named
 from ash.textures import Conditions
 
 LAYERS, WIDTH = 8, 256
@@ -55,21 +55,19 @@ def encode(positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n e"]:
     return torch.cat([positions, angles.sin(), angles.cos()], 1)
 
 
-def mlp(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """ASH with the MLP in place of its 2D decoders; everything else, the number of steps too, as the preset says."""
-    return _with_mlp(replace(named(preset), seed=seed), capture)
+def _with_mlp(config: AshConfig, capture: Capture) -> AshAvatar:
+    dofs = capture.motion.dofs.shape[1]
+    return AshAvatar(config, capture, make_decoders=lambda model, _: MlpDecoder(model, dofs=dofs))
 
 
-def mlp_time(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """The same in the time that ASH trains: as many fewer steps as each takes longer."""
-    config = replace(named(preset), seed=seed)
+def _in_equal_time(preset: str) -> AshConfig:
+    config = named(preset)
     if preset not in ASH_STEPS_PER_STEP:
         raise InputError(f"preset: equal time is known for {', '.join(ASH_STEPS_PER_STEP)}, got {preset!r}")
     slower, training = ASH_STEPS_PER_STEP[preset], config.training
     fewer = replace(training, steps=round(training.steps / slower), warmup_steps=round(training.warmup_steps / slower))
-    return _with_mlp(replace(config, training=fewer), capture)
+    return replace(config, training=fewer)
 
 
-def _with_mlp(config: AshConfig, capture: Capture) -> AshAvatar:
-    dofs = capture.motion.dofs.shape[1]
-    return AshAvatar(config, capture, make_decoders=lambda model, _: MlpDecoder(model, dofs=dofs))
+mlp = Recipe(config=named, build=_with_mlp)  # In place of the 2D decoders; its limits of training as the preset says.
+mlp_time = Recipe(config=_in_equal_time, build=_with_mlp)  # As many fewer steps as each takes longer than ASH's.

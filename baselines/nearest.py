@@ -12,11 +12,11 @@ import safetensors.numpy
 import torch
 from jaxtyping import Float
 
-from ash.dataset import Camera, Capture, Motion, Skeleton, require_pose
+from ash.capture.dataset import Camera, Capture, Motion, Pose, Skeleton, require_pose
+from ash.checkpoints import read_safetensors
 from ash.files import InputError, write_atomic
 from ash.protocol import StageClock
-from ash.skinning import root_yaw, rotvec_to_unitquat
-from ash.training import read_safetensors
+from ash.rotations import root_yaw, rotvec_to_unitquat
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -40,16 +40,16 @@ class NearestImage:
     def fit(self, capture: Capture, *, folder: Path) -> None:
         """There is nothing to learn: the training images are the model."""
 
-    def render(self, motion: Motion, frame: int, camera: Camera, *, clock: StageClock) -> np.ndarray:
+    def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
         """The nearest training image, shifted and scaled so that the root lies where `camera` sees it."""
         skeleton = self.capture.skeleton
         with clock.stage("stg1"):
-            require_pose(motion, frame, skeleton)
-            wanted = see_root(skeleton, motion, frame, camera)
-            distances = pose_distances(motion.dofs[frame], self.capture.motion.dofs[list(self.train.frames)])
+            require_pose(pose, skeleton)
+            wanted = see_root(skeleton, pose, camera)
+            distances = pose_distances(pose.dofs, self.capture.motion.dofs[list(self.train.frames)])
             near = self.train.frames[int(distances.argmin())]
             seen = {
-                name: see_root(skeleton, self.capture.motion, near, self.capture.cameras[name])
+                name: see_root(skeleton, Pose(self.capture.motion, near), self.capture.cameras[name])
                 for name in self.train.cameras
             }
             name = max(self.train.cameras, key=lambda candidate: float(seen[candidate].direction @ wanted.direction))
@@ -87,11 +87,11 @@ def central_frame(motion: Motion, frames: tuple[int, ...]) -> int:
     return frames[int(np.argmin([pose_distances(pose, poses).sum() for pose in poses]))]
 
 
-def see_root(skeleton: Skeleton, motion: Motion, frame: int, camera: Camera) -> Sighting:
+def see_root(skeleton: Skeleton, pose: Pose, camera: Camera) -> Sighting:
     """Where and how large a camera sees the root, and from which side."""
-    root = skeleton.heads[0] + motion.dofs[frame, :3]
+    root = skeleton.heads[0] + pose.dofs[:3]
     pixel, depth = camera.project(root)
-    yaw = float(root_yaw(torch.from_numpy(motion.dofs[frame])))
+    yaw = float(root_yaw(torch.from_numpy(pose.dofs)))
     unturn = np.array([[np.cos(yaw), 0, -np.sin(yaw)], [0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)]])
     towards = unturn @ (camera.position - root)
     return Sighting(

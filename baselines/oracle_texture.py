@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from ash.capture.dataset import Camera, Capture, Pose
 from ash.config import TemplateConfig
-from ash.dataset import Camera, Capture, Motion
-from ash.presets import named
+from ash.presets import Recipe, named
 from ash.protocol import StageClock
-from ash.template import PosedTemplate
+from ash.template.template import PosedTemplate
 from baselines.ddc import DdcAvatar, DdcConfig, ddc_config
 
 # Texture pixels per Gaussian of ASH's lattice, per side. On the mannequin, 4 in place of 2 bring 4.5 dB on training
@@ -34,19 +34,21 @@ class OracleTexture(DdcAvatar):
     def draw_training_views(self, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
         """The texture, drawn into each camera."""
         if frame not in self._surfaces:
-            self._surfaces[frame] = self.template.pose(self._motion, frame)
+            self._surfaces[frame] = self.template.pose(Pose(self._motion, frame))
         texture, posed = self.module.texture, self._surfaces[frame]
         return torch.stack([self.module.draw(texture, posed, camera, background)[..., :3] for camera in cameras])
 
     @torch.no_grad()
-    def dress(self, motion: Motion, frame: int, clock: StageClock) -> tuple[PosedTemplate, Float[Tensor, "3 t t"]]:
+    def dress(self, pose: Pose, clock: StageClock) -> tuple[PosedTemplate, Float[Tensor, "3 t t"]]:
         """The posed surface and the texture."""
         with clock.stage("stg1"):
-            return self.template.pose(motion, frame), self.module.texture.clamp(min=0)
+            return self.template.pose(pose), self.module.texture.clamp(min=0)
 
 
-def oracle_texture(capture: Capture, *, seed: int, preset: str, error_mm: float = 0.0) -> OracleTexture:
-    """The exact surface, or one that is wrong by `error_mm`, with one texture, at the preset's budget."""
+def _on_exact(preset: str) -> DdcConfig:
     config = named(preset)
-    mesh = ddc_config(config, seed=seed, template=TemplateConfig(kind="exact", error_mm=error_mm))
-    return OracleTexture(replace(mesh, texture=TEXTURE_FACTOR * config.model.texels), capture)
+    mesh = ddc_config(config, seed=0, template=TemplateConfig(kind="exact"))
+    return replace(mesh, texture=TEXTURE_FACTOR * config.model.texels)
+
+
+oracle_texture = Recipe(config=_on_exact, build=OracleTexture)  # One texture, at the preset's budget.

@@ -3,11 +3,11 @@
 from dataclasses import replace
 from pathlib import Path
 
+from ash.avatar import AshAvatar
+from ash.capture.dataset import Capture
 from ash.config import AshConfig, TemplateConfig
-from ash.dataset import Capture
-from ash.method import AshAvatar
-from ash.presets import named
 from baselines.nearest import central_frame
+from baselines.switches import wo_mot
 
 
 class StaticAvatar(AshAvatar):
@@ -28,10 +28,5 @@ def of_one_frame(capture: Capture) -> Capture:
     return replace(capture, splits=capture.splits | {"train": replace(train, frames=(frame,))})
 
 
-def static(capture: Capture, *, seed: int, preset: str) -> StaticAvatar:
-    """One set of Gaussians from one frame, at the preset's budget."""
-    config = named(preset)
-    model = replace(config.model, motion=False, base=True)
-    training = replace(config.training, warmup="none", warmup_steps=0)
-    template = TemplateConfig(kind="skinned")  # One frame teaches no deformation.
-    return StaticAvatar(replace(config, model=model, training=training, template=template, seed=seed), capture)
+# One set of Gaussians from one frame, at the preset's budget; one frame teaches no deformation.
+static = replace(wo_mot, build=StaticAvatar).but({"template": TemplateConfig(kind="skinned")})

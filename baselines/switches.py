@@ -1,70 +1,63 @@
-"""ASH with one switch turned: where paper and release differ, and what the fast presets add to both.
+"""Methods that are ASH or the mesh baseline with some fields of the configuration replaced: one table, a row each.
 
-Methods by their path (`baselines.switches:wo_base`): they are rows of the suites `switches` and `template`.
+A row here is an entry point. Any other variant needs no code: it is a row of a suite's file, or flags of
+`ash-bench train`, with the same dotted keys; `benchmarks/suites/switches.toml` holds many.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
-from ash.dataset import Capture
-from ash.method import AshAvatar
-from ash.presets import named
+import numpy as np
 
-Factory = Callable[..., AshAvatar]
+from ash.avatar import AshAvatar
+from ash.capture.dataset import Capture, Pose
+from ash.capture.formats import read_body
+from ash.config import AshConfig, TemplateConfig
+from ash.presets import ash, ash_truth, frugal
+from baselines.ddc import ddc_truth
+from baselines.oracle_texture import oracle_texture
 
-
-def _turned(
-    *,
-    model: dict[str, Any] | None = None,
-    training: dict[str, Any] | None = None,
-    template: dict[str, Any] | None = None,
-) -> Factory:
-    def factory(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-        config = named(preset)
-        config = replace(
-            config,
-            model=replace(config.model, **(model or {})),
-            training=replace(config.training, **(training or {})),
-            template=replace(config.template, **(template or {})),
-            seed=seed,
-        )
-        return AshAvatar(config, capture)
-
-    return factory
+STUDIO_CAMERAS = 120  # The paper's rig, of which its ablation keeps 12, 30 and 60.
 
 
-# The warm-up (Eq. 8): frames fitted one by one, a guess from the mesh, none.
-warm_up_paper = _turned(training={"warmup": "fitted"})
-warm_up_released = _turned(training={"warmup": "analytic"})
-warm_up_none = _turned(training={"warmup": "none", "warmup_steps": 0})
+class BareBodyAvatar(AshAvatar):
+    """ASH on a mesh whose vertices are not those of the clothed template, even where there are as many."""
 
-# Paper against release.
-loss_paper = _turned(training={"l1_weight": 0.1, "ssim_weight": 0.9})
-loss_released = _turned(training={"l1_weight": 0.9, "ssim_weight": 0.1})
-norm_released = _turned(model={"norm": "batch-as-released"})
-norm_instance = _turned(model={"norm": "instance"})
-world_rotations = _turned(model={"quat_frame": "world"})
-released_phi = _turned(model={"global_mlp": "released"})
-wo_phi = _turned(model={"global_features": False})
-sh_3 = _turned(model={"sh_degree": 3})
+    def template_vertices(self, pose: Pose) -> np.ndarray:
+        """None that could be compared with the truth, `[0, 3]`."""
+        return np.zeros((0, 3))
 
-# What the fast presets add.
-wide_dilation = _turned(model={"dilation": 0.3})
-wo_base = _turned(model={"base": False}, training={"warmup": "none", "warmup_steps": 0})
-wo_light = _turned(model={"light": False})
-wo_light_and_motion = _turned(model={"light": False, "motion": False})
-wo_standardise = _turned(model={"standardise": False})
-wo_heading = _turned(model={"yaw_normalise": False})
-two_trunks = _turned(model={"shared_trunk": False})
-noisy_textures = _turned(training={"texture_noise": 1.0})
-averaged = _turned(training={"ema": 0.99})
-blendshapes = _turned(model={"head": "blendshapes"})
-learned_template = _turned(template={"kind": "learned"})
 
-# How the template comes about, where a surface per frame ("chamfer") is what ASH learns it from.
-by_vertices = _turned(template={"kind": "learned", "supervision": "vertices"})
-by_images = _turned(template={"kind": "learned", "supervision": "images"})
-by_graph = _turned(template={"kind": "learned", "network": "graph"})
-unlearned = _turned(template={"kind": "skinned"})
-refined = _turned(model={"refine": True}, template={"kind": "learned"})
+def _on_bare_body(config: AshConfig, capture: Capture) -> BareBodyAvatar:
+    return BareBodyAvatar(config, replace(capture, template=read_body(capture)))
+
+
+# The paper's rows.
+wo_disp = ash.but({"model.offset": False})
+wo_mot = ash.but({"model.motion": False, "model.base": True, "training.warmup": "none", "training.warmup_steps": 0})
+res_128 = ash.but({"model.texels": lambda config: config.model.texels // 2})  # The paper's preset has 256.
+res_512 = ash.but({"model.texels": lambda config: config.model.texels * 2})
+cams_12 = ash.but({"training.camera_share": 12 / STUDIO_CAMERAS})
+cams_30 = ash.but({"training.camera_share": 30 / STUDIO_CAMERAS})
+cams_60 = ash.but({"training.camera_share": 60 / STUDIO_CAMERAS})
+# A fitted body model as template: clothes are whatever the offsets and the splats make of them.
+smpl = replace(ash, build=_on_bare_body).but({"template": TemplateConfig(kind="skinned")})
+
+# What lightness costs: the model of the preset `frugal` in any other.
+ash_frugal = ash.but({"model": lambda _: frugal().model})
+
+# An oracle: how good a template may become that is learned from true vertices.
+by_vertices = ash.but({"template.kind": "learned", "template.supervision": "vertices"})
+
+# Oracles on a surface that is wrong by so much. A mesh may be moved by the images; an exact one has nothing to gain.
+ash_2mm = ash_truth.but({"template.error_mm": 2.0})
+ash_4mm = ash_truth.but({"template.error_mm": 4.0})
+ash_8mm = ash_truth.but({"template.error_mm": 8.0})
+ash_16mm = ash_truth.but({"template.error_mm": 16.0})
+ddc_2mm = ddc_truth.but({"template.error_mm": 2.0, "refine": True})
+ddc_4mm = ddc_truth.but({"template.error_mm": 4.0, "refine": True})
+ddc_8mm = ddc_truth.but({"template.error_mm": 8.0, "refine": True})
+ddc_16mm = ddc_truth.but({"template.error_mm": 16.0, "refine": True})
+texture_2mm = oracle_texture.but({"template.error_mm": 2.0, "refine": True})
+texture_4mm = oracle_texture.but({"template.error_mm": 4.0, "refine": True})
+texture_8mm = oracle_texture.but({"template.error_mm": 8.0, "refine": True})
+texture_16mm = oracle_texture.but({"template.error_mm": 16.0, "refine": True})

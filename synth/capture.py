@@ -9,48 +9,45 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import wait as wait_for_end
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ash.dataset import (
-    SCHEMA,
-    Split,
-    image_path,
-    pixels_path,
+from ash.capture.dataset import Split, image_path, pixels_path, surface_path
+from ash.capture.formats import (
     read_cameras,
-    read_manifest,
     read_motion,
     read_skeleton,
-    surface_path,
     write_cameras,
     write_motion,
     write_skeleton,
     write_template,
 )
-from ash.files import InputError, read_arrays, read_image, sha256_of, write_arrays, write_image, write_json
-from synth import cloth, texture
-from synth.bare import bare_template
-from synth.body import Body, Surface
-from synth.checks import penetrations, stretch
+from ash.capture.manifest import Manifest, hash_files, is_capture, read_manifest
+from ash.files import InputError, read_arrays, read_image, write_arrays, write_image
+from synth.camera.render import Picture, Renderer, Studio, probe
+from synth.camera.rig import held_out, make_cameras
+from synth.camera.rig import names as camera_names
+from synth.camera.shutter import shutter_poses
+from synth.cloth import surface
+from synth.cloth.checks import penetrations, stretch
 from synth.code import code_version, source_version
-from synth.mannequin import mannequin
-from synth.motion import make_motion, pose_novelty
-from synth.presets import require_space
-from synth.render import Picture, Renderer, Studio, probe
-from synth.rig import held_out, make_cameras
-from synth.rig import names as camera_names
+from synth.cost import require_space
+from synth.motion.clips import make_motion, pose_novelty
+from synth.person import texture
+from synth.person.bare import bare_template
+from synth.person.body import Body, Surface
+from synth.person.mannequin import mannequin
 from synth.scene import Scene, stream
-from synth.shutter import shutter_poses
 
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class View:
+class WantedView:
     """One image to make."""
 
     camera: str
@@ -114,29 +111,27 @@ def is_finished(scene: Scene, folder: Path) -> bool:
 
     `verify_capture` checks the contents.
     """
-    if not (folder / "manifest.json").is_file():
+    if not is_capture(folder):
         return False
     manifest = read_manifest(folder)
-    if manifest.get("identity") != scene.identity:
-        raise InputError(
-            f"{folder}: holds the scene {manifest['scene']} with other parameters, expected an empty folder"
-        )
+    if manifest.identity != scene.identity:
+        raise InputError(f"{folder}: holds the scene {manifest.scene} with other parameters, expected an empty folder")
     if why_stale(scene, folder):
         return False
-    return bool(manifest["complete"]) and all((folder / name).is_file() for name in manifest["files"])
+    return manifest.complete and all((folder / name).is_file() for name in manifest.files)
 
 
 def why_stale(scene: Scene, folder: Path) -> str:
     """Why the capture in `folder` is not what this code would make of the scene; empty where it is or none is there."""
-    if not (folder / "manifest.json").is_file():
+    if not is_capture(folder):
         return ""
     manifest = read_manifest(folder)
-    if "identity" not in manifest:  # Made by hand, as tests do: nobody can make it again.
+    if not manifest.identity:  # Made by hand, as tests do: nobody can make it again.
         return ""
-    if manifest["identity"] != scene.identity:
-        return f"it holds {manifest['scene']} with other parameters"
-    if manifest.get("code") != code_version():
-        return f"it was made by other code ({manifest.get('code', 'unknown')}, this is {code_version()})"
+    if manifest.identity != scene.identity:
+        return f"it holds {manifest.scene} with other parameters"
+    if manifest.code != code_version():
+        return f"it was made by other code ({manifest.code or 'unknown'}, this is {code_version()})"
     return ""
 
 
@@ -147,7 +142,7 @@ def _begin(scene: Scene, folder: Path, *, alone: bool) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if not (folder / "manifest.json").is_file() and any(folder.iterdir()):
+        if not is_capture(folder) and any(folder.iterdir()):
             raise InputError(f"{folder}: expected an empty folder or a capture")
         if reason := why_stale(scene, folder):
             print(f"{folder}: {reason}; making it again", file=sys.stderr)
@@ -156,29 +151,24 @@ def _begin(scene: Scene, folder: Path, *, alone: bool) -> None:
         for path in folder.rglob(".*.*") if alone else ():
             path.unlink()
         require_space(scene, folder)
-        write_json(folder / "manifest.json", _manifest(scene, files={}, complete=False, made_with={}))
+        replace(_manifest(scene), complete=False).write(folder)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror})") from error
 
 
-def _manifest(scene: Scene, *, files: dict[str, str], complete: bool, made_with: dict[str, str]) -> dict[str, Any]:
-    return {
-        "schema": SCHEMA,
-        "scene": scene.name,
-        "size": scene.size,
-        "seed": scene.seed,
-        "identity": scene.identity,
-        "code": code_version(),
-        "source": source_version(),
-        "parameters": scene.parameters,
-        "splits": {
-            name: {"cameras": list(split.cameras), "frames": list(split.frames)}
-            for name, split in splits(scene).items()
-        },
-        "made_with": made_with,
-        "files": files,
-        "complete": complete,
-    }
+def _manifest(scene: Scene) -> Manifest:
+    """What can be said of a capture before anything of it is made."""
+    return Manifest(
+        scene=scene.name,
+        size=scene.size,
+        seed=scene.seed,
+        identity=scene.identity,
+        code=code_version(),
+        source=source_version(),
+        parameters=scene.parameters,
+        splits=splits(scene),
+        files={},
+    )
 
 
 def splits(scene: Scene) -> dict[str, Split]:
@@ -195,17 +185,19 @@ def splits(scene: Scene) -> dict[str, Split]:
     }
 
 
-def wanted_views(scene: Scene) -> list[View]:
+def wanted_views(scene: Scene) -> list[WantedView]:
     """Every image of the capture, frame by frame."""
     pairs = {pair for split in splits(scene).values() for pair in split.views}
-    return [View(camera=camera, frame=frame) for camera, frame in sorted(pairs, key=lambda pair: (pair[1], pair[0]))]
+    return [
+        WantedView(camera=camera, frame=frame) for camera, frame in sorted(pairs, key=lambda pair: (pair[1], pair[0]))
+    ]
 
 
 def make_body(scene: Scene) -> Body:
     """The scene's clothed body."""
     if scene.body == "mannequin":
         return mannequin(skirt=scene.outfit.skirt)
-    from synth.dressing import anny_body
+    from synth.person.dressing import anny_body
 
     return anny_body(skirt=scene.outfit.skirt)
 
@@ -221,22 +213,22 @@ def describe(scene: Scene, folder: Path, executor: Executor | None = None) -> No
     body = make_body(scene)
     painted = executor.submit(paint, scene, folder) if executor else None
     motion = make_motion(body.skeleton, scene.train + scene.test, fps=scene.fps, seed=stream(scene, "motion"))
-    surface = cloth.true_surface(body, motion, scene.outfit, seed=stream(scene, "folds"))
+    moved = surface.true_surface(body, motion, scene.outfit, seed=stream(scene, "folds"))
     write_skeleton(folder / "skeleton.json", body.skeleton)
     write_motion(folder / "motion.npz", motion)
-    offset = cloth.scan_error(body, scene.outfit, seed=stream(scene, "scan"))
+    offset = surface.scan_error(body, scene.outfit, seed=stream(scene, "scan"))
     write_template(folder / "template.npz", body.template(offset))
     write_template(folder / "body.npz", bare_template(scene))
-    write_arrays(folder / "truth" / "template.npz", vertices=surface[:, body.kept])
-    poking = penetrations(body, surface)
+    write_arrays(folder / "truth" / "template.npz", vertices=moved[:, body.kept])
+    poking = penetrations(body, moved)
     write_arrays(
         folder / "truth" / "clothes.npz",
         penetrating=poking.share,
         penetration_mm=1000 * poking.deepest,
-        stretch=stretch(body, surface, "skirt" if scene.outfit.skirt else "shirt"),
+        stretch=stretch(body, moved, "skirt" if scene.outfit.skirt else "shirt"),
     )
     # The picture is made of float32 vertices, so these are the exact ones.
-    stored = surface.astype(np.float32)
+    stored = moved.astype(np.float32)
     for frame, vertices in enumerate(stored):
         write_arrays(surface_path(folder, frame), vertices=vertices)
     rest = body.surface
@@ -259,8 +251,8 @@ def paint(scene: Scene, folder: Path) -> None:
     write_image(folder / "truth" / "texture.png", image)
 
 
-def _by_frame(views: list[View]) -> list[list[View]]:
-    frames: dict[int, list[View]] = {}
+def _by_frame(views: list[WantedView]) -> list[list[WantedView]]:
+    frames: dict[int, list[WantedView]] = {}
     for view in views:
         frames.setdefault(view.frame, []).append(view)
     return list(frames.values())
@@ -284,7 +276,9 @@ def _start_worker() -> None:
         threading.Thread(target=watch, args=(parent.sentinel,), daemon=True).start()
 
 
-def _run(executor: Executor | None, scene: Scene, folder: Path, renderer: Renderer, tasks: list[list[View]]) -> Any:
+def _run(
+    executor: Executor | None, scene: Scene, folder: Path, renderer: Renderer, tasks: list[list[WantedView]]
+) -> Any:
     """Submit tasks and yield how many images each finished one made. Few are in flight, so that stopping is quick."""
     if executor is None:
         raise ValueError("an executor is needed")
@@ -318,7 +312,7 @@ def _studio(scene: Scene, folder: Path, renderer: Renderer) -> Studio:
     return _STUDIOS[key]
 
 
-def render_views(scene: Scene, folder: Path, renderer: Renderer, views: list[View]) -> int:
+def render_views(scene: Scene, folder: Path, renderer: Renderer, views: list[WantedView]) -> int:
     """Render the views of one frame and write them; the image last, so that its presence means that all is there."""
     studio = _studio(scene, folder, renderer)
     cameras = read_cameras(folder / "cameras.json")
@@ -351,7 +345,7 @@ def _poses(scene: Scene, folder: Path, frame: int) -> tuple[np.ndarray, list[np.
     return surfaces[at], shutter_poses(np.stack(surfaces), at, shutter=scene.rig.shutter)
 
 
-def _write_view(folder: Path, view: View, picture: Picture) -> None:
+def _write_view(folder: Path, view: WantedView, picture: Picture) -> None:
     write_arrays(
         pixels_path(folder, view.camera, view.frame),
         triangle=picture.triangle,
@@ -363,8 +357,6 @@ def _write_view(folder: Path, view: View, picture: Picture) -> None:
 
 def finish(scene: Scene, folder: Path, renderer: Renderer) -> None:
     """Hash every file and write the final manifest."""
-    names = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
-    files = {name: sha256_of(folder / name) for name in names if name != "manifest.json"}
     made_with = {
         "numpy": np.__version__,
         "python": platform.python_version(),
@@ -375,6 +367,5 @@ def finish(scene: Scene, folder: Path, renderer: Renderer) -> None:
     motion = read_motion(folder / "motion.npz", joints=len(read_skeleton(folder / "skeleton.json").names))
     parts = splits(scene)
     novelty = pose_novelty(motion, train=parts["train"].frames, test=parts["novel_pose"].frames)
-    stated = {"pose_novelty_deg": round(novelty, 3)}  # of the test motion, see `pose_novelty`
-    manifest = _manifest(scene, files=files, complete=True, made_with=made_with)
-    write_json(folder / "manifest.json", manifest | stated)
+    manifest = replace(_manifest(scene), made_with=made_with, pose_novelty_deg=round(novelty, 3))
+    replace(manifest, files=hash_files(folder)).write(folder)

@@ -1,13 +1,18 @@
-"""Which code makes captures: a capture made by other code is made again, never reused."""
+"""Which code makes captures: a capture made by other code is made again, never reused.
+
+All of `synth` but `synth.readers`, which decides no byte of one, and what defines one: `ash.capture`, `ash.files`.
+"""
 
 import hashlib
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-# What reads captures and decides no byte of them. Everything else in this folder counts as making them.
-READERS = ("export", "official", "perturb", "retargeting", "sheets", "truth", "undistorting")
-FORMATS = ("dataset.py", "files.py", "lens.py")  # of the package ash
+from ash.files import hash_sources, source_files
+
+HERE = Path(__file__).parent
+MAKERS = (HERE, HERE.parent / "ash" / "capture", HERE.parent / "ash" / "files.py")
+READERS = (HERE / "readers",)
 PACKAGES = ("anny", "drjit", "mitsuba", "numpy", "pillow", "scipy")
 
 
@@ -21,17 +26,12 @@ def code_version() -> str:
 @lru_cache(maxsize=1)
 def source_version() -> str:
     """Hash of our sources alone: equal on machines whose renders differ by rounding."""
-    digest = hashlib.sha256()
-    for path in maker_sources():
-        digest.update(f"{path.name} {len(path.read_bytes())}\n".encode() + path.read_bytes())
-    return digest.hexdigest()[:16]
+    return hash_sources(*MAKERS, without=READERS)[:16]
 
 
 def maker_sources() -> list[Path]:
     """The files of source that decide the bytes of a capture."""
-    here = Path(__file__).parent
-    own = [path for path in sorted(here.glob("*.py")) if path.stem not in READERS]
-    return own + [here.parent / "ash" / name for name in FORMATS]
+    return source_files(*MAKERS, without=READERS)
 
 
 def _version(package: str) -> str:

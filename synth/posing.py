@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ash.dataset import Skeleton
+from ash.capture.dataset import Skeleton
 
 
 def rotvec_to_rotmat(rotvecs: np.ndarray) -> np.ndarray:

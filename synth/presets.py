@@ -1,18 +1,18 @@
 """Named scenes. A scene is a function of its size and seed; each rung adds exactly one phenomenon to `skinned`."""
 
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from ash.dataset import Skeleton
+from ash.capture.dataset import Skeleton
 from ash.files import InputError
-from synth.motion import Clip, clip_from_file
-from synth.rig import rig_from_file
-from synth.scene import Light, Outfit, Rig, Scene
+from synth.camera.rig import rig_from_file
+from synth.motion.clips import clip_from_file
+from synth.motion.importing import WHOLE
+from synth.scene import Clip, Light, Outfit, Rig, Scene, Take
 
-SIZES = ("ci", "quick", "table", "paper")
+SIZES = ("ci", "quick", "long", "table", "paper")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -34,6 +34,8 @@ def _size(name: str) -> Size:
         return Size(rig=rig, repeats=1, frames=4, test_frames=3, stride=3, samples=16, texture=512)
     if name == "quick":
         return Size(rig=Rig(), repeats=1, frames=10, test_frames=12, stride=5, samples=50, texture=2048)
+    if name == "long":  # `quick` with eight times the training motion.
+        return Size(rig=Rig(), repeats=8, frames=10, test_frames=12, stride=40, samples=50, texture=2048)
     if name == "table":
         rig = Rig(cameras=34, held_out=4, width=512, height=512)
         return Size(rig=rig, repeats=4, frames=20, test_frames=80, stride=20, samples=128, texture=4096)
@@ -139,12 +141,14 @@ def scene(name: str, *, size: str, seed: int = 0) -> Scene:
     return SCENES[name](size=size, seed=seed)
 
 
-def with_motion(scene: Scene, skeleton: Skeleton, *, train: Path | None, test: Path | None) -> Scene:
+def with_motion(
+    scene: Scene, skeleton: Skeleton, *, train: Path | None, test: Path | None, take: Take = WHOLE
+) -> Scene:
     """The scene driven by a user's BVH or AMASS files, for as many frames as the scene has; the rest stays."""
 
     def driven(clips: tuple[Clip, ...], path: Path | None) -> tuple[Clip, ...]:
         most = sum(clip.frames for clip in clips)
-        return clips if path is None else (clip_from_file(path, skeleton, fps=scene.fps, most=most),)
+        return clips if path is None else (clip_from_file(path, skeleton, fps=scene.fps, most=most, take=take),)
 
     return replace(scene, train=driven(scene.train, train), test=driven(scene.test, test))
 
@@ -152,44 +156,3 @@ def with_motion(scene: Scene, skeleton: Skeleton, *, train: Path | None, test: P
 def with_rig(scene: Scene, path: Path) -> Scene:
     """The scene seen by a user's `cameras.json`: every fourth camera is held out, at least one and at most eight."""
     return replace(scene, rig=rig_from_file(path))
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Estimate:
-    """What a capture will cost, from figures measured on two cores of a 2019 server."""
-
-    images: int
-    core_seconds: float
-    bytes: int
-
-    @property
-    def text(self) -> str:
-        """One line for the user."""
-        hours = self.core_seconds / 3600
-        time = f"{hours:.1f} core-hours" if hours >= 1 else f"{self.core_seconds / 60:.1f} core-minutes"
-        return f"{self.images} images, about {time}, {self.bytes / 1e9:.2f} GB"
-
-
-def estimate(scene: Scene) -> Estimate:
-    """Images, core seconds and bytes of a capture before it is made."""
-    training = sum(clip.frames for clip in scene.train)
-    rig = scene.rig
-    train_views = (rig.cameras - rig.held_out) * training
-    novel_views = rig.held_out * (len(range(scene.novel_view_stride // 2, training, scene.novel_view_stride)))
-    images = train_views + novel_views + rig.held_out * (scene.frames - training)
-    pixels = rig.width * rig.height
-    per_image = 0.07 + 1.6e-7 * pixels * scene.samples
-    fixed = (40.0 if scene.body == "anny" else 6.0) + 0.25 * scene.frames
-    size = int(images * pixels * 1.1 + scene.frames * 1.2e6 + 3 * scene.texture**2)
-    return Estimate(images=images, core_seconds=fixed + images * per_image, bytes=size)
-
-
-def require_space(scene: Scene, folder: Path) -> None:
-    """Refuse a capture that the disk cannot hold. What an earlier run wrote counts as there already."""
-    there = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-    needed = estimate(scene).bytes - there
-    free = shutil.disk_usage(folder).free
-    if needed > free:
-        raise InputError(
-            f"{folder}: the capture needs {needed / 1e9:.1f} GB more and the disk has {free / 1e9:.1f} GB free"
-        )

@@ -1,13 +1,65 @@
 """What a scene is: one frozen description from which every byte of a capture follows."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from ash.files import InputError, hash_of
-from synth.motion import Clip
 
 BODIES = ("mannequin", "anny")
+MOTIONS = (
+    "walk",
+    "reach",
+    "turn",
+    "squat",
+    "dance",
+    "stand",
+    "run",
+    "jump",
+    "spin",
+)  # as in `motion/generators.py`
+GIVEN = "given"  # the kind of a clip whose motion comes from a user's file
+UPS = ("auto", "x", "y", "z", "-x", "-y", "-z")
 RIGS = ("dome", "ring", "cap", "studio", "given")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Take:
+    """Which part of a motion file is taken, and how the file is read."""
+
+    up: str = "auto"  # the axis that is up in the file: auto, x, y, z, -x, -y, -z
+    start: float = 0.0  # seconds of the file that are left out at its start
+    length: float | None = None  # seconds of the file that are taken; none: up to its end
+    stride: int = 1  # every so many-th frame is taken: the motion goes so many times as fast
+    joints: tuple[tuple[str, str], ...] = ()  # joints of ours, each with the file's name for it
+
+    def __post_init__(self) -> None:
+        if self.up not in UPS:
+            raise InputError(f"up axis {self.up!r}, expected one of {', '.join(UPS)}")
+        if not 0 <= self.start < 1e6 or (self.length is not None and not 0 < self.length < 1e6):
+            raise InputError(f"a take from {self.start} s, {self.length} s long, expected 0 or more, and more than 0")
+        if not 1 <= self.stride <= 10_000:
+            raise InputError(f"a stride of {self.stride} frames, expected 1 to 10000")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Clip:
+    """A generator, how many frames of it to take, and where on the floor and facing where."""
+
+    generator: str  # one of MOTIONS, or "given" for a motion from a file
+    frames: int
+    yaw: float = 0.0  # radians that the whole clip is turned by about the vertical
+    shift: tuple[float, float] = (0.0, 0.0)  # metres, x and z, that it is then moved by
+    given: str = ""  # SHA-256 of a user's motion file, for "given"
+    take: Take = Take()  # what is taken of that file
+    path: str = field(default="", compare=False)  # where that file lies; no part of what the clip is
+
+    def __post_init__(self) -> None:
+        if self.generator not in (*MOTIONS, GIVEN):
+            raise InputError(f"unknown motion {self.generator!r}, expected one of {', '.join(MOTIONS)}")
+        if (self.generator == GIVEN) != bool(self.given):
+            raise InputError("a clip of kind 'given' needs the SHA-256 of a motion file, and only such a clip has one")
+        if not 2 <= self.frames <= 100_000:
+            raise InputError(f"a clip of {self.frames} frames, expected 2 to 100000")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -112,6 +164,8 @@ class Scene:
         parameters = asdict(self)
         for clip in (*parameters["train"], *parameters["test"]):
             del clip["path"]
+            if clip["take"] == asdict(Take()):
+                del clip["take"]
         return parameters
 
     @property

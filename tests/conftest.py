@@ -4,6 +4,7 @@ import signal
 from collections.abc import Iterator
 
 import pytest
+from helpers.browser import chromium, visit  # noqa: F401  (fixtures for all)
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -200,3 +200,106 @@ def test_old_python_is_refused(project: Path, environment: dict[str, str], tmp_p
     done = launch(project, "x", "0", env={**environment, "PATH": f"{tmp_path / 'bin'}:{environment['PATH']}"})
     assert done.returncode == 1
     assert done.stderr == "ash-bench: Python 3.11 or newer is needed, and Python 3.9.2 was found\n"
+
+
+def test_the_verb_test_wants_a_browser_and_goes_on_without(
+    project: Path, environment: dict[str, str], tmp_path: Path
+) -> None:
+    for program in [*Path("/usr/bin").iterdir(), *Path("/bin").iterdir()]:
+        if not program.name.startswith(("chromium", "google-chrome")) and not (tmp_path / program.name).exists():
+            (tmp_path / program.name).symlink_to(program)
+    machine = environment["APT_LOG"].removesuffix("apt.log") + "bin"
+    python = Path(sys._base_executable).parent  # type: ignore[attr-defined]
+    write_program(tmp_path / "bin" / "apt-cache", 'echo "  Candidate: 150.0-1"')
+    path = f"{tmp_path / 'bin'}:{machine}:{tmp_path}" + ("" if python == Path("/usr/bin") else f":{python}")
+    Path(environment["APT_LOG"]).write_text("")
+    assert launch(project, "x", "0", env={**environment, "PATH": path}).returncode == 0
+    done = launch(project, "test", "0", env={**environment, "PATH": path})
+    assert done.returncode == 0 and done.stdout == f"{project} test\n"
+    assert "tests of pages are skipped" in done.stderr
+    if os.geteuid() == 0:
+        assert "install --no-install-recommends chromium" in Path(environment["APT_LOG"]).read_text()
+    write_program(tmp_path / "bin" / "chromium", "exit 0")
+    assert launch(project, "test", "0", env={**environment, "PATH": path}).stderr == ""
+
+
+def bare_project(folder: Path, project: Path) -> Path:
+    """The stand-in project without an environment."""
+    for name in ("ash-bench", "pyproject.toml", "constraints.txt", "backend.py", "program.py"):
+        shutil.copy(project / name, folder)
+    return folder
+
+
+def environment_of_another(folder: Path) -> Path:
+    """An environment that is not ours, with the folders that a remake of ours would delete."""
+    for name in ("bin", "lib/python3.11/site-packages/half-1.0.dist-info", "lib64", "include"):
+        (folder / name).mkdir(parents=True)
+    (folder / "pyvenv.cfg").write_text("home = /elsewhere\n")
+    (folder / "bin" / "python").write_text("precious\n")
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes | None]:
+    return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None for p in folder.rglob("*")}
+
+
+def test_an_environment_behind_a_link_is_left_alone(project: Path, environment: dict[str, str], tmp_path: Path) -> None:
+    (tmp_path / "ours").mkdir()
+    ours = bare_project(tmp_path / "ours", project)
+    other = environment_of_another(tmp_path / "other")
+    before = contents(other)
+    (ours / ".venv").symlink_to(other)
+    done = launch(ours, "x", "0", env=environment)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "is a link to" in done.stderr and len(done.stderr.splitlines()) == 1
+    assert contents(other) == before and (ours / ".venv").is_symlink()
+
+
+def test_a_folder_that_we_did_not_make_is_left_alone(
+    project: Path, environment: dict[str, str], tmp_path: Path
+) -> None:
+    other = environment_of_another(bare_project(tmp_path, project) / ".venv")
+    before = contents(other)
+    done = launch(tmp_path, "x", "0", env=environment)
+    assert done.returncode == 1
+    assert "was not made by this launcher" in done.stderr and len(done.stderr.splitlines()) == 1
+    assert contents(other) == before
+
+
+@pytest.mark.parametrize("part", ["bin", "lib", "lib/python3.11", "lib/python3.11/site-packages"])
+def test_links_inside_the_environment_are_not_followed(
+    project: Path, environment: dict[str, str], tmp_path: Path, part: str
+) -> None:
+    (tmp_path / "ours").mkdir()
+    ours = bare_project(tmp_path / "ours", project)
+    other = environment_of_another(tmp_path / "other")
+    before = contents(other)
+    link = ours / ".venv" / part
+    link.parent.mkdir(parents=True)
+    (ours / ".venv" / "made-by-ash-bench").touch()
+    link.symlink_to(other / part)
+    done = launch(ours, "x", "0", env=environment)
+    assert done.returncode == 1 and f"{part} is a link to" in done.stderr
+    assert contents(other) == before
+
+
+def test_an_environment_of_an_older_launcher_is_ours(
+    project: Path, environment: dict[str, str], tmp_path: Path
+) -> None:
+    assert launch(project, "x", "0", env=environment).returncode == 0
+    copy = shutil.copytree(project, tmp_path / "copy", symlinks=True)
+    (copy / ".venv" / "made-by-ash-bench").unlink()
+    done = launch(copy, "x", "0", env=environment)
+    assert done.returncode == 0, done.stderr
+    assert (copy / ".venv" / "made-by-ash-bench").is_file()
+
+
+def test_no_system_leaves_apt_alone(project: Path, environment: dict[str, str]) -> None:
+    change(project)
+    log = Path(environment["APT_LOG"])
+    log.write_text("")
+    done = launch(project, "--no-system", "x", "0", env={**environment, "CXX": "/nowhere/c++"})
+    assert done.returncode == 1 and "g++" in done.stderr.splitlines()[-1]
+    assert log.read_text() == ""
+    done = launch(project, "--no-system", "x", "0", env=environment)
+    assert done.returncode == 0 and done.stdout == f"{project} x\n" and "will install into" in done.stderr

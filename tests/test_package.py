@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.cli import VERBS
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("ash", "synth", "baselines", "benchmarks")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -51,9 +53,11 @@ def test_wheel_holds_the_four_packages_and_the_licence(wheel: Path) -> None:
     for package in PACKAGES:
         sources = {path.relative_to(ROOT) for path in (ROOT / package).rglob("*.py")}
         assert {path.relative_to(wheel) for path in (wheel / package).rglob("*.py")} == sources
-    assert {path.name for path in (wheel / "benchmarks" / "templates").iterdir()} == {
-        path.name for path in (ROOT / "benchmarks" / "templates").iterdir() if path.is_file()
+    assert {path.name for path in (wheel / "benchmarks" / "report" / "templates").iterdir()} == {
+        path.name for path in (ROOT / "benchmarks" / "report" / "templates").iterdir() if path.is_file()
     }
+    suites = {path.name for path in (ROOT / "benchmarks" / "suites").glob("*.toml")}
+    assert {path.name for path in (wheel / "benchmarks" / "suites").glob("*.toml")} == suites != set()
 
 
 def test_wheel_works_outside_the_checkout(wheel: Path, tmp_path: Path) -> None:
@@ -62,10 +66,10 @@ def test_wheel_works_outside_the_checkout(wheel: Path, tmp_path: Path) -> None:
 import sys
 sys.path[:0] = [{str(wheel)!r}]
 sys.path += {[path for path in sys.path if path.endswith("-packages")]!r}
-import ash.dataset, synth.scene
+import ash.capture.dataset, synth.scene
 from importlib.metadata import entry_points
 from benchmarks.cli import main
-assert ash.dataset.__file__.startswith({str(wheel)!r})
+assert ash.capture.dataset.__file__.startswith({str(wheel)!r})
 main(["--help"])
 """
     done = subprocess.run(
@@ -162,7 +166,49 @@ def test_documents_name_files_and_verbs_that_exist(document: str) -> None:
     assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
     linked = re.findall(r"\]\((?!https?:)([^)#]+)\)", text)
     assert [name for name in linked if not ((ROOT / document).parent / name).exists()] == []
-    verbs = set(re.findall(r"\./ash-bench ([a-z-]+)", text))
-    sources = "".join(path.read_text() for path in (ROOT / "benchmarks").glob("*.py"))
-    known = set(re.findall(r'\b(?:_verb\(verbs|add\()[\w, ]*"([a-z-]+)"', sources))
+    verbs = set(re.findall(r"\./ash-bench ([a-z][a-z-]*)", text))
+    known = set(VERBS)
     assert verbs <= known
+
+
+def test_contracts_allow_only_what_they_name() -> None:
+    """import-linter forbids by name; a new module of ash is forbidden to synth and cells until it is allowed here."""
+    rooms = {f"ash.{path.stem}" for path in (ROOT / "ash").iterdir() if path.suffix == ".py" or path.is_dir()}
+    rooms -= {"ash.__init__", "ash.__pycache__", "ash.capture", "ash.files"}
+    contracts = PROJECT["tool"]["importlinter"]["contracts"]
+    walls = [contract for contract in contracts if contract["type"] == "forbidden"]
+    assert sum(rooms - {"ash.protocol", "ash.fields"} <= set(wall["forbidden_modules"]) for wall in walls) == 3
+
+
+def test_the_architecture_names_every_module() -> None:
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    rooms = dict(re.findall(r"^\| `([\w/]+)/` \| .* \| (.*) \|$", text, re.M))
+    for package in PACKAGES:
+        for folder in {path.parent for path in (ROOT / package).rglob("*.py")}:
+            named = set(re.findall(r"`(\w+)`", rooms[folder.relative_to(ROOT).as_posix()]))
+            assert named == {path.stem for path in folder.glob("*.py")} - {"__init__"}, folder
+
+
+def test_the_architecture_states_the_direction_of_imports_that_is_checked() -> None:
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    contracts = PROJECT["tool"]["importlinter"]["contracts"]
+    (packages,) = [c["layers"] for c in contracts if c["type"] == "layers" and c["layers"][-1] == "ash"]
+    (rooms,) = [c["layers"] for c in contracts if c.get("containers") == ["benchmarks"]]
+    assert f"packages    {' -> '.join(packages)}\n" in text
+    assert f"benchmarks  {' -> '.join(rooms)}\n" in text
+
+
+def test_the_architecture_lists_every_difference_from_the_paper() -> None:
+    from ash.presets import named
+
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    cpu, paper = named("cpu"), named("paper")
+    expected = {
+        f"{part}.{name}": (str(getattr(ours, name)), str(getattr(theirs, name)))
+        for part in ("model", "training", "template")
+        for ours, theirs in [(getattr(cpu, part), getattr(paper, part))]
+        for name in ours.__dataclass_fields__
+        if getattr(ours, name) != getattr(theirs, name)
+    }
+    listed = re.findall(r"^\| `((?:model|training|template)\.\w+)` \| (.*?) \| (.*?) \| .+ \|$", text, re.M)
+    assert {name: (ours, theirs) for name, ours, theirs in listed} == expected

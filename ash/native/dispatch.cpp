@@ -8,6 +8,8 @@
 #include <numeric>
 #include <vector>
 
+#include <pthread.h>
+
 #include "team.h"
 
 namespace ash {
@@ -43,7 +45,15 @@ const Kernels& kernels() {
 extern "C" {
 
 // Changes whenever a function below or its arguments change; ash/native/library.py holds the same number.
-int ash_abi_version() { return 4; }
+int ash_abi_version() { return 6; }
+
+// The address of GOMP_parallel in the OpenMP runtime whose threads all calls shall use; null: threads of their own.
+void ash_use_team(void* parallel) {
+    // The runtime's threads do not survive a fork, and it would wait for them: a child starts its own.
+    static const int once = pthread_atfork(nullptr, nullptr, [] { ash::parallel_of_torch.store(nullptr); });
+    (void)once;
+    ash::parallel_of_torch.store(reinterpret_cast<ash::Parallel>(parallel));
+}
 
 const char* ash_instruction_set() { return ash::kernels().name; }
 

@@ -80,7 +80,7 @@ struct BlendArgs {
 };
 
 struct SsimArgs {
-    const float *image, *target, *mean, *square;  // [h, 3 w]; the target, its window means and those of its square
+    const float *image, *target;                  // [h, 3 w]
     const float* weights;                         // [h, w] or null: 1 everywhere
     float* grad;                                  // [h, 3 w] or null
     int width, height;
@@ -108,6 +108,55 @@ struct PoseArgs {
     float* grad_raw;
 };
 
+struct AdamArgs {
+    float* parameter;
+    const float* grad;
+    float *mean, *square;  // moments
+    float new_mean, new_square, beta2, eps;  // 1 - beta1, 1 - beta2
+    float step_size;     // learning rate / (1 - beta1^t)
+    float inverse_root;  // 1 / sqrt(1 - beta2^t)
+};
+
+struct ShadeArgs {
+    const float *texture, *light, *weights;  // [3, height, width], [9, 3] or null, [n, 3]
+    const float *uvs, *normals;              // [u, 2], [v, 3]
+    const int64_t *triangles, *uv_faces, *faces;  // [n], [f, 3], [f, 3]
+    int height, width;
+    float* colours = nullptr;
+    // Backward only.
+    const float* grad = nullptr;
+    float *grad_texture = nullptr, *grad_weights = nullptr;  // the latter may be null
+};
+
+constexpr int PRODUCT_COLUMNS = 16;
+
+// c[p][j] = start[j] + sum over segments s and steps i of a[p a_step + a_at[s] + i a_inner] b[b_at[s] + i b_inner + j], for rows p and
+// columns j; then added to what is there, without what is negative, or 0 where `active` is not positive. Columns of b are read 16 at a
+// time, also beyond the last; from one 16 to the next are b_block floats.
+struct Product {
+    const float* a;
+    int64_t a_step, a_inner;
+    const float* b;
+    int64_t b_inner, b_block;
+    const int64_t *a_at, *b_at;
+    int segments;
+    int64_t steps, rows, columns;
+    float* c;
+    int64_t c_step;
+    const float* start = nullptr;
+    const float* active = nullptr;
+    int64_t active_step = 0;
+    bool add = false, relu = false;
+};
+
+// Weights as a product's b: to[block][tap][step][16] = from[column column_step + tap tap_step + step inner_step], 0 beyond the columns.
+struct Packing {
+    const float* from;
+    int columns, taps, steps;
+    int64_t column_step, tap_step, inner_step;
+    float* to;
+};
+
 // What is wrong with an input, found while it is read. 0: nothing.
 enum Fault : int64_t { FAULT_MEANS = 1, FAULT_QUATS, FAULT_ZERO_QUAT, FAULT_SCALES, FAULT_OPACITIES, FAULT_SH };
 
@@ -127,6 +176,11 @@ struct Kernels {
     void (*place_texels)(const PlaceArgs&, int64_t first, int64_t last);
     void (*pose)(const PoseArgs&, int64_t first, int64_t last);
     void (*pose_backward)(const PoseArgs&, int64_t first, int64_t last, double* grad_light);  // adds to [9, 3]
+    bool (*adam)(const AdamArgs&, int64_t first, int64_t last);  // false: a gradient is NaN or infinite
+    void (*shade)(const ShadeArgs&, int64_t first, int64_t last);
+    void (*shade_backward)(const ShadeArgs&, int64_t first, int64_t last, double* grad_light);  // adds to [9, 3]
+    void (*multiply)(const Product&);
+    void (*pack)(const Packing&);
 };
 
 extern const Kernels avx512_kernels, avx2_kernels, plain_kernels;

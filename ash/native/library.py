@@ -14,13 +14,15 @@ from torch import Tensor
 
 from ash.files import InputError
 
-ABI_VERSION = 4  # of ash/native/dispatch.cpp
+ABI_VERSION = 6  # of ash/native/dispatch.cpp
 LIBRARY_NAME = "libash_native" + (".dylib" if sys.platform == "darwin" else ".so")
 
 _P = c_void_p  # the address of a tensor's numbers
 _GAUSSIANS = [_P] * 7 + [c_int64] + [c_int] * 5 + [c_float] * 2 + [c_int]
+_SHADE = [_P, c_int, c_int, _P, _P, _P, c_int64, _P, _P, _P, _P]
 _SIGNATURES: dict[str, tuple[type | None, list[type]]] = {
     "ash_abi_version": (c_int, []),
+    "ash_use_team": (None, [_P]),
     "ash_instruction_set": (c_char_p, []),
     "ash_use_instruction_set": (c_int, [c_char_p]),
     "ash_fma_peak": (c_double, [c_int]),
@@ -30,7 +32,17 @@ _SIGNATURES: dict[str, tuple[type | None, list[type]]] = {
     "ash_blend_backward": (c_int, [_P, _P, _P, _P, _P, _P, _P, c_int, _P, _P]),
     "ash_release": (None, [_P]),
     "ash_stage_seconds": (None, [POINTER(c_double)]),
-    "ash_l1_ssim": (c_int, [_P] * 5 + [c_int] * 4 + [c_float] * 2 + [c_int, _P, POINTER(c_double)]),
+    "ash_l1_ssim": (c_int, [_P] * 3 + [c_int] * 4 + [c_float] * 2 + [c_int, _P, POINTER(c_double)]),
+    "ash_composite": (None, [_P, c_int64, c_int, c_int, _P, _P, _P]),
+    "ash_adam": (c_int, [c_int, *[POINTER(_P)] * 5, POINTER(c_int64), *[c_double] * 4, c_int]),
+    "ash_shade": (None, [*_SHADE, c_int, _P]),
+    "ash_shade_backward": (None, [*_SHADE, _P, _P, POINTER(c_double), _P]),
+    "ash_resolve": (None, [_P, _P, c_int64, c_int, c_int, c_int, _P, _P]),
+    "ash_resolve_backward": (None, [_P, _P, c_int64, c_int, c_int, _P]),
+    "ash_shuffle": (None, [_P, _P, *[c_int] * 5, _P]),
+    "ash_unet": (_P, [POINTER(c_int), _P, POINTER(c_int64), _P, POINTER(_P), c_int, _P]),
+    "ash_unet_backward": (None, [_P, _P, POINTER(_P), POINTER(_P), _P, c_int]),
+    "ash_unet_release": (None, [_P]),
     "ash_skin_vertices": (None, [_P, _P, _P, c_int64, c_int, c_int, _P, _P]),
     "ash_vertex_normals": (None, [_P, _P, c_int64, c_int64, _P]),
     "ash_place_texels": (None, [_P, _P, _P, c_int64, c_int, *[_P] * 4]),
@@ -74,7 +86,23 @@ def load() -> ctypes.CDLL:
     for name, (result, arguments) in _SIGNATURES.items():
         function = getattr(library, name)
         function.restype, function.argtypes = result, arguments
+    library.ash_use_team(_parallel_of_torch())
     return library
+
+
+def _parallel_of_torch() -> int | None:
+    """The address of `GOMP_parallel` in the OpenMP runtime that torch has loaded; None where it uses another kind."""
+    try:
+        # A symbol is looked up in a library and in all that it depends on: found under whatever name torch ships it.
+        parallel = ctypes.CDLL(torch._C.__file__).GOMP_parallel
+    except (OSError, AttributeError):
+        return None
+    return ctypes.cast(parallel, c_void_p).value
+
+
+def use_team(*, of_torch: bool) -> None:
+    """Whether calls on several threads use those of torch, as they do by default, or start their own."""
+    load().ash_use_team(_parallel_of_torch() if of_torch else None)
 
 
 def address(tensor: Tensor | None) -> int | None:

@@ -12,10 +12,9 @@ using namespace ash;
 extern "C" {
 
 // sums: [2], of the weighted |I - T| and SSIM. weights, grad may be null. Returns 0, or 1 if memory is short.
-int ash_l1_ssim(const float* image, const float* target, const float* mean, const float* square, const float* weights, int width,
-                int height, int top, int bottom, float l1_scale, float ssim_scale, int threads, float* grad, double* sums) try {
+int ash_l1_ssim(const float* image, const float* target, const float* weights, int width, int height, int top, int bottom, float l1_scale, float ssim_scale, int threads, float* grad, double* sums) try {
     std::vector<double> rows(2 * size_t(height));
-    SsimArgs args{image, target, mean, square, weights, grad, width, height, top, bottom, l1_scale, ssim_scale,
+    SsimArgs args{image, target, weights, grad, width, height, top, bottom, l1_scale, ssim_scale,
                   rows.data(), rows.data() + height};
     const Kernels& k = kernels();
     const int bands = std::max(1, std::min(threads, height / 16));

@@ -1,5 +1,6 @@
-// Threads for one call. There is no pool: nothing idles, spins or survives a fork, and torch's own threads are left in peace.
-// Starting and joining a thread costs about 20 microseconds (benchmarks: native/README.md).
+// Threads for one call: those of torch's own OpenMP runtime, where ash/native/library.py found it. Its idle threads spin for a while
+// after each of torch's operations, so that a second team would share the cores with them: by turns with convolutions, splatting on
+// threads of its own took 1.8 times as long. Without that runtime a call starts and joins its threads, about 20 microseconds each.
 #pragma once
 #include <atomic>
 #include <chrono>
@@ -10,6 +11,10 @@
 
 namespace ash {
 
+// OpenMP's GOMP_parallel: calls a function with its data on that many threads of the runtime, the caller's among them.
+using Parallel = void (*)(void (*)(void*), void*, unsigned threads, unsigned flags);
+inline std::atomic<Parallel> parallel_of_torch{nullptr};
+
 // work(part) for every part in [0, parts), on up to `threads` threads, the caller's among them. Parts are handed out in order, so the
 // long ones should come first. Which thread does which part must not matter to the result. `work` must not throw.
 template <class Work> void in_parallel(int threads, int64_t parts, const Work& work) {
@@ -17,9 +22,13 @@ template <class Work> void in_parallel(int threads, int64_t parts, const Work& w
     auto run = [&] {
         for (int64_t part; (part = next.fetch_add(1, std::memory_order_relaxed)) < parts;) work(part);
     };
+    const int64_t wanted = threads < parts ? threads : parts;
+    if (wanted <= 1) return run();
+    if (Parallel parallel = parallel_of_torch.load(std::memory_order_relaxed))
+        return parallel([](void* given) { (*static_cast<decltype(run)*>(given))(); }, &run, unsigned(wanted), 0);
     std::vector<std::thread> others;
     try {
-        for (int i = 1; i < threads && i < parts; ++i) others.emplace_back(run);
+        for (int64_t i = 1; i < wanted; ++i) others.emplace_back(run);
     } catch (const std::system_error&) {
         // The machine gives no more threads: those there are do all the work.
     }

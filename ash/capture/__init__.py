@@ -1,0 +1,1 @@
+"""What defines a capture: its files, its manifest, its lenses."""

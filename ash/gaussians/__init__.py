@@ -1,0 +1,1 @@
+"""Gaussians: parameters, texels, start and splatting."""

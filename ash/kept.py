@@ -1,0 +1,47 @@
+"""Values that are made when they are asked for, and kept as far as there is room for them."""
+
+from collections.abc import Callable, Hashable
+from dataclasses import fields, is_dataclass
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from torch import Tensor
+
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
+
+MAX_BYTES = 256 * 2**20
+
+
+class Kept(Generic[Key, Value]):
+    """Values by key. The first ones stay; from `max_bytes` on a value is made anew each time it is asked for.
+
+    Training asks for frames in random order, each as often as the others: to drop one for another would gain nothing.
+    """
+
+    def __init__(self, make: Callable[[Key], Value], *, max_bytes: int = MAX_BYTES) -> None:
+        self._make, self._max_bytes = make, max_bytes
+        self._values: dict[Key, Value] = {}
+        self.bytes = 0
+
+    def __getitem__(self, key: Key) -> Value:
+        """The value of a key, the same whether it was kept or not."""
+        if key in self._values:
+            return self._values[key]
+        value = self._make(key)
+        size = size_of(value)
+        if self.bytes + size <= self._max_bytes:
+            self._values[key] = value
+            self.bytes += size
+        return value
+
+
+def size_of(value: Any) -> int:
+    """Bytes of an array, a tensor, or of all of them in a dataclass."""
+    if isinstance(value, np.ndarray):
+        return value.nbytes
+    if isinstance(value, Tensor):
+        return value.numel() * value.element_size()
+    if is_dataclass(value):
+        return sum(size_of(getattr(value, field.name)) for field in fields(value))
+    return 0

@@ -1,0 +1,255 @@
+"""Drawing a mesh so that vertices learn from pixels: what DDC is made of, and how Stg.1 learns from videos alone.
+
+Which triangle a sample sees is decided by `ash.mesh.rasterizing` and does not change with the vertices; two things do.
+Inside the subject, where in its triangle a sample lies: the texture slides under it. At its outline, how far the
+outline reaches between two neighbouring samples: they are blended accordingly (Laine et al. 2020, "Modular Primitives
+for High-Performance Differentiable Rendering", Sec. 3.6), which makes coverage a continuous function of the vertices.
+Unlike there, outlines are followed through the samples, so that one is found whose triangle no sample hits.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+import ash.native.shading
+from ash.capture.dataset import Camera
+from ash.harmonics import sh_basis
+from ash.mesh.rasterizing import project_vertices, rasterize_mesh
+
+SUPERSAMPLING = 2  # Samples per pixel side.
+OWN_SURFACE_M = 0.15  # A sample inside an outline that is this far from it in depth shows another surface.
+
+# Triangles [n] and weights of their corners [n, 3] to colours [n, c].
+Shade = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Topology:
+    """Faces and who lies across each of their edges; edge e runs from corner e to the next."""
+
+    faces: Int[Tensor, "f 3"]
+    across: Int[Tensor, "f 3"]  # the face on the other side; -1: none
+
+
+def topology_of(faces: Int[Tensor, "f 3"]) -> Topology:
+    """Find the neighbours of every face; an edge of more than two faces counts as a border."""
+    start, end = faces.numpy().ravel(), np.roll(faces.numpy(), -1, axis=1).ravel()
+    edges = np.sort(np.stack([start, end], 1), axis=1)
+    _, name, count = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+    name = name.reshape(-1)
+    owner = np.repeat(np.arange(len(faces)), 3)
+    total = np.bincount(name, weights=owner, minlength=len(count)).astype(np.int64)
+    across = np.where(count[name] == 2, total[name] - owner, -1)
+    return Topology(faces=faces, across=torch.from_numpy(across.reshape(-1, 3)))
+
+
+def draw_mesh(
+    vertices: Float[Tensor, "v 3"],
+    topology: Topology,
+    camera: Camera,
+    shade: Shade,
+    background: Float[Tensor, " c"],
+    *,
+    outlines: bool = False,
+) -> Float[Tensor, "h w d"]:
+    """Colours over `background`, and coverage as the last channel (d = c + 1).
+
+    Differentiable in whatever `shade` is, and in the vertices (world, metres). Not differentiable: which of two
+    surfaces is in front. `outlines`: blend samples at outlines, which their gradient needs; without, coverage counts
+    samples, as a display does.
+    """
+    width, height = camera.width * SUPERSAMPLING, camera.height * SUPERSAMPLING
+    scale = torch.diag(vertices.new_tensor([SUPERSAMPLING, SUPERSAMPLING, 1.0]))
+    viewmat, K = torch.from_numpy(camera.viewmat).to(vertices), scale @ torch.from_numpy(camera.K).to(vertices)
+    corners = project_vertices(vertices, viewmat, K)
+    drawn = rasterize_mesh(corners, topology.faces, width=width, height=height)
+    triangle = drawn.triangle.long()
+    covered = (triangle.reshape(-1) >= 0).nonzero().squeeze(1)
+    seen = triangle.reshape(-1)[covered]
+    if vertices.requires_grad:
+        a, b, c = (corners.index_select(0, rows) for rows in topology.faces[seen].unbind(1))
+        weights = corner_weights(a, b, c, covered % width, covered // width)
+    else:
+        weights = drawn.barycentric.reshape(-1, 3)[covered].to(vertices)
+    colours = shade(seen, weights)
+    if not outlines and _native(colours, background) and not background.requires_grad and colours.shape[1] == 3:
+        size = {"width": camera.width, "height": camera.height}
+        return ash.native.shading.resolve(colours, covered, background, **size, factor=SUPERSAMPLING)
+    samples = torch.cat([background, background.new_zeros(1)]).expand(height * width, -1)
+    samples = samples.index_put((covered,), torch.cat([colours, torch.ones_like(colours[:, :1])], 1))
+    if outlines:
+        samples = _blend_outlines(samples, corners, topology, triangle, drawn.depth)
+    image = samples.reshape(height, width, -1)
+    steps = range(SUPERSAMPLING)  # Sums of strided views are several times as fast as a mean over two axes.
+    total = torch.stack([image[y::SUPERSAMPLING, x::SUPERSAMPLING] for y in steps for x in steps]).sum(0)
+    return total / SUPERSAMPLING**2
+
+
+def _native(*tensors: Tensor | None) -> bool:
+    """Whether the native kernels take tensors of this kind."""
+    given = [tensor for tensor in tensors if tensor is not None]
+    return all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in given)
+
+
+def blend(
+    values: Float[Tensor, "v c"], corners: Int[Tensor, "n 3"], weights: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n c"]:
+    """Per-corner values at points within their triangles."""
+    a, b, c = (values.index_select(0, rows) for rows in corners.unbind(1))
+    return a * weights[:, :1] + b * weights[:, 1:2] + c * weights[:, 2:]
+
+
+def corner_weights(
+    a: Float[Tensor, "n 3"],
+    b: Float[Tensor, "n 3"],
+    c: Float[Tensor, "n 3"],
+    column: Int[Tensor, " n"],
+    row: Int[Tensor, " n"],
+) -> Float[Tensor, "n 3"]:
+    """Perspective-correct weights of a triangle's corners (homogeneous pixels) at a sample's centre, sum 1."""
+    x, y = (column + 0.5).to(a), (row + 0.5).to(a)
+    volumes = []
+    for p, q in ((b, c), (c, a), (a, b)):
+        (p0, p1, p2), (q0, q1, q2) = p.unbind(1), q.unbind(1)
+        volumes.append((p1 * q2 - p2 * q1) * x + (p2 * q0 - p0 * q2) * y + (p0 * q1 - p1 * q0))
+    total = volumes[0] + volumes[1] + volumes[2]
+    return torch.stack([volume / total for volume in volumes], 1)
+
+
+def _blend_outlines(
+    samples: Float[Tensor, "s d"],
+    corners: Float[Tensor, "v 3"],
+    topology: Topology,
+    triangle: Int[Tensor, "h w"],
+    depth: Float[Tensor, "h w"],
+) -> Float[Tensor, "s d"]:
+    """Where an outline runs between two samples, one of them takes some of the other's colour."""
+    screen = corners[:, :2] / corners[:, 2:]
+    face, edge = _outline_edges(screen.detach(), topology).nonzero(as_tuple=True)
+    ends = torch.stack([topology.faces[face, edge], topology.faces[face, (edge + 1) % 3]], 1)
+    third = topology.faces[face, (edge + 2) % 3]
+    shape = (triangle.shape[1], triangle.shape[0])
+    blended = samples
+    for axis in (0, 1):  # Neighbours in a row, then in a column.
+        found = _crossings(screen, corners[:, 2].detach(), ends, third, axis, shape)
+        kept = _visible(found, triangle.reshape(-1), depth.reshape(-1))
+        inner, outer, share = found.inner[kept], found.outer[kept], found.reach[kept][:, None] - 0.5
+        # The surface reaches beyond the middle: the sample outside takes some of its colour; or it falls short of it.
+        takes = torch.where(share[:, 0] > 0, outer, inner)
+        blended = blended.index_add(0, takes, share * (samples[inner] - samples[outer]))
+    return blended
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Crossings:
+    """Where outline edges run between two neighbouring samples."""
+
+    inner: Int[Tensor, " n"]  # the sample on the surface's side
+    outer: Int[Tensor, " n"]
+    reach: Float[Tensor, " n"]  # how far the surface reaches, from the inner sample (0) to the outer (1)
+    depth: Float[Tensor, " n"]  # of the edge there, metres
+
+
+def _crossings(
+    screen: Float[Tensor, "v 2"],
+    depth: Float[Tensor, " v"],
+    ends: Int[Tensor, "e 2"],
+    third: Int[Tensor, " e"],
+    axis: int,
+    shape: tuple[int, int],
+) -> _Crossings:
+    """Follow every edge through the lines of samples that it crosses. `third`: the face's other corner, inside."""
+    across, still = axis, 1 - axis
+    low, high = screen.detach()[ends, still].aminmax(dim=1)
+    first = (low - 0.5).ceil().long().clamp(min=0)
+    last = ((high - 0.5).ceil().long() - 1).clamp(max=shape[still] - 1)
+    count = (last - first + 1).clamp(min=0)
+    edge = torch.repeat_interleave(torch.arange(len(ends)), count)
+    line = first[edge] + torch.arange(len(edge)) - (count.cumsum(0) - count)[edge]
+    p, q, r = screen[ends[edge, 0]], screen[ends[edge, 1]], screen.detach()[third[edge]]
+    fraction = (line + 0.5 - p[:, still]) / (q[:, still] - p[:, still])
+    at = p[:, across] + fraction * (q[:, across] - p[:, across])
+    left = (at.detach() - 0.5).floor().long()
+    # The third corner lies beyond the edge, seen along the line: the surface is on that side.
+    bend = (r[:, still] - p[:, still]) / (q[:, still] - p[:, still])
+    towards = r[:, across] > (p[:, across] + bend * (q[:, across] - p[:, across])).detach()
+    inside, outside = torch.where(towards, left + 1, left), torch.where(towards, left, left + 1)
+    reach = (at - (inside + 0.5)).abs()
+    nearness = 1 / depth[ends[edge]]
+    edge_depth = 1 / (nearness[:, 0] + fraction.detach() * (nearness[:, 1] - nearness[:, 0]))
+    fits = (left >= 0) & (left + 1 < shape[across])
+    step, stride = (1, shape[0]) if axis == 0 else (shape[0], 1)
+    inner, outer = (line * stride + place * step for place in (inside, outside))
+    return _Crossings(inner=inner[fits], outer=outer[fits], reach=reach[fits], depth=edge_depth[fits])
+
+
+def _visible(found: _Crossings, triangle: Int[Tensor, " s"], depth: Float[Tensor, " s"]) -> Int[Tensor, " n"]:
+    """Crossings that are seen, the nearest one where several lie between the same two samples."""
+    far = torch.where(triangle >= 0, depth, torch.inf).to(found.depth)
+    own = (far[found.inner] - found.depth).abs() < OWN_SURFACE_M
+    seen = own & (far[found.outer] > found.depth) & (triangle[found.inner] != triangle[found.outer])
+    kept = seen.nonzero().squeeze(1)
+    kept = kept[found.depth[kept].argsort(stable=True)]
+    pair = found.inner[kept] * len(triangle) + found.outer[kept]
+    order = pair.argsort(stable=True)
+    first = torch.ones(len(pair), dtype=torch.bool)
+    first[1:] = pair[order][1:] != pair[order][:-1]
+    return kept[order[first]]
+
+
+def _outline_edges(screen: Float[Tensor, "v 2"], topology: Topology) -> Bool[Tensor, "f 3"]:
+    """Edges beyond which the surface ends or turns away from the camera; of the two faces at an edge, one has it."""
+    a, b, c = screen[topology.faces].unbind(1)
+    turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0] > 0
+    other = topology.across > torch.arange(len(turn))[:, None]
+    return (topology.across < 0) | (other & (turn[topology.across] != turn[:, None]))
+
+
+def textured(
+    texture: Float[Tensor, "3 t s"],
+    uvs: Float[Tensor, "u 2"],
+    uv_faces: Int[Tensor, "f 3"],
+    normals: Float[Tensor, "v 3"],
+    faces: Int[Tensor, "f 3"],
+    light: Float[Tensor, "9 3"] | None,
+) -> Shade:
+    """`textured_naive`, by native kernels where only texture, light and weights need gradients."""
+    if not _native(texture, light, uvs, normals) or uvs.requires_grad or normals.requires_grad or len(texture) != 3:
+        return textured_naive(texture, uvs, uv_faces, normals, faces, light)
+    surface = ash.native.shading.Surface(*(t.contiguous() for t in (uvs, uv_faces, normals, faces)))
+
+    def shade(triangles: Tensor, weights: Tensor) -> Tensor:
+        return ash.native.shading.shade(texture, light, triangles, weights, surface)
+
+    return shade
+
+
+def textured_naive(
+    texture: Float[Tensor, "3 t s"],
+    uvs: Float[Tensor, "u 2"],
+    uv_faces: Int[Tensor, "f 3"],
+    normals: Float[Tensor, "v 3"],
+    faces: Int[Tensor, "f 3"],
+    light: Float[Tensor, "9 3"] | None,
+) -> Shade:
+    """Colours of a texture under `light`: coefficients of the exponent that multiplies them."""
+
+    def shade(triangles: Tensor, weights: Tensor) -> Tensor:
+        colours = sample_texture(texture, blend(uvs, uv_faces[triangles], weights))
+        if light is None:
+            return colours
+        across = blend(normals, faces[triangles], weights)
+        return colours * (sh_basis(torch.nn.functional.normalize(across, dim=-1), 2) @ light).exp()
+
+    return shade
+
+
+def sample_texture(texture: Float[Tensor, "c t s"], uvs: Float[Tensor, "n 2"]) -> Float[Tensor, "n c"]:
+    """Bilinear samples at UVs in [0, 1], v up; differentiable in the texture and the UVs."""
+    grid = torch.stack([2 * uvs[:, 0] - 1, 1 - 2 * uvs[:, 1]], -1)[None, None]
+    sampled = torch.nn.functional.grid_sample(texture[None], grid, padding_mode="border", align_corners=False)
+    return sampled[0, :, 0].T

@@ -1,0 +1,159 @@
+"""The ASH avatar, in the paper's order: template, textures, decoders, skinning, splatting. START READING HERE."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ash.capture.dataset import Camera, Pose
+from ash.config import ModelConfig
+from ash.gaussians.gaussians import Gaussians
+from ash.gaussians.splatting import Splatted, splat
+from ash.gaussians.texels import LIGHT_COEFFICIENTS, place, pose
+from ash.protocol import StageClock
+from ash.template.motion import normalised_motion
+from ash.template.refining import Refinement
+from ash.template.template import Template
+from ash.textures import Conditions, TexelLattice, TextureDrawer, build_lattice
+
+Decode = Callable[[Conditions], Tensor]  # to raw parameters [n, o]
+
+
+class AshModel(nn.Module):
+    """The learned part of ASH, and how the stages are joined. `base` and `light` are not in the paper."""
+
+    def __init__(
+        self,
+        config: ModelConfig,
+        template: Template,
+        lattice: TexelLattice,
+        initial: Float[Tensor, "n o"],
+        decoders: nn.Module | None,
+    ) -> None:
+        """`initial`: raw parameters per texel, to which the decoders add theirs; no decoders: they are all there is.
+
+        Decoders map `Conditions` to `[n, o]`; those of the paper are `ash.decoders.Decoders`.
+        """
+        super().__init__()
+        self.config = config
+        self.template = template
+        self.lattice = lattice
+        self.textures: TextureDrawer | None = None
+        if decoders is not None and config.head == "unet":
+            self.textures = TextureDrawer(
+                lattice if config.shuffle == 1 else build_lattice(template.mesh, config.decoded_texels),
+                window=config.window,
+                yaw_normalise=config.yaw_normalise,
+                standardise=config.standardise,
+                fade=config.fade,
+            )
+        self.base = nn.Parameter(initial.clone(), requires_grad=config.base)
+        self.decoders = decoders
+        self.mean_correction: Tensor
+        if config.fade and decoders is not None:
+            self.register_buffer("mean_correction", torch.zeros_like(initial))
+        self.refinement = Refinement(template.mesh) if config.refine else None
+        self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.light else None
+
+    def conditions(self, pose: Pose, clock: StageClock | None = None, threads: int = 1) -> Conditions:
+        """Stg.1 and Stg.2: pose the template, and draw what the decoders see."""
+        with _stage(clock, "stg1"):
+            posed = self.template.pose(pose)
+        with _stage(clock, "stg2"):
+            canonical, normals, transforms = place(self.lattice, posed, threads=threads)
+            textures = self._textures(pose)
+            return Conditions(
+                textures=textures,
+                trust=1.0 if self.textures is None else self.textures.trust(textures),
+                motion=normalised_motion(pose, window=self.config.window),
+                root_translation=torch.from_numpy(pose.dofs[:3]).float(),
+                canonical=canonical,
+                normals=normals,
+                transforms=transforms,
+            )
+
+    def _textures(self, pose: Pose) -> Float[Tensor, "c r r"]:
+        return torch.zeros(0, 1, 1) if self.textures is None else self.textures(self.template, pose)
+
+    def decode(
+        self, conditions: Conditions, *, static: bool = False, decoders: Decode | None = None
+    ) -> Float[Tensor, "n o"]:
+        """Stg.3: raw Gaussian parameters per texel.
+
+        `static` leaves the decoders out (the warm-up of the base); `decoders` are others than the model's own.
+        """
+        decoders = decoders or self.decoders
+        raw = self.base if decoders is None or static else self.base + self._faded(decoders(conditions), conditions)
+        if self.refinement is None:
+            return raw
+        moved = self.lattice.interpolate(self.refinement()) / self.config.offset_unit_m
+        return torch.cat([raw[:, :3] + moved, raw[:, 3:]], 1)
+
+    def _faded(self, added: Float[Tensor, "n o"], conditions: Conditions) -> Float[Tensor, "n o"]:
+        """What was decoded, and the less it is trusted the more of its mean over training frames in its place."""
+        return added if conditions.trust == 1 else self.mean_correction.lerp(added, conditions.trust)
+
+    def fade_to(self, mean: Float[Tensor, "n o"]) -> None:
+        """Set what the decoders' output fades to, far from the training motion."""
+        if self.config.fade:
+            self.mean_correction.copy_(mean)
+
+    def pose(self, raw: Float[Tensor, "n o"], conditions: Conditions, threads: int = 1) -> Gaussians:
+        """Activate the raw parameters and carry them from canonical to posed space (Eq. 5)."""
+        return pose(raw, conditions, self.config, self.light, threads=threads)
+
+    def draw(
+        self, gaussians: Gaussians, cameras: list[Camera], background: Tensor | None, threads: int = 1
+    ) -> Splatted:
+        """Stg.4: splat into cameras of one size."""
+        return splat(
+            gaussians, **views_of(cameras), background=background, dilation=self.config.dilation, threads=threads
+        )
+
+    def forward(
+        self,
+        pose: Pose,
+        camera: Camera,
+        clock: StageClock | None = None,
+        *,
+        decoders: Decode | None = None,
+    ) -> Splatted:
+        """Motion and camera to image: the whole of ASH, over black, on as many threads as torch is given."""
+        gaussians = self.gaussians(pose, clock, decoders=decoders)
+        with _stage(clock, "stg4"):
+            return self.draw(gaussians, [camera], None, torch.get_num_threads())
+
+    def gaussians(self, pose: Pose, clock: StageClock | None = None, *, decoders: Decode | None = None) -> Gaussians:
+        """Motion to posed Gaussians: everything that does not depend on the camera."""
+        threads = torch.get_num_threads()
+        conditions = self.conditions(pose, clock, threads)  # Stg.1, Stg.2
+        with _stage(clock, "stg3"):
+            raw = self.decode(conditions, decoders=decoders)
+        with _stage(clock, "stg4"):
+            return self.pose(raw, conditions, threads)
+
+
+def image_of(drawn: Splatted) -> np.ndarray:
+    """The first view as a method returns it: premultiplied RGBA, float32 `[h, w, 4]`."""
+    height, width = drawn.alpha.shape[1:]
+    image = torch.empty(height, width, 4)
+    image[..., :3], image[..., 3] = drawn.rgb[0], drawn.alpha[0]
+    return image.clamp_(0, 1).numpy()
+
+
+def views_of(cameras: list[Camera]) -> dict[str, Any]:
+    """Cameras of one size as the splatter takes them."""
+    return {
+        "viewmats": torch.stack([torch.from_numpy(c.viewmat).float() for c in cameras]),
+        "Ks": torch.stack([torch.from_numpy(c.K).float() for c in cameras]),
+        "width": cameras[0].width,
+        "height": cameras[0].height,
+    }
+
+
+def _stage(clock: StageClock | None, name: str) -> AbstractContextManager[None]:
+    return clock.stage(name) if clock is not None else nullcontext()

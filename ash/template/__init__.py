@@ -1,0 +1,1 @@
+"""The template mesh: motion, deformation and skinning (Stg.1)."""

@@ -1,0 +1,195 @@
+"""Stg.1: the animatable template. Motion in, deformed and posed template mesh out (ASH Sec. 3.2, appendix A)."""
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+import ash.native.skinning
+from ash.capture.dataset import Capture, Motion, Pose, Skeleton, TemplateMesh, require_pose
+from ash.files import InputError
+from ash.rotations import RigidTransforms
+from ash.template.graph import EmbeddedGraph
+from ash.template.skinning import SkinWeights, dual_quaternion_skinning, forward_kinematics, sparse_skin_weights
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PosedTemplate:
+    """The template in one frame. Vertices are related by posed = transforms.apply(canonical)."""
+
+    canonical: Float[Tensor, "v 3"]  # metres, deformed but unposed
+    transforms: RigidTransforms  # canonical -> world, one per vertex
+    vertices: Float[Tensor, "v 3"]  # metres, world
+    normals: Float[Tensor, "v 3"]  # unit, world
+
+
+@runtime_checkable
+class Deformation(Protocol):
+    """Where the canonical vertices lie in a frame: the part of Stg.1 that is learned, fixed or known."""
+
+    def canonical(self, pose: Pose, transforms: RigidTransforms) -> Float[Tensor, "v 3"]:
+        """Canonical vertices, metres, for this frame of this motion."""
+        ...
+
+
+class RestDeformation:
+    """No deformation: the rest mesh, posed by skinning alone."""
+
+    def __init__(self, mesh: TemplateMesh) -> None:
+        self.rest = torch.from_numpy(mesh.vertices).float()
+
+    def canonical(self, pose: Pose, transforms: RigidTransforms) -> Float[Tensor, "v 3"]:
+        """The rest vertices."""
+        return self.rest
+
+
+class KnownDeformation:
+    """An oracle: posed vertices are known for every frame of one motion, and are brought back to canonical space."""
+
+    def __init__(self, motion: Motion, posed: Float[np.ndarray, "t v 3"]) -> None:
+        self.motion = motion
+        self.posed = torch.from_numpy(posed).float()
+
+    def canonical(self, pose: Pose, transforms: RigidTransforms) -> Float[Tensor, "v 3"]:
+        """Inverse skinning of the known posed vertices.
+
+        Raises:
+            InputError: asked for a frame of another motion than the one that is known.
+        """
+        if not (pose.frame < len(self.posed) and np.array_equal(pose.dofs, self.motion.dofs[pose.frame])):
+            raise InputError(f"frame {pose.frame}: the exact surface is known only for the motion of the capture")
+        return transforms.apply_inverse(self.posed[pose.frame])
+
+
+class PerturbedDeformation:
+    """A deformation with a planted error whose size is exactly known, to chart quality against template error.
+
+    The error is smooth over the surface, and half of its mean square is the same in all frames; the other half is
+    drawn anew for every frame, as the part of a learned template's error that no pose explains. In every frame its
+    root mean square over the vertices is `error_mm`, before and after posing, for posing is rigid per vertex.
+    """
+
+    LENGTH_M = 0.1  # Points nearer than this move alike.
+    WAVES = 64
+
+    def __init__(self, inner: Deformation, mesh: TemplateMesh, *, error_mm: float, seed: int) -> None:
+        self.inner, self.seed, self.amplitude = inner, seed, 1e-3 * error_mm
+        self.rest = mesh.vertices
+        self.static = _of_unit_rms(self._smooth_field(np.random.default_rng([seed, 0])))
+
+    def canonical(self, pose: Pose, transforms: RigidTransforms) -> Float[Tensor, "v 3"]:
+        """The inner deformation's vertices, off by the planted error."""
+        return self.inner.canonical(pose, transforms) + torch.from_numpy(self.error(pose.frame)).float()
+
+    def error(self, frame: int) -> Float[np.ndarray, "v 3"]:
+        """The error of a frame, metres, canonical. The two parts are orthogonal, so that their squares add up."""
+        own = self._smooth_field(np.random.default_rng([self.seed, 1, frame]))
+        own -= self.static * (own * self.static).sum() / (self.static**2).sum()
+        return self.amplitude * np.sqrt(0.5) * (self.static + _of_unit_rms(own))
+
+    def _smooth_field(self, rng: np.random.Generator) -> Float[np.ndarray, "v 3"]:
+        """A Gaussian random field over space, by random Fourier features (Rahimi and Recht 2007)."""
+        waves = rng.standard_normal((3, self.WAVES)) / self.LENGTH_M
+        phases = rng.uniform(0, 2 * np.pi, self.WAVES)
+        return np.cos(self.rest @ waves + phases) @ rng.standard_normal((self.WAVES, 3))
+
+
+def _of_unit_rms(field: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
+    return field / np.sqrt((field**2).sum(1).mean())
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Learned:
+    """How a template was learned."""
+
+    seconds: float  # what it took, whenever that was
+    found: str  # what it settled on, in words
+
+
+class Template:
+    """Poses the template mesh. The last few frames are kept: in playback, they are the next frame's history."""
+
+    KEPT_FRAMES = 4
+
+    def __init__(
+        self,
+        mesh: TemplateMesh,
+        skeleton: Skeleton,
+        deformation: Deformation,
+        *,
+        through: EmbeddedGraph | None = None,
+    ) -> None:
+        """`through`: skin the nodes of this graph only, and blend their transforms, as the release does."""
+        self.mesh = mesh
+        self.skeleton = skeleton
+        self.faces = torch.from_numpy(mesh.faces)
+        self.skin: SkinWeights = sparse_skin_weights(torch.from_numpy(mesh.skin_weights).float())
+        self.links: SkinWeights | None = None
+        if through is not None:
+            self.skin = SkinWeights(joints=self.skin.joints[through.nodes], weights=self.skin.weights[through.nodes])
+            self.links = SkinWeights(joints=through.links, weights=through.weights)
+        self.deformation = deformation
+        self.learned: Learned | None = None
+        self._kept: OrderedDict[tuple[bytes, bytes], PosedTemplate] = OrderedDict()
+
+    def pose(self, pose: Pose) -> PosedTemplate:
+        """The template in one frame of a motion."""
+        require_pose(pose, self.skeleton)
+        window = pose.window(5)
+        key = (pose.motion.dofs[window].tobytes(), np.int64(pose.frame).tobytes())
+        if key not in self._kept:
+            self._kept[key] = self._pose(pose)
+            if len(self._kept) > self.KEPT_FRAMES:
+                self._kept.popitem(last=False)
+        return self._kept[key]
+
+    @torch.no_grad()
+    def _pose(self, pose: Pose) -> PosedTemplate:
+        dofs = torch.from_numpy(pose.dofs)
+        joints = forward_kinematics(self.skeleton, dofs)
+        joints = RigidTransforms(quats=joints.quats.float(), translations=joints.translations.float())
+        transforms = dual_quaternion_skinning(joints, self.skin)
+        if self.links is not None:
+            transforms = dual_quaternion_skinning(transforms, self.links)
+        canonical = self.deformation.canonical(pose, transforms)
+        vertices = transforms.apply(canonical)
+        return PosedTemplate(
+            canonical=canonical,
+            transforms=transforms,
+            vertices=vertices,
+            normals=vertex_normals(vertices, self.faces),
+        )
+
+
+def vertex_normals(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "v 3"]:
+    """Area-weighted mean of the adjacent face normals, unit length. A vertex without area gets the zero vector.
+
+    By a native kernel where no gradient is needed.
+    """
+    if ash.native.skinning.takes(vertices):
+        return ash.native.skinning.vertex_normals(vertices, faces)
+    a, b, c = vertices[faces].unbind(1)
+    doubled_area = torch.linalg.cross(b - a, c - a)
+    summed = torch.zeros_like(vertices).index_add_(0, faces.reshape(-1), doubled_area.repeat_interleave(3, 0))
+    return torch.nn.functional.normalize(summed, dim=-1)
+
+
+def skinned_template(capture: Capture) -> Template:
+    """The template a method gets without learning: skinned, not deformed."""
+    return Template(capture.template, capture.skeleton, RestDeformation(capture.template))
+
+
+def exact_template(
+    capture: Capture, posed: Float[np.ndarray, "t v 3"], *, error_mm: float = 0.0, seed: int = 0
+) -> Template:
+    """The oracle's template: `posed` vertices are exact in every frame of the capture's motion, or off by a planted
+    error of exactly `error_mm` (rms), which is a function of the seed and the frame."""
+    known = KnownDeformation(capture.motion, posed)
+    if error_mm == 0:
+        return Template(capture.template, capture.skeleton, known)
+    off = PerturbedDeformation(known, capture.template, error_mm=error_mm, seed=seed)
+    return Template(capture.template, capture.skeleton, off)

@@ -1,0 +1,1 @@
+"""How the template is learned, once per capture."""

@@ -1,0 +1,98 @@
+"""Which template a method stands on. A learned one is made once per capture, configuration and seed, and kept."""
+
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import safetensors.torch
+import torch
+
+from ash.capture.dataset import Capture
+from ash.capture.formats import read_template_truth
+from ash.checkpoints import load_module, read_safetensors
+from ash.config import TemplateConfig
+from ash.files import hash_of, hash_sources, only_one, write_atomic
+from ash.template.graph import EmbeddedGraph
+from ash.template.template import Deformation, Learned, RestDeformation, Template, exact_template, skinned_template
+from ash.template_learning.deforming import LinearDeformation
+from ash.template_learning.graph_nets import GraphDeformation
+from ash.template_learning.image_tracking import track_images
+from ash.template_learning.regressing import fit_graph, fit_linear
+from ash.template_learning.tracking import Tracked, track_chamfer, track_vertices
+
+Deformer = LinearDeformation | GraphDeformation
+
+
+def template_of(config: TemplateConfig, capture: Capture, *, seed: int) -> Template:
+    """The template that a configuration names; "exact", and supervision "vertices", read the truth: for oracles."""
+    if config.kind == "skinned":
+        return skinned_template(capture)
+    if config.kind == "exact":
+        return exact_template(capture, read_template_truth(capture), error_mm=config.error_mm, seed=seed)
+    return learned_template(config, capture, seed=seed)
+
+
+def learned_template(config: TemplateConfig, capture: Capture, *, seed: int) -> Template:
+    """Learn the template, or read it from the capture's `store` where an equal one lies.
+
+    A capture without a store has it learned anew each time, to the same result. Of two processes that want the same
+    template at once, one learns it and the other waits.
+    """
+    torch.manual_seed(seed)
+    make = LinearDeformation if config.network == "linear" else GraphDeformation
+    deformation: Deformer = make(config, capture.template, capture.skeleton)
+    template = _around(deformation, deformation.graph, config, capture)
+    if capture.store is None:
+        facts = _learn(deformation, config, capture, seed)
+    else:
+        path = capture.store / f"{template_key(config, capture, seed=seed)}.safetensors"
+        with only_one(path):
+            if not path.exists():
+                facts = _learn(deformation, config, capture, seed)
+                write_atomic(path, safetensors.torch.save(_state(deformation), metadata=facts))
+            tensors, facts = read_safetensors(path)
+            load_module(deformation, tensors, path)
+    template.learned = Learned(seconds=float(facts["seconds"]), found=facts["found"])
+    return template
+
+
+def template_key(config: TemplateConfig, capture: Capture, *, seed: int) -> str:
+    """Hash of everything that decides a learned template, sources included."""
+    train = capture.splits["train"]
+    views = {"frames": train.frames, "cameras": train.cameras if config.supervision == "images" else ()}
+    drawn = seed if config.network == "graph" or config.supervision == "images" else 0  # Else nothing is random.
+    decisive = {
+        "capture": capture.identity,
+        "config": asdict(config),
+        "seed": drawn,
+        "sources": hash_sources(Path(__file__).parents[1]),
+    }
+    return hash_of(decisive | views)[:16]
+
+
+def _around(deformation: Deformation, graph: EmbeddedGraph, config: TemplateConfig, capture: Capture) -> Template:
+    through = graph if config.skinning == "graph" else None
+    return Template(capture.template, capture.skeleton, deformation, through=through)
+
+
+def _learn(deformation: Deformer, config: TemplateConfig, capture: Capture, seed: int) -> dict[str, str]:
+    start = time.perf_counter()
+    at_rest = _around(RestDeformation(capture.template), deformation.graph, config, capture)
+    tracked = _track(config, capture, at_rest, deformation.graph, seed)
+    if isinstance(deformation, LinearDeformation):
+        choice = fit_linear(deformation, capture.motion, tracked)
+        found = f"static displacement {'kept' if choice.static else 'refused'}, ridge {choice.ridge:g}"
+    else:
+        step = fit_graph(deformation, capture.motion, tracked, steps=config.steps, seed=seed)
+        found = f"step {step} of {config.steps}"
+    return {"seconds": repr(time.perf_counter() - start), "found": found}
+
+
+def _track(config: TemplateConfig, capture: Capture, at_rest: Template, graph: EmbeddedGraph, seed: int) -> Tracked:
+    if config.supervision == "images":
+        return track_images(capture, at_rest, graph, seed=seed)
+    return (track_vertices if config.supervision == "vertices" else track_chamfer)(capture, at_rest)
+
+
+def _state(deformation: Deformer) -> dict[str, torch.Tensor]:
+    return {name: tensor.contiguous() for name, tensor in deformation.state_dict().items()}

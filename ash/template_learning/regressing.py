@@ -1,0 +1,157 @@
+"""From tracked frames to a template that can be animated: what all frames share, and what the pose explains.
+
+A few dozen frames of a few clips do not pin down a network: Adam on the graph networks explains the training frames
+and is worse than plain skinning on another motion. A ridge regression per node of the embedded graph, on the joints
+near it, explains nearly as much and is better than skinning there; how much of it to trust is measured on training
+sequences that were left out.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ash.capture.dataset import Motion, Pose
+from ash.template.graph import EmbeddedGraph
+from ash.template_learning.deforming import LinearDeformation
+from ash.template_learning.graph_nets import GraphDeformation
+from ash.template_learning.tracking import Tracked
+
+RIDGES = (0.03, 0.1, 0.3, 1.0, 3.0)  # Against squared radians summed over frames; then none of the pose at all.
+FOLDS = 4
+BLEND_RIDGE = 1e-4  # Nodes without vertices of their own stay at zero.
+ROUGHNESS = 0.1  # Weight of the Laplacian of the deformation, against the squared distance.
+LOOK_EVERY = 20  # Steps between two looks at the frames held out.
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Choice:
+    """What the frames left out preferred."""
+
+    ridge: float  # infinite: the pose explains nothing
+    static: bool  # whether what all frames share is kept
+
+
+def fit_linear(deformation: LinearDeformation, motion: Motion, tracked: Tracked) -> Choice:
+    """Fit the static displacement and the nodes' maps, in place."""
+    dofs = torch.stack([deformation.window(Pose(motion, frame)) for frame in tracked.frames]).double()
+    targets = _node_translations(deformation.graph, tracked.shift).double()
+    static = tracked.canonical.mean(0) - deformation.rest
+    choice = _choose(deformation, tracked, dofs, targets, motion.sequence[list(tracked.frames)])
+    with torch.no_grad():
+        if choice.static:
+            deformation.static.copy_(static)
+        if np.isfinite(choice.ridge):
+            mean, maps = _ridge(dofs, targets, deformation.reach.double(), choice.ridge)
+            deformation.mean_window.copy_(mean)
+            deformation.maps.copy_(maps)
+    return choice
+
+
+def _node_translations(graph: EmbeddedGraph, shift: Float[Tensor, "t v 3"]) -> Float[Tensor, "t g 3"]:
+    """Translations of the nodes whose blend is nearest to the shifts of the vertices, least squares."""
+    count, links = graph.links.shape
+    rows = np.repeat(np.arange(count), links)
+    entries = (graph.weights.double().numpy().ravel(), (rows, graph.links.numpy().ravel()))
+    blend = scipy.sparse.csr_matrix(entries, shape=(count, len(graph.nodes)))
+    normal = (blend.T @ blend + BLEND_RIDGE * scipy.sparse.eye(len(graph.nodes))).tocsc()
+    solve = scipy.sparse.linalg.splu(normal).solve
+    return torch.from_numpy(np.stack([solve(blend.T @ frame) for frame in shift.double().numpy()]))
+
+
+def _ridge(
+    dofs: Float[Tensor, "t f"], targets: Float[Tensor, "t g 3"], reach: Float[Tensor, "g f"], ridge: float
+) -> tuple[Float[Tensor, " f"], Float[Tensor, "g f 3"]]:
+    """Per node, the least-squares map from `reach * (dofs - mean)` to its translation; `reach` is part of the map."""
+    mean = dofs.mean(0)
+    centred = dofs - mean
+    gram, moment = centred.T @ centred, torch.einsum("tf,tgo->gfo", centred, targets - targets.mean(0))
+    maps = []
+    for scale, right in zip(reach, moment, strict=True):  # One system at a time: together they would be gigabytes.
+        left = scale[:, None] * gram * scale + ridge * torch.eye(len(scale), dtype=gram.dtype)
+        maps.append(scale[:, None] * torch.cholesky_solve(scale[:, None] * right, torch.linalg.cholesky(left)))
+    return mean, torch.stack(maps)
+
+
+def _choose(
+    deformation: LinearDeformation, tracked: Tracked, dofs: Tensor, targets: Tensor, sequence: np.ndarray
+) -> Choice:
+    """Leave out every fourth sequence (or a quarter of the only one) in turn, and score what it would have got."""
+    folds = held_out_folds(sequence)
+    if len(folds) < 2:
+        return Choice(ridge=np.inf, static=True)
+    nodes = deformation.graph.nodes
+    true = (tracked.canonical - deformation.rest)[:, nodes].double()
+    reach = deformation.reach.double()
+    errors = np.zeros((len(folds), len(RIDGES) + 2))
+    for index, fold in enumerate(folds):
+        seen = ~fold
+        static = true[seen].mean(0)
+        for column, ridge in enumerate(RIDGES):
+            mean, maps = _ridge(dofs[seen], targets[seen], reach, ridge)
+            moved = torch.einsum("tf,gfo->tgo", dofs[fold] - mean, maps)
+            errors[index, column] = _mean_square(true[fold] - static - moved)
+        errors[index, -2] = _mean_square(true[fold] - static)
+        errors[index, -1] = _mean_square(true[fold])
+    best = int(errors.mean(0).argmin())
+    return Choice(ridge=(*RIDGES, np.inf, np.inf)[best], static=best <= len(RIDGES))
+
+
+def held_out_folds(sequence: np.ndarray) -> list[Tensor]:
+    """Which frames each fold leaves out: whole sequences where there are several, else stretches of the only one."""
+    names = np.unique(sequence)
+    if len(names) == 1:
+        parts = np.array_split(np.arange(len(sequence)), min(FOLDS, len(sequence)))
+        return [torch.from_numpy(np.isin(np.arange(len(sequence)), part)) for part in parts if len(parts) > 1]
+    count = min(FOLDS, len(names))
+    return [torch.from_numpy(np.isin(sequence, names[first::count])) for first in range(count)]
+
+
+def _mean_square(error: Tensor) -> float:
+    return float((error**2).sum(-1).mean())
+
+
+def fit_graph(deformation: GraphDeformation, motion: Motion, tracked: Tracked, *, steps: int, seed: int) -> int:
+    """Train the graph networks on the tracked frames, in place; returns the step that was kept.
+
+    The static displacement comes first. One fold of the training frames is held out, and the weights that were best
+    there are kept: those of step 0, which deform nothing, where no training helps.
+    """
+    folds = held_out_folds(motion.sequence[list(tracked.frames)])
+    held = folds[seed % len(folds)] if folds else torch.zeros(len(tracked.frames), dtype=torch.bool)
+    windows = [deformation.window_transforms(Pose(motion, frame)) for frame in tracked.frames]
+    with torch.no_grad():
+        deformation.static.copy_(tracked.canonical[~held].mean(0) - deformation.rest)
+    optimiser = torch.optim.AdamW(deformation.networks(), lr=2e-3, weight_decay=0.1)
+    seen = (~held).nonzero().squeeze(1).tolist()
+    best, kept, kept_step = float("inf"), deformation.state_dict(), 0
+    for step in range(steps + 1):
+        if step % LOOK_EVERY == 0:
+            error = _held_out_error(deformation, windows, tracked, held.nonzero().squeeze(1).tolist())
+            if error < best:
+                best, kept_step = error, step
+                kept = {name: value.clone() for name, value in deformation.state_dict().items()}
+        index = seen[np.random.default_rng([seed, step]).integers(len(seen))]
+        canonical = deformation.deform(windows[index])
+        shift = canonical - tracked.canonical[index]
+        rough = shift - deformation.graph.vertex_adjacency(shift)
+        loss = (shift**2).sum(1).mean() + ROUGHNESS * (rough**2).sum(1).mean()
+        optimiser.zero_grad()
+        (1e6 * loss).backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+    deformation.load_state_dict(kept)
+    return kept_step
+
+
+@torch.no_grad()
+def _held_out_error(
+    deformation: GraphDeformation, windows: Sequence[list], tracked: Tracked, held: Sequence[int]
+) -> float:
+    if not held:
+        return 0.0
+    return float(np.mean([_mean_square(deformation.deform(windows[i]) - tracked.canonical[i]) for i in held]))

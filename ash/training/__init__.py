@@ -1,0 +1,1 @@
+"""Training: batches, losses, the optimiser and the loop."""

@@ -1,0 +1,331 @@
+"""The loop: Adam over anything that draws views differentiably. ASH, its ablations and the mesh baseline all use it.
+
+Sampling is a function of (seed, step), so that a run stopped anywhere and resumed makes the same steps. When it ends is
+decided in `ash.training.stopping`, from scores, which are part of the checkpoint; a limit in seconds counts CPU time.
+"""
+
+import json
+import math
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import safetensors
+import safetensors.torch
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ash.capture.dataset import Camera
+from ash.checkpoints import contiguous_state, load_module, read_safetensors
+from ash.config import TrainingConfig
+from ash.files import write_atomic
+from ash.protocol import TrainingOutcome
+from ash.training.adam import Adam
+from ash.training.batches import Batch, TrainingImages, cut_batch, draw_batch
+from ash.training.losses import l1_ssim_loss, ssim_target
+from ash.training.stopping import Course, Score, decided, gain_of_last_third, is_mark, last_step, rate_factor
+
+LOG_EVERY = 50
+COMPARED_FRAMES = 40  # Training frames, evenly taken, over which the decoders' output is averaged and compared.
+SNAPSHOT_SECONDS = tuple(round(30 * 2 ** (i / 2)) for i in range(13))  # Half a minute to half an hour of CPU time.
+
+
+class Diverged(FloatingPointError):
+    """Training produced NaN or infinity twice. That is a result, and is recorded as one."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """SIGTERM came; the state was saved."""
+
+
+@runtime_checkable
+class Trainable(Protocol):
+    """What the loop needs of a model."""
+
+    @property
+    def module(self) -> torch.nn.Module:
+        """Everything that is saved in a checkpoint."""
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """Adam's groups, each with its own `lr`."""
+
+    def draw_training_views(self, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
+        """Differentiable rgb `[c, h, w, 3]` over `background`, for cameras of one size.
+
+        Raises:
+            FloatingPointError: what the weights make cannot be drawn, because it holds NaN or infinity, say.
+        """
+
+    def corrections(self, frame: int) -> Tensor | None:
+        """What the decoders add to the static parameters in a training frame, in any shape; None without decoders."""
+
+    def fade_to(self, mean: Tensor) -> None:
+        """Take the mean of `corrections` over training frames: far from them it is worth more than decoding."""
+
+
+def fit(
+    learner: Trainable,
+    images: TrainingImages,
+    config: TrainingConfig,
+    *,
+    seed: int,
+    folder: Path,
+    before_start: Callable[[], None] = lambda: None,
+) -> TrainingOutcome:
+    """Train until nothing more is learned or a limit is spent, from the checkpoint in `folder` if there is one.
+
+    `before_start` runs only when training starts afresh (warm-ups that do not render).
+
+    Raises:
+        Diverged: a loss, gradient or weight was not finite, again after one roll-back with half the learning rate.
+        Interrupted: SIGTERM came; the checkpoint holds everything up to the last whole step.
+    """
+    if not config.crop:
+        whole = {
+            (name, frame): (0, 0, images.cameras[name].width, images.cameras[name].height)
+            for name, frame in images.boxes
+        }
+        images = replace(images, boxes=whole)
+    run = _Run(learner, config, images, folder)
+    if not run.resume():
+        before_start()
+        run.average_afresh()
+        if not run.save():
+            raise Diverged("the warm-up left weights that are not finite")
+    with _sigterm() as asked_to_stop:
+        while not run.has_ended or not run.save():  # What cannot be saved was rolled back: on from there.
+            batch = draw_batch(images, config, seed, run.step)
+            run.advance(batch)
+            if asked_to_stop():
+                run.save()
+                raise Interrupted(f"stopped at step {run.step} of {config.steps}; run again to go on")
+            run.save_if_due()
+    return run.finish()
+
+
+def view_loss(images: Float[Tensor, "c h w 3"], batch: Batch, config: TrainingConfig) -> Tensor:
+    """ASH Eq. 9, mean over the views."""
+    losses = [
+        l1_ssim_loss(image, ssim_target(target), l1_weight=config.l1_weight, ssim_weight=config.ssim_weight)
+        for image, target in zip(images, batch.targets, strict=True)
+    ]
+    return torch.stack(losses).mean()
+
+
+class _Run:
+    """The state of one training: model, optimiser, step, CPU seconds, and what was decided so far."""
+
+    def __init__(self, learner: Trainable, config: TrainingConfig, images: TrainingImages, folder: Path) -> None:
+        self.learner, self.config, self.images = learner, config, images
+        groups = learner.parameter_groups()
+        self.optimiser = Adam(groups, eps=1e-15)
+        self.initial_rates = [group["lr"] for group in groups]
+        self.folder, self.path, self.log = folder, folder / "checkpoint.safetensors", folder / "log.jsonl"
+        self.step, self.seconds, self.rate_scale = 0, 0.0, 1.0
+        self.course = Course()
+        self.average: dict[str, Tensor] = {}
+        self.average_afresh()
+        self.started, self.saved_at = time.process_time(), time.monotonic()
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether no step is left."""
+        return self.step >= last_step(self.course, self.config)
+
+    def average_afresh(self) -> None:
+        """Let the average of the weights start from the weights as they are."""
+        if self.config.ema:
+            self.average = {name: value.detach().clone() for name, value in self.learner.module.named_parameters()}
+
+    def advance(self, batch: Batch) -> None:
+        """One step of Adam."""
+        factor = rate_factor(self.course, self.config, step=self.step) * self.rate_scale
+        for group, rate in zip(self.optimiser.groups, self.initial_rates, strict=True):
+            group["lr"] = rate * factor
+        self.optimiser.zero_grad()
+        try:
+            drawn = self.learner.draw_training_views(batch.frame, batch.cameras, batch.background, self.step)
+        except FloatingPointError as error:
+            self._roll_back(str(error))
+            return
+        loss = view_loss(drawn, batch, self.config)
+        loss.backward()  # type: ignore[no-untyped-call]
+        if not (math.isfinite(loss.item()) and self.optimiser.step()):
+            self._roll_back("loss or gradient not finite")
+            return
+        for name, value in self.learner.module.named_parameters() if self.average else ():
+            # A short memory at first, so that the start is soon forgotten.
+            self.average[name].lerp_(value.detach(), 1 - min(self.config.ema, (1 + self.step) / (10 + self.step)))
+        self.step += 1
+        self._look(loss)
+
+    def _look(self, loss: Tensor) -> None:
+        """Score the reserved views where it is time to, decide what follows from it, and write the log."""
+        if self.images.reserved and (is_mark(self.step) or self.has_ended):
+            self._score()
+        self.course = decided(self.course, self.config, step=self.step, seconds=self._elapsed())
+        if self.step % LOG_EVERY == 1 or self.has_ended or self._score_of_this_step() is not None:
+            self._write_log(loss)
+        if self.config.snapshots:
+            self._save_snapshots()
+
+    def _score(self) -> None:
+        with self._as_used():
+            score = Score(step=self.step, psnr=self._reserved_psnr())
+        if math.isfinite(score.psnr):  # Else the next step meets the same, and deals with it.
+            self.course = replace(self.course, scores=(*self.course.scores, score))
+
+    def _score_of_this_step(self) -> float | None:
+        last = self.course.scores[-1:]
+        return last[0].psnr if last and last[0].step == self.step else None
+
+    def _roll_back(self, why: str) -> None:
+        if self.rate_scale < 1:
+            raise Diverged(f"{why} at step {self.step}, again after a roll-back")
+        self.resume()
+        self.rate_scale = 0.5
+
+    def _write_log(self, loss: Tensor) -> None:
+        row = {"step": self.step, "seconds": round(self._elapsed(), 3), "loss": float(loss.detach())}
+        if (psnr := self._score_of_this_step()) is not None:
+            row["train_psnr"] = psnr
+        self._append(row)
+
+    def _append(self, row: dict[str, Any]) -> None:
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        with self.log.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+
+    @torch.no_grad()
+    def _reserved_psnr(self) -> float:
+        """Foreground PSNR of the training views that no step sees, in dB."""
+        errors = []
+        for name, frame in self.images.reserved:
+            view = cut_batch(self.images, frame, [name], torch.zeros(3))
+            try:
+                drawn = self.learner.draw_training_views(frame, view.cameras, view.background, self.step)
+            except FloatingPointError:
+                return math.nan
+            errors.append((drawn.clamp(0, 1) - view.targets)[view.foreground > 0.5].square().flatten())
+        return float(-10 * torch.log10(torch.cat(errors).mean()))
+
+    def _elapsed(self) -> float:
+        return self.seconds + time.process_time() - self.started
+
+    def save_if_due(self) -> None:
+        """Save once per `checkpoint_seconds`."""
+        if time.monotonic() - self.saved_at > self.config.checkpoint_seconds:
+            self.save()
+
+    def save(self) -> bool:
+        """Write the checkpoint atomically. False: the weights are not finite, and were rolled back instead."""
+        if not all(torch.isfinite(value).all() for value in self.learner.module.state_dict().values()):
+            if self.path.exists():
+                self._roll_back("weights not finite")
+            return False
+        tensors = {f"model.{name}": value for name, value in contiguous_state(self.learner.module).items()}
+        for index, moments in enumerate(self.optimiser.moments):
+            for name, value in (moments or {}).items():
+                tensors[f"adam.{index}.{name}"] = value.contiguous()
+        tensors |= {f"average.{name}": value.contiguous() for name, value in self.average.items()}
+        facts = {"step": str(self.step), "seconds": repr(self._elapsed()), "rate_scale": repr(self.rate_scale)}
+        facts["course"] = self.course.to_json()
+        write_atomic(self.path, safetensors.torch.save(tensors, metadata=facts))
+        self.saved_at = time.monotonic()
+        return True
+
+    @contextmanager
+    def _as_used(self) -> Iterator[None]:
+        """With the weights as they would be used: averaged, if they are averaged at all."""
+        own = {name: value.detach().clone() for name, value in self._averaged()}
+        self._take(self.average)
+        try:
+            yield
+        finally:
+            self._take(own)
+
+    def _averaged(self) -> list[tuple[str, torch.nn.Parameter]]:
+        return list(self.learner.module.named_parameters()) if self.average else []
+
+    @torch.no_grad()
+    def _take(self, weights: dict[str, Tensor]) -> None:
+        for name, value in self._averaged():
+            value.copy_(weights[name])
+
+    def _save_snapshots(self) -> None:
+        """Keep the weights as they would be used after so many seconds; what is there already is kept."""
+        for seconds in SNAPSHOT_SECONDS:
+            path = self.folder / "snapshots" / f"{seconds:06d}.safetensors"
+            if seconds <= self._elapsed() and not path.exists():
+                with self._as_used():
+                    self._settle()
+                    write_atomic(path, safetensors.torch.save(contiguous_state(self.learner.module)))
+
+    def finish(self) -> TrainingOutcome:
+        """Give the model the averaged weights, if they were averaged (the checkpoint keeps both), and tell the end."""
+        self._take(self.average)
+        outcome = TrainingOutcome(
+            steps=self.step,
+            seconds=self._elapsed(),
+            ended_by=self.course.ended_by,
+            gained=gain_of_last_third(self.course.scores),
+            reserved_psnr=self._score_of_this_step(),
+            correction_spread=self._settle(),
+        )
+        self._append({"outcome": asdict(outcome)})
+        return outcome
+
+    @torch.no_grad()
+    def _settle(self) -> float | None:
+        """Tell the learner the mean of what its decoders add; how far training frames differ from it, rms."""
+        frames = self.images.frames[:: -(-len(self.images.frames) // COMPARED_FRAMES)]
+        found = [added for frame in frames if (added := self.learner.corrections(frame)) is not None]
+        if not found:
+            return None
+        mean = torch.stack(found).mean(0)
+        self.learner.fade_to(mean)
+        return float(torch.stack([(added - mean).square().mean() for added in found]).mean().sqrt())
+
+    def resume(self) -> bool:
+        """Load the checkpoint, if there is one."""
+        if not self.path.exists():
+            return False
+        tensors, facts = read_safetensors(self.path)
+        load_module(self.learner.module, {n[6:]: t for n, t in tensors.items() if n.startswith("model.")}, self.path)
+        for index, parameter in enumerate(self.optimiser.parameters):
+            if f"adam.{index}.step" not in tensors:  # It never had a gradient.
+                self.optimiser.moments[index] = None
+                continue
+            moments = self.optimiser.moments[index] = Adam.moments_like(parameter)
+            for name, value in moments.items():
+                value.copy_(tensors[f"adam.{index}.{name}"])
+        for name, value in self.average.items():
+            value.copy_(tensors[f"average.{name}"])
+        self.step, self.seconds = int(facts["step"]), float(facts["seconds"])
+        self.rate_scale, self.course = float(facts["rate_scale"]), Course.from_json(facts["course"])
+        self.started = time.process_time()
+        return True
+
+
+class _sigterm:
+    """Turns SIGTERM into a question that the loop asks after each step (main thread only)."""
+
+    def __enter__(self) -> Callable[[], bool]:
+        self.asked = False
+        try:
+            self.previous = signal.signal(signal.SIGTERM, self._ask)
+        except ValueError:  # Not the main thread: signals are somebody else's business.
+            self.previous = None
+        return lambda: self.asked
+
+    def _ask(self, *_: object) -> None:
+        self.asked = True
+
+    def __exit__(self, *_: object) -> None:
+        if self.previous is not None:
+            signal.signal(signal.SIGTERM, self.previous)

@@ -1,0 +1,63 @@
+"""How methods are called and coloured in tables and charts; a method of someone else keeps its own name."""
+
+from dataclasses import dataclass
+from functools import cache
+
+from benchmarks.cell.methods import DECIDING_PACKAGES, ORACLES, methods
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Look:
+    """A method's name for readers and its colour, which reads on white and on dark paper."""
+
+    title: str
+    colour: str
+
+
+LOOKS = {
+    "ash": Look(title="ASH", colour="#2f6fde"),
+    "ash_truth": Look(title="ASH, exact surface", colour="#2f6fde"),
+    "ddc": Look(title="DDC", colour="#dd6b20"),
+    "ddc_truth": Look(title="DDC, exact surface", colour="#dd6b20"),
+    "wo_disp": Look(title="w/o disp.", colour="#2a9d8f"),
+    "wo_mot": Look(title="w/o mot.", colour="#9b59b6"),
+    "res_128": Look(title="half texels", colour="#5b8c2a"),
+    "res_512": Look(title="double texels", colour="#008fb3"),
+    "cams_12": Look(title="12 of 120 cameras", colour="#a0522d"),
+    "cams_30": Look(title="30 of 120 cameras", colour="#b8860b"),
+    "cams_60": Look(title="60 of 120 cameras", colour="#7a869a"),
+    "ash_frugal": Look(title="ASH, frugal", colour="#2a9d8f"),
+    "mlp": Look(title="w/ MLP", colour="#c2415c"),
+    "mlp_time": Look(title="w/ MLP, equal time", colour="#c2415c"),
+    "smpl": Look(title="bare-body template", colour="#8d6e63"),
+    "static": Look(title="static", colour="#7a869a"),
+    "nearest": Look(title="nearest image", colour="#7a869a"),
+    "oracle_texture": Look(title="best texture, exact mesh", colour="#b8860b"),
+}
+SPLIT_WORDS = {"novel_view": "held-out views", "novel_pose": "held-out motion"}  # In sentences; tables have titles.
+SPARE_COLOURS = ("#b8860b", "#c2415c", "#5b8c2a", "#7a869a", "#008fb3", "#a0522d")
+EXACT = {"ash": "ash_truth", "ddc": "ddc_truth"}  # A method and the same method given the exact surface.
+
+
+def look_of(method: str) -> Look:
+    """The look of a method; unknown ones get a colour by the sum of their letters, the same in every report."""
+    if method in LOOKS:
+        return LOOKS[method]
+    name = method.rpartition(":")[2]
+    title = name.replace("_", " ") if name != method else method  # A factory's name, where it came by its path.
+    return Look(title=title, colour=SPARE_COLOURS[sum(method.encode()) % len(SPARE_COLOURS)])
+
+
+def is_oracle(method: str) -> bool:
+    """Whether the method was shown the truth, and so is a bound and no competitor."""
+    return method in ORACLES
+
+
+def is_ours(method: str) -> bool:
+    """Whether the method comes with the suite; a user's own stand first in reports."""
+    return (method.partition(".")[0] in DECIDING_PACKAGES) if ":" in method else method in _installed_ours()
+
+
+@cache
+def _installed_ours() -> frozenset[str]:
+    return frozenset(name for name, method in methods().items() if method.is_ours)

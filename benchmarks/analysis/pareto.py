@@ -1,0 +1,88 @@
+"""Accuracy against cost: who is beaten by nobody, how much the whole field covers, and what would have sufficed.
+
+Qualities are larger-is-better (dB), costs smaller-is-better (ms). Oracles take no part.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.analysis.statistics import welch
+
+SUFFICIENT_DB = 0.5  # A loss that readers of images do not see, and three seeds can establish.
+REFERENCE_MS, REFERENCE_DB = 1000.0, 10.0  # The hypervolume's fixed corner: a frame per second of noise.
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Candidate:
+    """A method with its quality for each seed and its cost."""
+
+    name: str
+    qualities: tuple[float, ...]
+    cost: float
+
+    @property
+    def quality(self) -> float:
+        """Mean over seeds."""
+        return float(np.mean(self.qualities))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Sufficient:
+    """The cheapest candidate that is not inferior to the best, and the bound of its loss that says so."""
+
+    name: str
+    best: str
+    loss_bound_db: float
+
+
+def front(candidates: Sequence[Candidate]) -> tuple[str, ...]:
+    """Names of those that no other beats in both quality and cost, cheapest first."""
+    kept = [c for c in candidates if not any(_dominates(other, c) for other in candidates)]
+    return tuple(c.name for c in sorted(kept, key=lambda c: c.cost))
+
+
+def hypervolume(candidates: Sequence[Candidate]) -> float:
+    """Area that the front covers up to the fixed corner, in dB times decades of time."""
+    area, reached = 0.0, REFERENCE_DB
+    for candidate in sorted(candidates, key=lambda c: c.cost):
+        if candidate.cost < REFERENCE_MS and candidate.quality > reached:
+            area += math.log10(REFERENCE_MS / candidate.cost) * (candidate.quality - reached)
+            reached = candidate.quality
+    return area
+
+
+def hypervolume_interval(
+    candidates: Sequence[Candidate], *, rng: np.random.Generator, resamples: int = 1000
+) -> tuple[float, float]:
+    """95 % interval of the hypervolume by drawing seeds anew."""
+    areas = []
+    for _ in range(resamples):
+        drawn = [
+            Candidate(name=c.name, cost=c.cost, qualities=tuple(rng.choice(c.qualities, len(c.qualities)).tolist()))
+            for c in candidates
+        ]
+        areas.append(hypervolume(drawn))
+    low, high = np.quantile(areas, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def smallest_sufficient(candidates: Sequence[Candidate], *, margin: float = SUFFICIENT_DB) -> Sufficient | None:
+    """The cheapest candidate whose loss to the best has an upper 95 % bound (one-sided) below the margin.
+
+    None with fewer than two seeds, for one seed bounds nothing. The best itself loses nothing and always qualifies.
+    """
+    if not candidates or any(len(c.qualities) < 2 for c in candidates):
+        return None
+    best = max(candidates, key=lambda c: c.quality)
+    for candidate in sorted(candidates, key=lambda c: c.cost):
+        bound = 0.0 if candidate is best else welch(best.qualities, candidate.qualities, level=0.90).high
+        if bound < margin:
+            return Sufficient(name=candidate.name, best=best.name, loss_bound_db=bound)
+    return None
+
+
+def _dominates(a: Candidate, b: Candidate) -> bool:
+    return a.quality >= b.quality and a.cost <= b.cost and (a.quality > b.quality or a.cost < b.cost)

@@ -1,0 +1,148 @@
+"""The statistics of the suite: SciPy's, read as differences with intervals, and what SciPy lacks.
+
+The unit of evidence is the seed, not the image: images of one training share its luck, so a test over images alone
+cries wolf in a third of all cases. Verdicts come from seed means; the hierarchical bootstrap is reported beside them.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+from scipy.special import nctdtrinc
+
+LEVEL = 0.95
+EXACT = 1e-12  # A spread of this share of the difference is rounding.
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Interval:
+    """A mean with its confidence interval; for a single value the interval is unknown (None)."""
+
+    mean: float
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Difference:
+    """Mean of `a` minus mean of `b`: interval, two-sided p, and size in pooled standard deviations (Cohen's d)."""
+
+    mean: float
+    low: float
+    high: float
+    p: float
+    effect: float
+    detectable: float  # the smallest difference that this design finds with 80 % power
+
+
+def mean_interval(values: Sequence[float], *, level: float = LEVEL) -> Interval:
+    """Student's interval of a mean."""
+    mean = float(np.mean(values))
+    if len(values) < 2:
+        return Interval(mean=mean, low=None, high=None)
+    half = float(stats.t.ppf((1 + level) / 2, len(values) - 1) * stats.sem(values))
+    return Interval(mean=mean, low=mean - half, high=mean + half)
+
+
+def welch(a: Sequence[float], b: Sequence[float], *, level: float = LEVEL) -> Difference:
+    """Independent samples of unequal variance: different methods, each with its own seeds.
+
+    Raises:
+        ValueError: a sample has fewer than two values.
+    """
+    _require(a, b)
+    spread = math.sqrt((float(np.var(a, ddof=1)) + float(np.var(b, ddof=1))) / 2)
+    return _difference(float(np.mean(a) - np.mean(b)), spread, lambda: stats.ttest_ind(a, b, equal_var=False), level)
+
+
+def paired(a: Sequence[float], b: Sequence[float], *, level: float = LEVEL) -> Difference:
+    """Paired samples: two methods on the same captures.
+
+    Raises:
+        ValueError: the samples differ in length, or have fewer than two values.
+    """
+    _require(a, b)
+    if len(a) != len(b):
+        raise ValueError(f"expected pairs, got {len(a)} and {len(b)} values")
+    differences = np.subtract(a, b)
+    spread = float(np.std(differences, ddof=1))
+    return _difference(float(differences.mean()), spread, lambda: stats.ttest_rel(a, b), level)
+
+
+def hierarchical_bootstrap(
+    a: np.ndarray, b: np.ndarray, *, rng: np.random.Generator, resamples: int = 2000, level: float = LEVEL
+) -> tuple[float, float]:
+    """Interval of mean(a) - mean(b) for scores `[seeds, images]`: seeds are drawn anew, and images, the same for both.
+
+    With three seeds it is a little too narrow (8-11 % false alarms at nominal 5): report it, do not gate on it.
+    """
+    if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1]:
+        raise ValueError(f"expected [seeds, images] with the same images, got {a.shape} and {b.shape}")
+    means = np.empty(resamples)
+    for index in range(resamples):
+        images = rng.integers(a.shape[1], size=a.shape[1])
+        drawn = [scores[rng.integers(len(scores), size=len(scores))][:, images].mean() for scores in (a, b)]
+        means[index] = drawn[0] - drawn[1]
+    tail = (1 - level) / 2
+    low, high = np.quantile(means, [tail, 1 - tail])
+    return float(low), float(high)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Adjusted p values that keep the chance of any false alarm among all comparisons at the level (Holm 1979)."""
+    order = np.argsort(p_values)
+    adjusted = np.empty(len(p_values))
+    running = 0.0
+    for rank, index in enumerate(order):
+        running = max(running, min(1.0, (len(p_values) - rank) * p_values[index]))
+        adjusted[index] = running
+    return [float(p) for p in adjusted]
+
+
+def wilson(failures: int, trials: int) -> tuple[float, float]:
+    """95 % interval of a rate (Wilson 1927): honest also for 0 of 5."""
+    if not 0 <= failures <= trials or trials == 0:
+        raise ValueError(f"expected 0 <= failures <= trials and a trial, got {failures} of {trials}")
+    interval = stats.binomtest(failures, trials).proportion_ci(LEVEL, method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def kendall(a: Sequence[float], b: Sequence[float]) -> float:
+    """Kendall's tau: the share of pairs in the same order minus that in the opposite one; ties count as neither.
+
+    That is tau-a, which says what readers of a ranking ask; SciPy has tau-b and tau-c, which forgive ties.
+    """
+    signs = [np.sign(np.subtract.outer(values, values)) for values in (a, b)]
+    return float((signs[0] * signs[1]).sum() / (len(a) * (len(a) - 1)))
+
+
+def _difference(mean: float, spread: float, test: Callable[[], Any], level: float) -> Difference:
+    """The test's result as a difference; samples without any spread need no test: what differs, differs."""
+    if spread <= EXACT * abs(mean) or spread == 0:
+        effect = 0.0 if mean == 0 else math.copysign(math.inf, mean)
+        return Difference(mean=mean, low=mean, high=mean, p=float(mean == 0), effect=effect, detectable=0.0)
+    found = test()
+    interval = found.confidence_interval(level)
+    quantile = float(stats.t.ppf((1 + level) / 2, found.df))
+    error = (float(interval.high) - float(interval.low)) / (2 * quantile)
+    return Difference(
+        mean=mean,
+        low=float(interval.low),
+        high=float(interval.high),
+        p=float(found.pvalue),
+        effect=mean / spread,
+        detectable=noncentrality(float(found.df), quantile) * error,
+    )
+
+
+def noncentrality(freedom: float, quantile: float, power: float = 0.8) -> float:
+    """The true difference, in standard errors, at which a t test finds it with the given power."""
+    return float(nctdtrinc(freedom, 1 - power, quantile))
+
+
+def _require(a: Sequence[float], b: Sequence[float]) -> None:
+    if len(a) < 2 or len(b) < 2:
+        raise ValueError(f"expected at least two seeds on each side, got {len(a)} and {len(b)}")

@@ -1,0 +1,1 @@
+"""One cell: what decides its outcome lives here, and is hashed together."""

@@ -1,0 +1,283 @@
+"""A cell: one method trained once on one capture, and everything that was found out about it.
+
+A cell lives in a folder of its own, named by the hash of what went in:
+
+    config.json     what goes in: method, preset, seed, capture and its identity, code, protocol
+    log.jsonl       the method's training log, one object per line
+    output.log      what the process printed, bounded
+    model.safetensors   the trained method
+    work/           the method's own folder, all that it can write to: its checkpoints
+    input/          the training part of the capture, all that the method sees; only while it runs
+    images/SPLIT/CAM/FRAME.png   predictions, RGBA uint8, colour on black: `rescore` reads them
+    result.json     what came out; written last, atomically: where it exists, the cell is finished
+"""
+
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ash.capture.dataset import Capture
+from ash.capture.typed import from_json
+from ash.files import InputError, hash_of, read_image, read_json, require_plain, write_json
+from ash.protocol import TrainingOutcome
+from benchmarks.cell.metrics import IMAGE_SPLITS, METRICS, PROTOCOL, VIEW_SCORES
+from benchmarks.cell.views import View
+
+Status = Literal["done", "crashed", "diverged", "timeout", "out of memory"]
+VARIED = ("factory", "changes")
+STATUSES = ("done", "crashed", "diverged", "timeout", "out of memory")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CellConfig:
+    """What goes into a cell. Equal configs give equal cells, so their hash is the cell's name."""
+
+    scene: str
+    size: str
+    capture_seed: int
+    capture: str  # identity of the capture: SHA-256 of its manifest
+    method: str
+    preset: str
+    seed: int
+    code: str  # SHA-256 over the sources that decide the outcome
+    truth: str = ""  # what the capture shows, on any machine: hash of scene, generator and perturbation
+    axis: str = ""  # the stress axis along which the capture is spoilt; none: the clean capture
+    severity: float = 0.0
+    factory: str = ""  # an entry point or `package.module:factory`, where the row `method` has another name than that
+    changes: dict[str, Any] = field(default_factory=dict)  # in the method's configuration: dotted key to new value
+    protocol: str = PROTOCOL
+
+    @property
+    def key(self) -> str:
+        """The cell's name. Cells from before methods could be varied keep theirs."""
+        return hash_of({name: value for name, value in asdict(self).items() if name not in VARIED or value})[:16]
+
+    @property
+    def source(self) -> str:
+        """The entry point or `package.module:factory` that makes the avatar."""
+        return self.factory or self.method
+
+    @property
+    def place(self) -> str:
+        """The scene, and how its capture is spoilt."""
+        return f"{self.scene} {self.axis}={self.severity:g}" if self.axis else self.scene
+
+    @property
+    def title(self) -> str:
+        """For progress lines and errors."""
+        return f"{self.place} · {self.method} · seed {self.seed}"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ViewScore:
+    """Scores of one image. `scores` maps (region, metric) to its value."""
+
+    split: str
+    camera: str
+    frame: int
+    prediction: str  # SHA-256 of the pixels
+    scores: dict[tuple[str, str], float]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Summary:
+    """One row of results.csv, without the columns that say which cell it is."""
+
+    split: str
+    region: str
+    metric: str
+    value: float
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CurvePoint:
+    """One line of the training log: seconds of training, and the loss or PSNR (dB) at that time."""
+
+    seconds: float
+    loss: float | None
+    psnr: float | None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Snapshot:
+    """Foreground PSNR, dB, that the avatar would have had after so many seconds of training, on one split."""
+
+    seconds: float
+    split: str
+    psnr: float
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Timing:
+    """Milliseconds per timed frame, whole and by stage; `reference_ms` times a fixed workload between the frames."""
+
+    frame_ms: tuple[float, ...]
+    stage_ms: dict[str, tuple[float, ...]]
+    reference_ms: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Provenance:
+    """Where and with what a result was made."""
+
+    commit: str
+    machine: dict[str, str]
+    versions: dict[str, str]
+    wall_s: float
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CellResult:
+    """What came out of a cell. A failed cell has the worst score in every row, never a missing row."""
+
+    config: CellConfig
+    status: Status
+    reason: str = ""
+    summary: tuple[Summary, ...] = ()
+    views: tuple[ViewScore, ...] = ()
+    timing: Timing | None = None
+    curve: tuple[CurvePoint, ...] = ()
+    training: TrainingOutcome | None = None  # as the method tells it
+    snapshots: tuple[Snapshot, ...] = ()
+    provenance: Provenance | None = None
+    isolated: bool | None = None  # whether the method had a room of its own; None: an oracle, a failure, an old result
+
+    def value(self, split: str, region: str, metric: str) -> float | None:
+        """One number of the summary."""
+        found = [row.value for row in self.summary if (row.split, row.region, row.metric) == (split, region, metric)]
+        return found[0] if found else None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Cell:
+    """A config and where it lives: the cell's own folder, and the folder of its capture on this machine."""
+
+    config: CellConfig
+    folder: Path
+    capture_folder: Path = field(default=Path())
+
+
+def failed_result(config: CellConfig, status: Status, reason: str, provenance: Provenance | None = None) -> CellResult:
+    """The result of a cell that did not come through: the worst of every quality, never a missing row."""
+    qualities = [(split, region, metric) for split in IMAGE_SPLITS for region, metric in VIEW_SCORES]
+    rows = [Summary(split=s, region=r, metric=m, value=METRICS[m].worst) for s, r, m in qualities]
+    rows.append(Summary(split="speed", region="", metric="frame_ms", value=METRICS["frame_ms"].worst))
+    rows.append(Summary(split="speed", region="", metric="failed", value=1.0))
+    return CellResult(config=config, status=status, reason=reason, summary=tuple(rows), provenance=provenance)
+
+
+def write_config(cell: Cell) -> None:
+    """Write `config.json`; the capture's folder is noted beside the config, for it is no part of the identity."""
+    content = {
+        "config": asdict(cell.config),
+        "key": cell.config.key,
+        "capture_folder": str(cell.capture_folder.resolve()),
+    }
+    write_json(cell.folder / "config.json", content)
+
+
+def read_cell(folder: Path) -> Cell:
+    """Read `config.json` of a cell's folder."""
+    path = folder / "config.json"
+    content = read_json(path)
+    try:
+        config: CellConfig = from_json(CellConfig, content["config"], place="config")
+        _require_names(config)
+        if config.key != content["key"]:
+            raise ValueError("its key does not fit its content")
+        return Cell(config=config, folder=folder, capture_folder=Path(content["capture_folder"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: expected the config of a cell ({error})") from error
+
+
+def _require_names(config: CellConfig) -> None:
+    """What becomes part of a path or a table is a plain name."""
+    for name in ("scene", "size", "preset", "axis", "method", "factory"):
+        require_plain(getattr(config, name), what=name, may_be_empty=name in ("axis", "factory"))
+
+
+def write_result(folder: Path, result: CellResult) -> None:
+    """Write `result.json`. NaN and infinity are refused by the writer."""
+    content = asdict(result)
+    for view in content["views"]:
+        view["scores"] = {f"{region}/{metric}": value for (region, metric), value in view["scores"].items()}
+    write_json(folder / "result.json", content)
+
+
+def read_result(folder: Path) -> CellResult | None:
+    """Read `result.json`, or None where the cell is unfinished.
+
+    Raises:
+        InputError: the file is damaged or of another protocol version; nothing is overwritten.
+    """
+    path = folder / "result.json"
+    if not path.exists():
+        return None
+    try:
+        content = read_json(path)
+        result = _result_from(content)
+    except InputError as error:
+        raise InputError(f"{error}; remove {folder} to run that cell again") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        problem = f"{path}: expected a complete result ({type(error).__name__}: {error})"
+        raise InputError(f"{problem}; remove {folder} to run that cell again") from error
+    if result.config.protocol != PROTOCOL:
+        raise InputError(f"{path}: expected protocol {PROTOCOL}, got {result.config.protocol}; results do not mix")
+    return result
+
+
+def result_of(cell: Cell) -> CellResult | None:
+    """The result of a cell, or None where it is unfinished.
+
+    Raises:
+        InputError: it is damaged, of another protocol version, or another cell's: copied or moved there.
+    """
+    result = read_result(cell.folder)
+    # A report may call a scene by another name; the capture's identity tells it apart all the same.
+    if result is not None and replace(result.config, scene=cell.config.scene).key != cell.config.key:
+        raise InputError(
+            f"{cell.folder}/result.json: expected the result of {cell.config.title}, got that of "
+            f"{result.config.title} ({result.config.key}); remove {cell.folder} to run that cell again"
+        )
+    return result
+
+
+def _result_from(content: Any) -> CellResult:
+    views = [dict(view) for view in content["views"]]
+    scores = [
+        from_json(dict[str, float], view.pop("scores"), place=f"views[{k}].scores") for k, view in enumerate(views)
+    ]
+    result: CellResult = from_json(CellResult, content | {"views": [view | {"scores": {}} for view in views]})
+    _require_names(result.config)
+    for view in result.views:
+        require_plain(view.split, what="split")
+        require_plain(view.camera, what="camera")
+    whole = [replace(view, scores=_by_region(s)) for view, s in zip(result.views, scores, strict=True)]
+    return replace(result, views=tuple(whole))
+
+
+def _by_region(scores: dict[str, float]) -> dict[tuple[str, str], float]:
+    """Scores by region and metric, from names such as `foreground/psnr`."""
+    pairs = [(name.split("/"), value) for name, value in scores.items()]
+    return {(region, metric): value for (region, metric), value in pairs}
+
+
+CHECKPOINT = "model.safetensors"
+
+
+def is_trained(cell: Cell) -> bool:
+    """Whether there is an avatar to load."""
+    return (cell.folder / CHECKPOINT).exists()
+
+
+def prediction_path(folder: Path, view: View) -> Path:
+    """Where the prediction of a view lies."""
+    return folder / "images" / view.split / view.camera / f"{view.frame:06d}.png"
+
+
+def stored_prediction(cell: Cell, capture: Capture, view: View) -> np.ndarray:
+    """The prediction of a view as it was scored, uint8 RGBA on black."""
+    camera = capture.cameras[view.camera]
+    return read_image(prediction_path(cell.folder, view), shape=(camera.height, camera.width, 4))

@@ -1,0 +1,292 @@
+"""A trained method on held-out views and motion: drawn, stored, scored, its cost measured."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from hashlib import sha256
+
+import numpy as np
+
+from ash.capture.dataset import Capture, pixels_path, surface_path
+from ash.capture.formats import read_template_truth
+from ash.files import read_arrays, write_image
+from ash.protocol import TrainingOutcome
+from benchmarks.cell import metrics
+from benchmarks.cell.cells import (
+    Cell,
+    CellResult,
+    CurvePoint,
+    Snapshot,
+    Summary,
+    Timing,
+    ViewScore,
+    prediction_path,
+    stored_prediction,
+)
+from benchmarks.cell.curves import read_curve, seconds_to_settle
+from benchmarks.cell.host import EXAM, WORK, Described, Host, Timed, require_honest_clock
+from benchmarks.cell.metrics import IMAGE_SPLITS, VIEW_SCORES
+from benchmarks.cell.timing import TIMED_FRAMES, WARM_UP_FRAMES, reference_workload_ms
+from benchmarks.cell.views import View, evaluated_views, playback
+from benchmarks.cell.weights import weights_file
+
+GEOMETRY_FRAMES = 4
+MOST_SNAPSHOTS = 100
+
+
+GEOMETRY_POINTS = 4096  # Gaussians whose distance to the surface is measured, evenly taken; the mean wants no more.
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PosedFrames:
+    """What an avatar says about its geometry: per frame, template vertices and centres of Gaussians, metres."""
+
+    vertices: dict[int, np.ndarray]
+    means: dict[int, np.ndarray]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Drawn:
+    """What a trained method left besides its stored pictures, when its process ended."""
+
+    views: tuple[View, ...]
+    timing: Timing
+    geometry: PosedFrames | None
+    described: Described
+    peak_mb: float
+    snapshots: tuple[Snapshot, ...]
+    isolated: bool
+
+
+def draw_all(cell: Cell, capture: Capture, host: Host) -> Drawn:
+    """Let the method draw every view that is scored, and measure it; nothing is compared with truth yet."""
+    views = evaluated_views(capture)
+    host.meet(cell.folder.resolve() / EXAM, capture)
+    for view in views:
+        write_image(prediction_path(cell.folder, view), metrics.quantise(host.draw(view, capture.cameras[view.camera])))
+    timing = _timing(host, playback(views))
+    described = host.describe()
+    return Drawn(
+        views=views,
+        timing=timing,
+        geometry=_pose_geometry(host, described, views),
+        described=described,
+        peak_mb=host.peak_memory_mb(),
+        snapshots=_snapshots(cell, capture, host, views),
+        isolated=host.isolated,
+    )
+
+
+def judge(
+    cell: Cell, capture: Capture, drawn: Drawn, train_s: float, training: TrainingOutcome | None = None
+) -> CellResult:
+    """Score the stored pictures, when the method's process is gone.
+
+    `training`: how training ended, where the avatar was loaded and does not know.
+    """
+    training = drawn.described.training or training
+    scored = [_score(cell, capture, view, stored_prediction(cell, capture, view)) for view in drawn.views]
+    curve = read_curve(cell.folder / "log.jsonl")
+    summary = (
+        _image_summary(scored)
+        + _gap_summary(scored)
+        + _flicker_summary(cell, capture, scored)
+        + _geometry_summary(capture, drawn.geometry, drawn.views)
+        + _cost_summary(drawn, max([train_s, *(point.seconds for point in curve)]))
+        + _training_summary(training, curve)
+    )
+    return CellResult(
+        config=cell.config,
+        status="done",
+        summary=summary,
+        views=tuple(scored),
+        timing=drawn.timing,
+        curve=curve,
+        training=training,
+        snapshots=drawn.snapshots,
+        isolated=drawn.isolated,
+    )
+
+
+def _snapshots(cell: Cell, capture: Capture, host: Host, views: tuple[View, ...]) -> tuple[Snapshot, ...]:
+    """What the avatar would have scored had training ended earlier, of a method that left its weights of then."""
+    found = []
+    for path in sorted((cell.folder / WORK / "snapshots").glob("*.safetensors"))[:MOST_SNAPSHOTS]:
+        if not path.stem.isdecimal() or len(path.stem) > 9:
+            continue
+        host.load(f"snapshots/{path.name}")
+        drawn = [metrics.quantise(host.draw(view, capture.cameras[view.camera])) for view in views]
+        for split in IMAGE_SPLITS:
+            scores = [_psnr(capture, v, image) for v, image in zip(views, drawn, strict=True) if v.split == split]
+            if scores:
+                found.append(Snapshot(seconds=float(path.stem), split=split, psnr=float(np.mean(scores))))
+    return tuple(found)
+
+
+def _psnr(capture: Capture, view: View, prediction: np.ndarray) -> float:
+    truth = metrics.on_black(capture.image(view.camera, view.frame))
+    mask = metrics.foreground(truth)
+    return metrics.psnr(prediction[..., :3], truth[..., :3], mask if mask.any() else None)
+
+
+def _timing(host: Host, views: list[View]) -> Timing:
+    """The method's own milliseconds, which ours outside must bear out."""
+    frames: list[Timed] = []
+    references = []
+    for index in range(WARM_UP_FRAMES + TIMED_FRAMES):
+        frames.append(host.time(views[index % len(views)]))
+        references.append(reference_workload_ms())
+    timed = frames[WARM_UP_FRAMES:]
+    require_honest_clock(timed)
+    stages: dict[str, tuple[float, ...]] = {
+        name: tuple(frame.stage_ms[name] for frame in timed if name in frame.stage_ms)
+        for name in sorted({name for frame in timed for name in frame.stage_ms})
+    }
+    return Timing(
+        frame_ms=tuple(frame.inside_ms for frame in timed),
+        stage_ms=stages,
+        reference_ms=tuple(references[WARM_UP_FRAMES:]),
+    )
+
+
+def _score(cell: Cell, capture: Capture, view: View, prediction: np.ndarray) -> ViewScore:
+    truth = metrics.on_black(capture.image(view.camera, view.frame))
+    scores = metrics.score_view(prediction, truth)
+    perceptual = _perceptual()
+    if perceptual is not None:
+        scores["full", "lpips"] = perceptual(prediction[..., :3], truth[..., :3])
+    noise = pixels_path(capture.folder, view.camera, view.frame)
+    if noise.exists():
+        variance = read_arrays(noise, expected=("noise",))["noise"]
+        scores["foreground", "noise_ceiling"] = metrics.noise_ceiling(variance, metrics.foreground(truth))
+    digest = sha256(prediction.tobytes()).hexdigest()
+    return ViewScore(split=view.split, camera=view.camera, frame=view.frame, prediction=digest, scores=scores)
+
+
+@cache
+def _perceptual() -> Callable[[np.ndarray, np.ndarray], float] | None:
+    """LPIPS, where the user gave its weights."""
+    path = weights_file()
+    if path is None:
+        return None
+    from benchmarks.cell.lpips import Lpips
+
+    return Lpips(path)
+
+
+def _image_summary(scored: list[ViewScore]) -> tuple[Summary, ...]:
+    """Means over the images of each split."""
+    rows = []
+    for split in IMAGE_SPLITS:
+        views = [view for view in scored if view.split == split]
+        for region, metric in (*VIEW_SCORES, ("full", "lpips"), ("foreground", "noise_ceiling")):
+            values = [view.scores[region, metric] for view in views if (region, metric) in view.scores]
+            if values:
+                rows.append(Summary(split=split, region=region, metric=metric, value=float(np.mean(values))))
+    return tuple(rows)
+
+
+def _gap_summary(scored: list[ViewScore]) -> tuple[Summary, ...]:
+    """By how much training views are better than the views of each other split: what was learned by heart."""
+    means = {
+        row.split: row.value for row in _image_summary(scored) if (row.region, row.metric) == ("foreground", "psnr")
+    }
+    return tuple(
+        Summary(split=split, region="foreground", metric="gap", value=means["train_view"] - value)
+        for split, value in means.items()
+        if split != "train_view" and "train_view" in means
+    )
+
+
+def _training_summary(training: TrainingOutcome | None, curve: tuple[CurvePoint, ...]) -> tuple[Summary, ...]:
+    """How training ended; the seconds to the plateau where there is one."""
+    if training is None:
+        return ()
+    reached, settled = training.ended_by == "plateau", seconds_to_settle(curve)
+    rows = {"steps": float(training.steps), "plateau": float(reached)}
+    if training.search_seconds:
+        rows["search_s"] = training.search_seconds
+    if reached and settled is not None:
+        rows["settled_s"] = settled
+    return tuple(Summary(split="speed", region="", metric=name, value=value) for name, value in rows.items())
+
+
+def _flicker_summary(cell: Cell, capture: Capture, scored: list[ViewScore]) -> tuple[Summary, ...]:
+    """Flicker over the test motion: the only split whose scored frames follow each other."""
+    views = [view for view in scored if view.split == "novel_pose"]
+    values = []
+    for camera in sorted({view.camera for view in views}):
+        frames = sorted(view.frame for view in views if view.camera == camera)
+        predicted = [
+            stored_prediction(cell, capture, View(split="novel_pose", camera=camera, frame=frame)) for frame in frames
+        ]
+        values.append(metrics.flicker(predicted, [metrics.on_black(capture.image(camera, frame)) for frame in frames]))
+    if not values:
+        return ()
+    return (Summary(split="novel_pose", region="foreground", metric="flicker", value=float(np.mean(values))),)
+
+
+def _pose_geometry(host: Host, described: Described, views: tuple[View, ...]) -> PosedFrames | None:
+    """Template and Gaussians in the evaluated frames, of methods that show their geometry."""
+    if not described.geometry:
+        return None
+    frames = sorted({view.frame for view in views})
+    few = {frame for split in IMAGE_SPLITS for frame in _few(_frames_of(views, split))}
+    return PosedFrames(
+        vertices={frame: host.geometry("vertices", frame) for frame in frames},
+        means={frame: host.geometry("means", frame) for frame in few} if described.gaussians else {},
+    )
+
+
+def _geometry_summary(capture: Capture, posed: PosedFrames | None, views: tuple[View, ...]) -> tuple[Summary, ...]:
+    """Template and Gaussians against the true surface."""
+    if posed is None or not (capture.folder / "truth" / "template.npz").exists():
+        return ()
+    rows = []
+    template_truth = read_template_truth(capture)
+    for split in IMAGE_SPLITS:
+        frames = _frames_of(views, split)
+        error = metrics.template_error_mm([posed.vertices[frame] for frame in frames], template_truth[frames])
+        if error is not None:  # A template of its own (a bare body, say) has no vertices that could be compared.
+            rows.append(Summary(split=split, region="", metric="template_mm", value=error))
+        distances = [_surface_distance(capture, posed.means[frame], frame) for frame in _few(frames) if posed.means]
+        known = [distance for distance in distances if distance is not None]
+        if known:
+            rows.append(Summary(split=split, region="", metric="surface_mm", value=float(np.mean(known))))
+    return tuple(rows)
+
+
+def _frames_of(views: tuple[View, ...], split: str) -> list[int]:
+    return sorted({view.frame for view in views if view.split == split})
+
+
+def _few(frames: list[int]) -> list[int]:
+    return frames[:: max(1, len(frames) // GEOMETRY_FRAMES)]
+
+
+def _surface_distance(capture: Capture, means: np.ndarray, frame: int) -> float | None:
+    path = surface_path(capture.folder, frame)
+    if not path.exists() or not len(means):
+        return None
+    faces = read_arrays(capture.folder / "truth" / "surface.npz", expected=("faces",))["faces"]
+    vertices = read_arrays(path, expected=("vertices",))["vertices"].astype(np.float64)
+    some = np.asarray(means, np.float64)[:: -(-len(means) // GEOMETRY_POINTS)]
+    return metrics.surface_distance_mm(some, vertices, faces)
+
+
+def _cost_summary(drawn: Drawn, train_s: float) -> tuple[Summary, ...]:
+    timing, described = drawn.timing, drawn.described
+    costs = {
+        ("speed", "frame_ms"): float(np.median(timing.frame_ms)),
+        **{("speed", f"{name}_ms"): float(np.median(values)) for name, values in timing.stage_ms.items()},
+        ("speed", "train_s"): train_s,
+        ("speed", "failed"): 0.0,
+        ("memory", "params"): float(described.params),
+        ("memory", "gaussians"): float(described.gaussians),
+        ("memory", "peak_rss_mb"): drawn.peak_mb,
+    }
+    if described.template_s is not None:  # What learning the template took; `train_s` is without it.
+        costs["speed", "template_s"] = described.template_s
+    return tuple(
+        Summary(split=split, region="", metric=metric, value=value) for (split, metric), value in costs.items()
+    )

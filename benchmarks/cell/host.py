@@ -1,0 +1,435 @@
+"""The harness's side of a method's process: asks, checks every answer, and takes the time from outside.
+
+Nothing that the process says about itself is believed further than it can be checked: arrays by type, shape and range,
+numbers by sense, its clock by ours. It never sees a score or a result, and its files are taken as files, not as links.
+"""
+
+import contextlib
+import json
+import math
+import os
+import shutil
+import signal
+import stat
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, distribution
+from importlib.util import find_spec
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import psutil
+
+from ash.capture.dataset import Camera, Capture
+from ash.capture.formats import write_cameras, write_motion
+from ash.capture.typed import from_json
+from ash.files import one_line, require_plain
+from ash.protocol import TrainingOutcome
+from benchmarks.cell import isolation
+from benchmarks.cell.cells import CHECKPOINT, Cell, Status
+from benchmarks.cell.guest import LARGEST_HEADER
+from benchmarks.cell.methods import OUR_PACKAGES, Method
+from benchmarks.cell.sources import editable_folder, package_files
+from benchmarks.cell.views import View
+
+WORK, EXAM, BASE = "work", "exam", "room"  # In a cell's folder: the method's own, what it is to draw, its file system.
+KEPT = (CHECKPOINT, "log.jsonl")
+LOUDEST, LAST_WORDS = 1 << 20, 1 << 14  # bytes of printing that are kept: the first of them, and the last
+MOST_POINTS, MOST_COUNT = 10_000_000, 10**13
+LOWEST, HIGHEST = -0.5, 2.0  # of a picture; rounding and overbright colours leave 0..1 a little, other units far
+CLOCK_SLACK_MS, CLOCK_SLACK = 2.0, 0.1
+ISOLATION = "ASH_BENCH_ISOLATION"  # "off": do without namespaces, as where the kernel has none
+
+
+class MethodFailed(Exception):
+    """The method did not come through; `status` says how."""
+
+    def __init__(self, status: Status, reason: str) -> None:
+        super().__init__(one_line(reason))
+        self.status: Status = status
+
+
+class Killed(Exception):
+    """The method's process was killed by somebody else, such as the kernel for want of memory."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Timed:
+    """Milliseconds of one frame by the method's clock, whole and by stage, and by ours."""
+
+    inside_ms: float
+    stage_ms: dict[str, float]
+    outside_ms: float
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Described:
+    """What a trained method says of itself."""
+
+    params: int
+    gaussians: int
+    geometry: bool
+    template_s: float | None
+    training: TrainingOutcome | None
+
+
+class Host:
+    """A method's process, and what it may be asked."""
+
+    def __init__(self, process: subprocess.Popen[bytes], requests: int, replies: int, *, isolated: bool) -> None:
+        self.isolated = isolated
+        self._process, self._requests, self._replies = process, requests, replies
+
+    def make(self) -> None:
+        """Import the factory and build the avatar."""
+        self._ask("make")
+
+    def fit(self) -> float:
+        """Learn; seconds by our clock."""
+        start = time.perf_counter()
+        header, _ = self._ask("fit")
+        seconds = time.perf_counter() - start
+        inside = _number(header.get("seconds"), "seconds of training")
+        if abs(seconds - inside) > 1.0 + CLOCK_SLACK * seconds:
+            raise MethodFailed("crashed", f"its clock says {inside:.1f} s of training, ours {seconds:.1f} s")
+        return seconds
+
+    def save(self) -> None:
+        """Write the weights."""
+        self._ask("save", name=CHECKPOINT)
+
+    def load(self, name: str = CHECKPOINT) -> None:
+        """Read the weights, or others that it left in its folder."""
+        self._ask("load", name=name)
+
+    def meet(self, folder: Path, capture: Capture) -> None:
+        """Show the cameras and motion that are to be drawn; only after training."""
+        write_cameras(folder / "cameras.json", list(capture.cameras.values()))
+        write_motion(folder / "motion.npz", capture.motion)
+        self._ask("meet", folder=str(folder))
+
+    def draw(self, view: View, camera: Camera) -> np.ndarray:
+        """One picture, float32 `[h, w, 4]`, finite."""
+        expected = (camera.height, camera.width, 4)
+        header, payload = self._ask("draw", most=4 * math.prod(expected), camera=view.camera, frame=view.frame)
+        if header.get("dtype") != "<f4" or header.get("shape") != list(expected):
+            got = f"{header.get('dtype')} {header.get('shape')}"
+            raise MethodFailed("crashed", f"expected an image float32 {expected}, got {got}")
+        image = np.frombuffer(payload, dtype=np.float32).reshape(expected)
+        if not np.isfinite(image).all():
+            raise MethodFailed("diverged", "the rendered image holds NaN or infinity")
+        if image.min() < LOWEST or image.max() > HIGHEST:
+            span = f"{image.min():.3g} to {image.max():.3g}"
+            raise MethodFailed("crashed", f"values of an image run from {span}, expected 0 to 1")
+        return image
+
+    def time(self, view: View) -> Timed:
+        """Draw a picture for its time alone."""
+        start = time.perf_counter()
+        header, _ = self._ask("time", camera=view.camera, frame=view.frame)
+        outside = (time.perf_counter() - start) * 1e3
+        stages = header.get("stages")
+        if not isinstance(stages, dict) or len(stages) > 20 or not all(_is_plain(name) for name in stages):
+            raise MethodFailed("crashed", "expected at most 20 stages with plain names")
+        inside = _number(header.get("ms"), "milliseconds of a frame")
+        known = {name: _number(ms, f"milliseconds of {name}") for name, ms in stages.items()}
+        return Timed(inside_ms=inside, stage_ms=known, outside_ms=outside)
+
+    def geometry(self, what: str, frame: int) -> np.ndarray:
+        """`vertices` or `means` of a frame, float64 `[n, 3]` metres."""
+        header, payload = self._ask(what, most=8 * 3 * MOST_POINTS, frame=frame)
+        shape = header.get("shape")
+        if not isinstance(shape, list) or len(shape) != 2 or shape[1] != 3 or header.get("dtype") not in ("<f4", "<f8"):
+            raise MethodFailed("crashed", f"{what}: expected floats [n, 3], got {header.get('dtype')} {shape}")
+        points = np.frombuffer(payload, dtype=header["dtype"])
+        if len(points) != 3 * shape[0] or not np.isfinite(points).all():
+            raise MethodFailed("crashed", f"{what}: expected {shape[0]} finite points")
+        return points.reshape(-1, 3).astype(np.float64)
+
+    def describe(self) -> Described:
+        """Counts, and what it offers."""
+        header, _ = self._ask("describe")
+        for name in ("params", "gaussians"):
+            count = header.get(name)
+            if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count <= MOST_COUNT:
+                raise MethodFailed("crashed", f"{name}: {count!r}, expected a whole number, 0 or more")
+        seconds = header.get("template_s")
+        return Described(
+            params=header["params"],
+            gaussians=header["gaussians"],
+            geometry=header.get("geometry") is True,
+            template_s=None if seconds is None else _number(seconds, "seconds for the template"),
+            training=_outcome(header.get("training")),
+        )
+
+    def peak_memory_mb(self) -> float:
+        """The largest resident memory that one of the method's processes had so far, MiB."""
+        peaks = [0.0]
+        with contextlib.suppress(psutil.Error):
+            whole = psutil.Process(self._process.pid)
+            peaks += [_peak_mb(member) for member in (whole, *whole.children(recursive=True))]
+        return max(peaks)
+
+    def _ask(self, what: str, *, most: int = 0, **arguments: Any) -> tuple[dict[str, Any], bytes]:
+        """Send a request and read the checked reply: a header, and at most `most` bytes besides."""
+        try:
+            os.write(self._requests, json.dumps({"do": what, **arguments}).encode() + b"\n")
+        except BrokenPipeError:
+            raise self._gone() from None
+        return self._receive(most)
+
+    def _receive(self, most: int) -> tuple[dict[str, Any], bytes]:
+        length = int.from_bytes(self._read(4), "big")
+        if length > LARGEST_HEADER:
+            raise MethodFailed("crashed", "its process answered nonsense")
+        try:
+            header = json.loads(self._read(length))
+            size = header["bytes"]
+            if not isinstance(size, int) or not size >= 0:
+                raise ValueError(size)
+        except (ValueError, TypeError, KeyError, RecursionError):
+            raise MethodFailed("crashed", "its process answered nonsense") from None
+        if "error" in header:
+            statuses: dict[str, Status] = {"diverged": "diverged", "memory": "out of memory"}
+            raise MethodFailed(statuses.get(str(header["error"]), "crashed"), str(header.get("message")))
+        if size > most:
+            raise MethodFailed("crashed", f"it answered with {size} bytes, expected at most {most}: a wrong shape")
+        return header, self._read(size)
+
+    def _read(self, size: int) -> bytes:
+        parts, left = [], size
+        while left:
+            part = os.read(self._replies, min(left, 1 << 20))
+            if not part:
+                raise self._gone()
+            parts.append(part)
+            left -= len(part)
+        return b"".join(parts)
+
+    def _gone(self) -> Exception:
+        """Why the process does not answer any more."""
+        try:
+            code = self._process.wait(5)
+        except subprocess.TimeoutExpired:
+            return MethodFailed("crashed", "its process closed the connection")
+        if code == isolation.REFUSED:
+            return isolation.Refused("no room")
+        if code == -signal.SIGKILL:
+            return Killed()
+        name = signal.Signals(-code).name if code < 0 and -code in list(signal.Signals) else f"exit code {code}"
+        return MethodFailed("crashed", f"the method's process ended with {name}")
+
+
+@contextlib.contextmanager
+def hosted(
+    cell: Cell, capture: Capture, seen: Capture, method: Method, *, oracle: bool, allow_room: bool = True
+) -> Iterator[Host]:
+    """A process for the method, in a room of its own where this system has one; whatever it started ends with it."""
+    place, work = cell.folder.resolve(), cell.folder.resolve() / WORK
+    for name in (WORK, EXAM, BASE):
+        (place / name).mkdir(parents=True, exist_ok=True)
+    store = seen.store if oracle or method.target.split(".")[0] in OUR_PACKAGES else work / "templates"
+    order: dict[str, Any] = {
+        "work": str(work),
+        "input": str(seen.folder.resolve()),
+        "closed": [] if oracle else [str(capture.folder.resolve())],
+        "store": "" if store is None else str(store.resolve()),
+        "target": method.target,
+        "seed": cell.config.seed,
+        "preset": cell.config.preset,
+        "changes": cell.config.changes,
+        "room": None,
+    }
+    wanted = allow_room and not oracle and os.environ.get(ISOLATION) != "off"
+    if wanted:
+        if store is not None:
+            store.mkdir(parents=True, exist_ok=True)
+        order["room"] = asdict(_room(place, capture, seen, method, store))
+    host, pump = _start(order, isolated=wanted)
+    try:
+        try:
+            host._receive(0)
+        except isolation.Refused:
+            _end(host._process)
+            host, pump = _start(order | {"room": None}, isolated=False)
+            host._receive(0)
+        yield host
+    finally:
+        _end(host._process)
+        for descriptor in (host._requests, host._replies):
+            os.close(descriptor)
+        pump.join(5)
+        for name in (EXAM, BASE):
+            shutil.rmtree(place / name, ignore_errors=True)
+
+
+def take_files(cell: Cell) -> None:
+    """Move what a method leaves to be kept into the cell's folder: regular files only."""
+    for name in KEPT:
+        source = cell.folder / WORK / name
+        with contextlib.suppress(FileNotFoundError):
+            if stat.S_ISREG(source.lstat().st_mode):
+                source.replace(cell.folder / name)
+    if not (cell.folder / CHECKPOINT).is_file():
+        raise MethodFailed("crashed", f"save wrote no file {CHECKPOINT}")
+
+
+def give_files(cell: Cell) -> None:
+    """Put a trained cell's weights where its method finds them again."""
+    (cell.folder / WORK).mkdir(parents=True, exist_ok=True)
+    target = cell.folder / WORK / CHECKPOINT
+    target.unlink(missing_ok=True)
+    shutil.copyfile(cell.folder / CHECKPOINT, target)
+
+
+def require_honest_clock(frames: list[Timed]) -> None:
+    """The method's clock and ours agree about its frames, but for the way between the processes.
+
+    Raises:
+        MethodFailed: they contradict each other.
+    """
+    way = min(frame.outside_ms - frame.inside_ms for frame in frames)
+    shortest = min(frames, key=lambda frame: frame.outside_ms)
+    if abs(way) > CLOCK_SLACK_MS + CLOCK_SLACK * shortest.outside_ms or way < -0.5:
+        inside, outside = shortest.inside_ms, shortest.outside_ms
+        raise MethodFailed("crashed", f"its clock says {inside:.1f} ms for a frame, ours {outside:.1f} ms")
+
+
+def _room(place: Path, capture: Capture, seen: Capture, method: Method, store: Path | None) -> isolation.Room:
+    packages = {folder for name in ("ash", "baselines", "benchmarks") for folder in _package_folders(name)}
+    own = _package_folders(method.target) or {str(path.resolve()) for path in package_files(method.target)}
+    with contextlib.suppress(PackageNotFoundError):
+        if method.distribution and (project := editable_folder(distribution(method.distribution.rpartition(" ")[0]))):
+            own.add(str(project.resolve()))
+    readable = {*isolation.libraries(), *packages, *own, str(seen.folder.resolve()), str(place / EXAM)}
+    data = capture.folder.resolve()
+    # The generator of truth is none of a method's business either.
+    secret = {str(data), str(data.parent), str(place), str(place.parent), *_package_folders("synth")}
+    return isolation.Room(
+        readable=tuple(sorted(readable)),
+        writable=(str(place / WORK), *((str(store.resolve()),) if store is not None else ())),
+        hidden=tuple(sorted(secret - readable)),
+        base=str(place / BASE),
+    )
+
+
+def _package_folders(target: str) -> set[str]:
+    """Where the top-level package of `package.module:function` lies; nowhere for a single file."""
+    spec = find_spec(target.partition(":")[0].split(".")[0])
+    if spec is None or spec.submodule_search_locations is None:
+        return set()
+    # An editable installation lists an empty folder among its places; the package is where its first file is.
+    places = {Path(spec.origin).parent} if spec.origin else {Path(place) for place in spec.submodule_search_locations}
+    return {str(place.resolve()) for place in places}
+
+
+def _start(order: dict[str, Any], *, isolated: bool) -> tuple[Host, threading.Thread]:
+    theirs, requests = os.pipe()
+    replies, answers = os.pipe()
+    command = [sys.executable, "-m", "benchmarks.cell.guest", str(theirs), str(answers), json.dumps(order)]
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        pass_fds=(theirs, answers),
+    )
+    os.close(theirs)
+    os.close(answers)
+    assert process.stdout is not None
+    pump = threading.Thread(target=_pass_on, args=(process.stdout,), daemon=True)
+    pump.start()
+    return Host(process, requests, replies, isolated=isolated), pump
+
+
+def _pass_on(output: IO[bytes]) -> None:
+    """Print what the method prints: the first megabyte of it, and its last words."""
+    kept, left_out, last = 0, 0, b""
+    while part := os.read(output.fileno(), 1 << 16):
+        now = part[: max(0, LOUDEST - kept)]
+        os.write(2, now)
+        kept += len(now)
+        rest = part[len(now) :]
+        left_out += len(rest)
+        last = (last + rest)[-LAST_WORDS:]
+    if left_out:
+        os.write(2, f"\n({left_out - len(last)} bytes left out)\n".encode() + last)
+    output.close()
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a method's process and everything that it started."""
+    family = []
+    with contextlib.suppress(psutil.Error):
+        whole = psutil.Process(process.pid)
+        family = [*whole.children(recursive=True), whole]
+    for member in reversed(family):
+        with contextlib.suppress(psutil.Error):
+            member.kill()
+    process.wait()
+    # What lost its parents has become ours (see `adopt_orphans`).
+    deadline = time.monotonic() + 5
+    while (orphans := _children()) and time.monotonic() < deadline:
+        for orphan in orphans:
+            with contextlib.suppress(psutil.Error):
+                for member in (*orphan.children(recursive=True), orphan):
+                    member.kill()
+        _reap()
+
+
+def adopt_orphans() -> None:
+    """Let what a method leaves behind become this process's child, so that it can be ended with the cell."""
+    if sys.platform.startswith("linux"):
+        import ctypes
+
+        ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER
+
+
+def _children() -> list[psutil.Process]:
+    if not _adopting():
+        return []
+    return psutil.Process().children()
+
+
+def _adopting() -> bool:
+    return os.environ.get("ASH_BENCH_CELL_PROCESS") == str(os.getpid())
+
+
+def _reap() -> None:
+    with contextlib.suppress(ChildProcessError):
+        while os.waitpid(-1, os.WNOHANG)[0]:
+            pass
+    time.sleep(0.02)
+
+
+def _peak_mb(process: psutil.Process) -> float:
+    status = Path(f"/proc/{process.pid}/status")
+    if status.exists():
+        lines = [line for line in status.read_text().splitlines() if line.startswith("VmHWM")]
+        return int(lines[0].split()[1]) / 1024 if lines else 0.0
+    return float(process.memory_info().rss / 2**20)
+
+
+def _number(value: Any, what: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
+        raise MethodFailed("crashed", f"{what}: {value!r}, expected a number, 0 or more")
+    return float(value)
+
+
+def _outcome(told: Any) -> TrainingOutcome | None:
+    try:
+        outcome: TrainingOutcome | None = from_json(TrainingOutcome | None, told, place="outcome")
+        if outcome is not None:
+            require_plain(outcome.ended_by, what="end of training")
+    except ValueError as error:
+        raise MethodFailed("crashed", f"how training ended: {error}") from error
+    return outcome
+
+
+def _is_plain(name: str) -> bool:
+    return 0 < len(name) <= 40 and name.replace("_", "").isalnum() and name.isascii()

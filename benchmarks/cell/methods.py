@@ -1,0 +1,155 @@
+"""Which methods there are, who of them may see the truth, and which sources decide their outcome."""
+
+import hashlib
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from importlib.machinery import ModuleSpec
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from ash.fields import Changes, nearest, replaced
+from ash.files import InputError, hash_sources
+from ash.protocol import Configurable
+from benchmarks.cell.sources import plugin_hash
+
+METHOD_GROUP = "ash_bench.methods"
+
+
+TEMPLATE_ERRORS_MM = (0, 2, 4, 8, 16)
+ON_EXACT = ("ash_truth", "ddc_truth", "oracle_texture")
+WRONG_BY_MM = {
+    mm: ON_EXACT if mm == 0 else (f"ash_{mm}mm", f"ddc_{mm}mm", f"texture_{mm}mm") for mm in TEMPLATE_ERRORS_MM
+}
+# Who may look at truth/ is decided here, not by the method: these get the whole capture, all others its training part.
+ORACLES = frozenset({"baselines.switches:by_vertices"}).union(*WRONG_BY_MM.values())
+
+
+# Whose sources decide a cell's outcome, besides this folder; a change elsewhere (a report, say) leaves results valid.
+DECIDING_PACKAGES = ("ash", "baselines")
+OUR_PACKAGES = (*DECIDING_PACKAGES, "benchmarks", "synth")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Method:
+    """An installed method: where its factory is (`package.module:function`) and which distribution brought it."""
+
+    name: str
+    target: str
+    distribution: str
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether its sources are among those that are hashed."""
+        return self.target.split(".")[0] in DECIDING_PACKAGES
+
+    def load(self) -> Callable[..., Any]:
+        """Import the factory."""
+        module, _, function = self.target.partition(":")
+        factory: Callable[..., Any] = getattr(import_module(module), function)
+        return factory
+
+
+def methods() -> dict[str, Method]:
+    """All installed methods, ours and anyone's."""
+    found = {}
+    for entry in sorted(entry_points(group=METHOD_GROUP), key=lambda entry: entry.name):
+        distribution = f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else ""
+        found[entry.name] = Method(name=entry.name, target=entry.value, distribution=distribution)
+    return found
+
+
+def find_method(name: str) -> Method:
+    """An installed method by name, or any importable factory as `package.module:function`."""
+    if ":" in name and find_spec_of(name) is not None:
+        return Method(name=name, target=name, distribution="")
+    known = methods()
+    if name not in known:
+        raise InputError(f"unknown method {name!r}, {nearest(name, tuple(known))}")
+    return known[name]
+
+
+def offered(name: str, preset: str) -> Any:
+    """The configuration that a preset means to a method; None where the method offers none.
+
+    Raises:
+        InputError: an unknown method or preset.
+    """
+    method = find_method(name)
+    try:
+        factory = method.load()
+    except Exception as error:
+        raise InputError(f"{name}: cannot be imported: {located(error, method.target)}") from error
+    if not isinstance(factory, Configurable):
+        return None
+    try:
+        return factory.config(preset)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+
+
+def configured(name: str, preset: str, changes: Mapping[str, Any] | Changes) -> Any:
+    """The configuration that a preset means to a method, with `changes`.
+
+    Raises:
+        InputError: the method offers no configuration, or the configuration refuses a change.
+    """
+    config = offered(name, preset)
+    if config is None:
+        key = next(iter(dict(changes)), "")
+        raise InputError(f"{name}: offers no configuration, and so has no key {key!r} (docs/plugin.md)")
+    try:
+        return replaced(config, changes, of=name)
+    except ValueError as error:  # A dataclass of someone else's may not know our kind of it.
+        raise InputError(str(error)) from error
+
+
+def located(error: BaseException, target: str) -> str:
+    """An error with file and line: the last of the method's own files on its way, or where it was raised."""
+    told = f"{type(error).__name__}: {error}"
+    reached = traceback.extract_tb(error.__traceback__)
+    spec = find_spec_of(target)
+    own = "" if spec is None or spec.origin is None else str(Path(spec.origin).parent)
+    places = [place for place in reached if own and place.filename.startswith(own)] or reached
+    if isinstance(error, SyntaxError) or not places:  # It says itself where it is.
+        return told
+    path = Path(places[-1].filename)
+    return f"{told} ({path.parent.name}/{path.name}:{places[-1].lineno})"
+
+
+def find_spec_of(target: str) -> ModuleSpec | None:
+    """The module of `package.module:function`, None where there is none."""
+    try:
+        return find_spec(target.partition(":")[0])
+    except (ImportError, ValueError):
+        return None
+
+
+@cache
+def code_version(method: str) -> str:
+    """SHA-256 over everything of ours that decides a cell's outcome, and all sources of a third party's method."""
+    roots = [*(_package_folder(package) for package in DECIDING_PACKAGES), Path(__file__).parent]
+    digest = hashlib.sha256(hash_sources(*roots).encode())
+    found = find_method(method)
+    if not found.is_ours:
+        digest.update(f"{found.target} {found.distribution}".encode())
+        digest.update(_sources_of(found).encode())
+    return digest.hexdigest()[:16]
+
+
+def _sources_of(method: Method) -> str:
+    spec = find_spec_of(method.target)
+    if method.target.split(".")[0] in OUR_PACKAGES and spec is not None and spec.origin is not None:
+        return hash_sources(Path(spec.origin))  # A planted defect, say: the rest of it is hashed already.
+    return plugin_hash(method.target, method.distribution.rpartition(" ")[0])
+
+
+def _package_folder(package: str) -> Path:
+    spec = find_spec(package)
+    if spec is None or spec.origin is None:
+        raise InputError(f"the package {package} is not importable: install ash-bench again")
+    return Path(spec.origin).parent  # Not its search locations: an editable install lists an empty folder among them.

@@ -1,0 +1,225 @@
+"""One cell, in a process of its own: train, render, score, time; `python -m benchmarks.cell.process FOLDER`.
+
+No code of the method runs in this process: it learns and draws in another (`benchmarks.cell.host`), and ends before
+anything is scored. So these exit codes are the harness's own word: 0 a result was written (also that of a method that
+failed), 2 wrong input or no room to write (on stderr), 130 interrupted, 76 the method's process was killed by somebody
+else; the last two without a result.
+"""
+
+import argparse
+import os
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+from ash.capture.dataset import Capture
+from ash.capture.formats import load_capture
+from ash.files import InputError, disk_problem
+from ash.protocol import Avatar
+from benchmarks import provenance
+from benchmarks.cell.cells import (
+    CHECKPOINT,
+    Cell,
+    CellConfig,
+    CellResult,
+    Provenance,
+    failed_result,
+    prediction_path,
+    read_cell,
+    result_of,
+    stored_prediction,
+    write_result,
+)
+from benchmarks.cell.evaluation import _flicker_summary, _gap_summary, _image_summary, _score, draw_all, judge
+from benchmarks.cell.host import Host, Killed, MethodFailed, adopt_orphans, give_files, hosted, take_files
+from benchmarks.cell.methods import ORACLES, configured, find_method
+from benchmarks.cell.sealing import seen_by_method, watched
+from benchmarks.cell.views import View
+
+KILLED = 76  # exit code
+TEMPLATES = "templates"  # Beside the captures: learned once, shared by methods and runs.
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the cell whose folder is given, unless it is finished."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.cell.process")
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--follow-parent", action="store_true", help="end when standard input ends")
+    arguments = parser.parse_args(argv)
+    os.environ["ASH_BENCH_CELL_PROCESS"] = str(os.getpid())
+    adopt_orphans()
+    if arguments.follow_parent:
+        threading.Thread(target=_end_with_parent, daemon=True).start()
+    try:
+        run_cell(read_cell(arguments.folder))
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(disk_problem(error) or _reraise(error), file=sys.stderr)
+        return 2
+    except KeyboardInterrupt as interruption:
+        print(f"interrupted {interruption}", file=sys.stderr)
+        return 130
+    except Killed:
+        print("the method's process was killed from outside", file=sys.stderr)
+        return KILLED
+    return 0
+
+
+def run_cell(cell: Cell) -> CellResult:
+    """Train and evaluate a cell and write its result; whatever the method does wrong is a result too.
+
+    Raises:
+        InputError: the capture or the method's name is at fault, not the method.
+        OSError: the cell's folder cannot be written.
+        Killed: somebody else killed the method's process.
+    """
+    finished = result_of(cell)
+    if finished is not None:
+        return finished
+    start = time.perf_counter()
+    capture = _capture_of(cell)
+    _clear(cell)
+    try:
+        result = _train_and_evaluate(cell, capture)
+    except MethodFailed as error:
+        print(f"{cell.config.title}: {error.status}: {error}", file=sys.stderr)
+        result = failed_result(cell.config, error.status, str(error))
+    except MemoryError as error:
+        result = failed_result(cell.config, "out of memory", str(error) or "the process could not allocate memory")
+    result = replace(result, provenance=_provenance(time.perf_counter() - start))
+    write_result(cell.folder, result)
+    return result
+
+
+def evaluate_cell(cell: Cell) -> CellResult:
+    """Load a cell's checkpoint, render and score again, and write the result anew; training is not repeated.
+
+    Raises:
+        InputError: the cell is unfinished, or its method does not load or draw any more.
+    """
+    before = _finished(cell)
+    capture = _capture_of(cell)
+    train_s = before.value("speed", "", "train_s") or 0.0
+    give_files(cell)
+    try:
+        with _hosted(cell, capture) as host:
+            host.make()
+            host.load()
+            drawn = draw_all(cell, capture, host)
+        result = replace(judge(cell, capture, drawn, train_s, before.training), provenance=before.provenance)
+    except (MethodFailed, Killed) as error:
+        raise InputError(f"{cell.folder}: {error or 'its process was killed'}; the result stays as it was") from error
+    write_result(cell.folder, result)
+    return result
+
+
+@contextmanager
+def load_avatar(cell: Cell, capture: Capture) -> Iterator[tuple[Avatar, Capture]]:
+    """A cell's trained avatar and the capture as it sees it; both hold as long as the body runs."""
+    factory = find_method(cell.config.source).load()
+    with _seen(cell, capture) as seen:
+        with watched(capture, seen):
+            avatar = _make(cell.config, seen, factory)
+            avatar.load(cell.folder / CHECKPOINT)
+        yield avatar, seen
+
+
+def rescore_cell(cell: Cell) -> CellResult:
+    """Recompute every quality from the stored predictions and write the result anew; costs stay as measured."""
+    before = _finished(cell)
+    capture = _capture_of(cell)
+    views = [View(split=view.split, camera=view.camera, frame=view.frame) for view in before.views]
+    scored = [_score(cell, capture, view, stored_prediction(cell, capture, view)) for view in views]
+    for old, new in zip(before.views, scored, strict=True):
+        if old.prediction != new.prediction:
+            name = prediction_path(cell.folder, View(split=new.split, camera=new.camera, frame=new.frame))
+            raise InputError(f"{name}: altered since it was scored (SHA-256 differs from result.json)")
+    recomputed = _image_summary(scored) + _gap_summary(scored) + _flicker_summary(cell, capture, scored)
+    names = {(row.split, row.region, row.metric) for row in recomputed}
+    kept = tuple(row for row in before.summary if (row.split, row.region, row.metric) not in names)
+    result = replace(before, views=tuple(scored), summary=recomputed + kept)
+    write_result(cell.folder, result)
+    return result
+
+
+def _train_and_evaluate(cell: Cell, capture: Capture) -> CellResult:
+    """The method learns and draws in a process of its own, then ends; what it drew is scored in this one."""
+    with _hosted(cell, capture) as host:
+        host.make()
+        train_s = host.fit()
+        host.save()
+        drawn = draw_all(cell, capture, host)
+    take_files(cell)
+    return judge(cell, capture, drawn, train_s)
+
+
+@contextmanager
+def _hosted(cell: Cell, capture: Capture) -> Iterator[Host]:
+    method, oracle = find_method(cell.config.source), cell.config.source in ORACLES
+    with _seen(cell, capture) as seen, hosted(cell, capture, seen, method, oracle=oracle) as host:
+        yield host
+
+
+def _clear(cell: Cell) -> None:
+    """Remove what an earlier attempt drew: nothing of it may be scored as if it were of this one."""
+    shutil.rmtree(cell.folder / "images", ignore_errors=True)
+
+
+def _make(config: CellConfig, capture: Capture, factory: Callable[..., Avatar]) -> Avatar:
+    if not config.changes:
+        return factory(capture, seed=config.seed, preset=config.preset)
+    wanted = configured(config.source, config.preset, config.changes)
+    return factory(capture, seed=config.seed, preset=config.preset, config=wanted)
+
+
+def _seen(cell: Cell, capture: Capture) -> AbstractContextManager[Capture]:
+    """What a method may see: the training part; oracles, which stand for a bound and no method, see the truth."""
+    store = cell.capture_folder.parent / TEMPLATES
+    return seen_by_method(capture, cell.folder / "input", oracle=cell.config.source in ORACLES, store=store)
+
+
+def _capture_of(cell: Cell) -> Capture:
+    capture = load_capture(cell.capture_folder)
+    if capture.identity != cell.config.capture:
+        raise InputError(
+            f"{cell.capture_folder}: expected the capture {cell.config.capture[:12]}, got {capture.identity[:12]}"
+        )
+    return capture
+
+
+def _finished(cell: Cell) -> CellResult:
+    result = result_of(cell)
+    if result is None or result.status != "done":
+        raise InputError(
+            f"{cell.folder}: expected a finished cell, got {result.status if result else 'no result.json'}"
+        )
+    return result
+
+
+def _provenance(wall_s: float) -> Provenance:
+    return Provenance(
+        commit=provenance.commit(), machine=provenance.machine(), versions=provenance.versions(), wall_s=wall_s
+    )
+
+
+def _end_with_parent() -> None:
+    """Leave when the engine is gone, however it went: its end of our standard input closes then."""
+    while os.read(0, 4096):
+        pass
+    os._exit(130)
+
+
+def _reraise(error: OSError) -> str:
+    raise error
+
+
+if __name__ == "__main__":
+    sys.exit(main(cast(list[str], sys.argv[1:])))

@@ -1,0 +1,1 @@
+"""A trained avatar in files that other programs read."""

@@ -1,0 +1,1 @@
+"""The gate: rules, planted defects, error rates."""

@@ -1,0 +1,325 @@
+"""The verdict on a change: a run against a committed baseline, with known error rates.
+
+Three levels. Identical predictions prove that nothing changed. Otherwise qualities are compared by seed means: a loss
+fails when it is larger than the metric's margin and is established (Welch's test, corrected by Holm over all
+comparisons); an equally established rise is flagged as well, for a leak looks like progress. Costs: exact work counts,
+and, on a processor like the baseline's, peak memory and times of frames and training, these as a ratio to a reference
+workload that was timed between the frames, because the machine's mood is in both. A training that became much shorter
+is flagged as well: it may have left something out. Elsewhere memory and times are not judged.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Literal
+from xml.sax.saxutils import escape, quoteattr
+
+from ash.capture.typed import from_json
+from ash.files import InputError, read_json, write_json
+from benchmarks.analysis.statistics import Difference, holm, welch
+from benchmarks.cell.cells import CellResult
+from benchmarks.cell.metrics import METRICS, PROTOCOL
+
+Verdict = Literal["pass", "fail", "unexplained improvement", "not judged"]
+Kind = Literal["presence", "quality", "time", "memory", "work"]
+FINE = ("pass", "not judged")
+
+GATED = (  # (split, region, metric): few, so that the correction for many comparisons leaves power
+    ("novel_view", "foreground", "psnr"),
+    ("novel_pose", "foreground", "psnr"),
+    ("novel_view", "foreground", "flip"),
+    ("novel_view", "full", "iou"),
+    ("novel_pose", "", "template_mm"),
+)
+EXACT_COUNTS = ("params", "gaussians")
+ALPHA = 0.05
+SLOWER = 1.15  # ratio of minima; run to run it varies by 3 % (8 % at worst) on a busy machine
+OTHER_TRAINING = 1.25  # ratio of training times, either way; unchanged code gave 0.93 to 1.08 in 20 runs
+STAGE_FLOOR = 0.1  # stages below this share of the reference workload are noise
+MORE_MEMORY = 1.10
+SINGLE_SEED_FACTOR = 5.0  # one seed knows no spread: only losses of several margins are believed
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class BaselineEntry:
+    """What the gate remembers of one method on one scene; lists run over seeds."""
+
+    scene: str
+    method: str
+    truth: str  # what its capture shows; equal on machines whose renders differ by rounding
+    seeds: tuple[int, ...]
+    predictions: tuple[str, ...]  # one digest per seed over all predicted images
+    qualities: dict[str, tuple[float, ...]]
+    counts: dict[str, float]
+    memory_mb: float
+    times: dict[str, float]  # frame, stages, training: least time over least time of the reference workload
+    failed: int
+
+    @property
+    def title(self) -> str:
+        """For checks."""
+        return f"{self.scene} · {self.method}"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Baseline:
+    """What a run is compared with."""
+
+    suite: str
+    commit: str
+    machine: str
+    entries: tuple[BaselineEntry, ...]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Check:
+    """One comparison and its outcome."""
+
+    what: str
+    verdict: Verdict
+    detail: str
+    kind: Kind = "presence"
+    name: str = ""  # the quality, stage or count; empty where the whole of a method is meant
+    scene: str = ""
+    method: str = ""
+
+
+def summarise(suite: str, results: Sequence[CellResult]) -> Baseline:
+    """What the gate needs to know of a run."""
+    known = [result.provenance for result in results if result.provenance is not None]
+    pairs = dict.fromkeys((result.config.place, result.config.method) for result in results)
+    entries = [_entry([r for r in results if (r.config.place, r.config.method) == pair]) for pair in pairs]
+    commit = known[0].commit if known else "unknown"
+    machine = known[0].machine.get("processor", "unknown") if known else "unknown"
+    return Baseline(suite=suite, commit=commit, machine=machine, entries=tuple(entries))
+
+
+def write_baseline(path: Path, baseline: Baseline) -> None:
+    """Write a baseline: the only place where one is ever changed."""
+    write_json(path, {"protocol": PROTOCOL, **asdict(baseline)})
+
+
+def read_baseline(path: Path) -> Baseline:
+    """Read a baseline.
+
+    Raises:
+        InputError: damaged, or of another protocol version.
+    """
+    content = read_json(path)
+    if isinstance(content, dict) and content.get("protocol", PROTOCOL) != PROTOCOL:
+        raise InputError(f"{path}: expected protocol {PROTOCOL}, got {content['protocol']!r}; make a new baseline")
+    try:
+        told: Baseline = from_json(Baseline, {name: value for name, value in content.items() if name != "protocol"})
+        return told
+    except (AttributeError, ValueError) as error:
+        raise InputError(f"{path}: expected a baseline of the gate ({error})") from error
+
+
+def judge(baseline: Baseline, head: Baseline) -> list[Check]:
+    """Every comparison of a run with the baseline."""
+    if baseline.suite != head.suite:
+        raise InputError(f"expected a run of suite {baseline.suite}, as the baseline is, got {head.suite}")
+    found = {(entry.scene, entry.method): entry for entry in head.entries}
+    checks: list[Check] = []
+    compared: list[tuple[BaselineEntry, BaselineEntry]] = []
+    for base in baseline.entries:
+        now = found.get((base.scene, base.method))
+        if now is None:
+            checks.append(_check(base, "present", "fail", "no such cell in this run"))
+        elif now.failed > base.failed:
+            checks.append(_check(base, "came through", "fail", f"{now.failed} seeds failed"))
+        else:
+            compared.append((base, now))
+    checks += _quality_checks(compared)
+    here = baseline.machine == head.machine
+    for base, now in compared:
+        checks += _count_checks(base, now)
+        checks += [_memory_check(base, now), *_time_checks(base, now)] if here else [_elsewhere(base, baseline, head)]
+    return checks
+
+
+def markdown(baseline: Baseline, head: Baseline, checks: Sequence[Check]) -> str:
+    """A summary for a pull request: the verdict, what failed, and all checks folded away."""
+    bad = [check for check in checks if check.verdict not in FINE]
+    title = "passed" if not bad else f"**{len(bad)} of {len(checks)} checks did not pass**"
+    lines = [f"## ash-bench gate: {title}", ""]
+    lines.append(f"Suite {head.suite}, commit {head.commit} against baseline {baseline.commit}, on {head.machine}.")
+    if bad:
+        lines += ["", *_rows(bad)]
+    return "\n".join([*lines, "", "<details><summary>All checks</summary>", "", *_rows(checks), "", "</details>", ""])
+
+
+def junit(checks: Sequence[Check]) -> str:
+    """The checks as a JUnit file."""
+    bad = sum(check.verdict not in FINE for check in checks)
+    skipped = sum(check.verdict == "not judged" for check in checks)
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>']
+    numbers = f'tests="{len(checks)}" failures="{bad}" errors="0" skipped="{skipped}"'
+    lines.append(f'<testsuite name="ash-bench gate" {numbers}>')
+    for check in checks:
+        group, _, name = check.what.partition(": ")
+        head = f"  <testcase classname={quoteattr(group)} name={quoteattr(name)}"
+        if check.verdict == "pass":
+            lines.append(f"{head}/>")
+        elif check.verdict == "not judged":
+            lines.append(f"{head}><skipped message={quoteattr(check.detail)}/></testcase>")
+        else:
+            reason = f"<failure message={quoteattr(check.verdict)}>{escape(check.detail)}</failure>"
+            lines.append(f"{head}>{reason}</testcase>")
+    return "\n".join([*lines, "</testsuite>", ""])
+
+
+def _entry(results: Sequence[CellResult]) -> BaselineEntry:
+    done = [result for result in sorted(results, key=lambda r: r.config.seed) if result.status == "done"]
+    config = results[0].config
+    return BaselineEntry(
+        scene=config.place,
+        method=config.method,
+        truth=config.truth or config.capture,
+        seeds=tuple(result.config.seed for result in done),
+        predictions=tuple(_digest(result) for result in done),
+        qualities={"/".join(name): _values(done, name) for name in GATED if _values(done, name)},
+        counts={m: values[0] for m in EXACT_COUNTS if (values := _values(done, ("memory", "", m)))},
+        memory_mb=max(_values(done, ("memory", "", "peak_rss_mb")), default=0.0),
+        times=_times(done),
+        failed=len(results) - len(done),
+    )
+
+
+def _values(results: Iterable[CellResult], name: tuple[str, str, str]) -> tuple[float, ...]:
+    return tuple(value for result in results if (value := result.value(*name)) is not None)
+
+
+def _digest(result: CellResult) -> str:
+    return sha256("".join(view.prediction for view in result.views).encode()).hexdigest()
+
+
+def _times(results: Sequence[CellResult]) -> dict[str, float]:
+    """Least time over least time of the reference workload; the least over seeds, for noise only ever adds."""
+    ratios: dict[str, float] = {}
+    for result in results:
+        if result.timing is not None:
+            reference = min(result.timing.reference_ms)
+            measured = {"frame": result.timing.frame_ms, **result.timing.stage_ms}
+            if (train_s := result.value("speed", "", "train_s")) is not None:
+                measured["training"] = (1e3 * train_s,)
+            for name, values in measured.items():
+                ratios[name] = min(ratios.get(name, math.inf), min(values) / reference)
+    return ratios
+
+
+def _quality_checks(compared: Sequence[tuple[BaselineEntry, BaselineEntry]]) -> list[Check]:
+    checks: list[Check] = []
+    tests: list[tuple[BaselineEntry, str, Difference, Sequence[float], Sequence[float]]] = []
+    for base, now in compared:
+        if base.truth != now.truth:
+            detail = "the ground truth changed, so qualities cannot be compared; update the baseline"
+            checks.append(_check(base, "capture", "fail", detail))
+        elif base.predictions == now.predictions:
+            checks.append(_check(base, "quality", "pass", "identical predictions", kind="quality"))
+        else:
+            for name, before in base.qualities.items():
+                after = now.qualities.get(name, ())
+                if len(before) > 1 and len(after) > 1:
+                    tests.append((base, name, welch(after, before), before, after))
+                else:
+                    checks.append(_single(base, name, before, after))
+    adjusted = holm([test.p for _, _, test, _, _ in tests])
+    return checks + [_established(*test, p=p) for test, p in zip(tests, adjusted, strict=True)]
+
+
+def _check(
+    entry: BaselineEntry, what: str, verdict: Verdict, detail: str, *, kind: Kind = "presence", name: str = ""
+) -> Check:
+    """A check of one method on one scene."""
+    return Check(
+        what=f"{entry.title}: {what}",
+        verdict=verdict,
+        detail=detail,
+        kind=kind,
+        name=name,
+        scene=entry.scene,
+        method=entry.method,
+    )
+
+
+def _means(name: str, before: Sequence[float], after: Sequence[float]) -> str:
+    """Means over seeds, before and after, with their unit."""
+    unit = METRICS[name.split("/")[-1]].unit
+    return f"{sum(before) / len(before):.4g} -> {sum(after) / len(after):.4g}{unit and ' ' + unit}"
+
+
+def _established(
+    entry: BaselineEntry, name: str, test: Difference, before: Sequence[float], after: Sequence[float], *, p: float
+) -> Check:
+    margin = METRICS[name.split("/")[-1]].abs_tol
+    smallest = max(margin, test.detectable)
+    detail = (
+        f"{_means(name, before, after)} ({test.mean:+.4g} [{test.low:+.4g}, {test.high:+.4g}], p {p:.2g}; "
+        f"a change from {smallest:.2g} on would be seen)"
+    )
+    beyond = abs(test.mean) > margin and p < ALPHA
+    verdict: Verdict = _direction(name, test.mean) if beyond else "pass"
+    return _check(entry, name, verdict, detail, kind="quality", name=name)
+
+
+def _single(entry: BaselineEntry, name: str, before: Sequence[float], after: Sequence[float]) -> Check:
+    if not after or not before:
+        return _check(entry, name, "fail", "not measured", kind="quality", name=name)
+    margin = METRICS[name.split("/")[-1]].abs_tol * SINGLE_SEED_FACTOR
+    change = sum(after) / len(after) - sum(before) / len(before)
+    detail = f"{_means(name, before, after)} ({change:+.4g}; with one seed a change from {margin:g} on would be seen)"
+    verdict: Verdict = _direction(name, change) if abs(change) > margin else "pass"
+    return _check(entry, name, verdict, detail, kind="quality", name=name)
+
+
+def _direction(name: str, change: float) -> Verdict:
+    higher_is_better = METRICS[name.split("/")[-1]].direction == "up"
+    return "unexplained improvement" if (change > 0) == higher_is_better else "fail"
+
+
+def _count_checks(base: BaselineEntry, now: BaselineEntry) -> list[Check]:
+    checks = []
+    for name, before in base.counts.items():
+        after = now.counts.get(name)
+        verdict: Verdict = "pass" if after == before else "fail"
+        now_text = "not measured" if after is None else f"{after:g}"
+        detail = f"{before:g} -> {now_text} (any change is seen)"
+        checks.append(_check(base, name, verdict, detail, kind="work", name=name))
+    return checks
+
+
+def _memory_check(base: BaselineEntry, now: BaselineEntry) -> Check:
+    more = now.memory_mb > MORE_MEMORY * base.memory_mb
+    detail = f"{base.memory_mb:.0f} -> {now.memory_mb:.0f} MB (a rise from {MORE_MEMORY - 1:.0%} on is seen)"
+    return _check(base, "peak memory", "fail" if more else "pass", detail, kind="memory")
+
+
+def _time_checks(base: BaselineEntry, now: BaselineEntry) -> list[Check]:
+    checks = []
+    for name, before in base.times.items():
+        after = now.times.get(name)
+        if after is None or max(before, after) < STAGE_FLOOR:
+            continue
+        slower = OTHER_TRAINING if name == "training" else SLOWER
+        detail = (
+            f"{before:.4g} -> {after:.4g} times the reference workload ({after / before - 1:+.0%}; "
+            f"a rise from {slower - 1:.0%} on is seen)"
+        )
+        verdict: Verdict = "fail" if after > slower * before else "pass"
+        if name == "training" and after * OTHER_TRAINING < before:
+            verdict = "unexplained improvement"
+        checks.append(_check(base, f"time of {name}", verdict, detail, kind="time", name=name))
+    return checks
+
+
+def _elsewhere(base: BaselineEntry, baseline: Baseline, head: Baseline) -> Check:
+    detail = f"the baseline was made on {baseline.machine}, this run on {head.machine}"
+    return _check(base, "memory and times", "not judged", detail, kind="time")
+
+
+def _rows(checks: Sequence[Check]) -> list[str]:
+    rows = [f"| {check.what} | {check.verdict} | {check.detail} |" for check in checks]
+    return ["| check | verdict | detail |", "|---|---|---|", *rows]

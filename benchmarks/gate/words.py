@@ -1,0 +1,96 @@
+"""What the gate says to a developer: the verdict first and last, what moved, and where to look."""
+
+from collections.abc import Sequence
+
+from benchmarks.gate.gate import FINE, Baseline, Check
+
+# Where a moved number is made. What all methods share is looked for in other places than what one of them alone does.
+STAGES = {
+    "stg1": ("ash/template/",),
+    "stg2": ("ash/textures.py", "ash/native/texels.inc"),
+    "stg3": ("ash/decoders.py", "ash/blendshapes.py", "ash/inference.py"),
+    "stg4": ("ash/gaussians/", "ash/native/", "baselines/display.py"),
+    "training": ("ash/training/", "ash/losses.py", "ash/presets.py"),
+    "frame": ("ash/model.py", "ash/avatar.py", "ash/gaussians/", "ash/native/"),
+}
+SHARED = ("synth/", "ash/capture/", "benchmarks/cell/", "ash/mesh/", "ash/native/", "ash/rotations.py")
+MAKING_SCENES = ("synth/", "ash/capture/")
+TEMPLATE = ("ash/template/", "ash/template_learning/")
+METHODS = {"ddc": ("baselines/ddc.py", "ash/mesh/"), "ash": ("ash/",)}
+SOURCES = ("ash/", "baselines/", "synth/", "benchmarks/cell/", "pyproject.toml", "constraints.txt")
+SHOWN_FILES = 20
+
+
+def terminal(baseline: Baseline, head: Baseline, checks: Sequence[Check], changed: Sequence[str] | None) -> str:
+    """The verdict, what moved by how much, which part is suspect, and the verdict again."""
+    bad = [check for check in checks if check.verdict not in FINE]
+    lines = [verdict(checks), f"suite {head.suite}, commit {head.commit} against baseline {baseline.commit}"]
+    for check in bad:
+        lines.append(f"  {check.verdict:22} {check.what}: {check.detail}")
+    if bad:
+        one_of_many = len({c.scene for c in bad}) < len({c.scene for c in checks})
+        lines += ["", f"What moved: {pattern(checks)}.", *suspects(bad, changed, one_of_many=one_of_many)]
+    else:
+        lines += [f"  {check.what}: {check.detail}" for check in checks]
+    untold = [check for check in checks if check.verdict == "not judged"]
+    lines += [f"Not judged: {untold[0].detail}." if untold else "", verdict(checks)]
+    return "\n".join(line for k, line in enumerate(lines) if line or k)
+
+
+def verdict(checks: Sequence[Check]) -> str:
+    """One line."""
+    bad = sum(check.verdict not in FINE for check in checks)
+    judged = sum(check.verdict != "not judged" for check in checks)
+    return f"gate: FAILED, {bad} of {judged} checks did not pass" if bad else f"gate: passed, {judged} checks"
+
+
+def pattern(checks: Sequence[Check]) -> str:
+    """Whether one method or all moved, on one scene or on all, in quality or in cost."""
+    bad = [check for check in checks if check.verdict not in FINE]
+    methods = _share("method", {c.method for c in bad}, {c.method for c in checks})
+    scenes = _share("scene", {c.scene for c in bad}, {c.scene for c in checks})
+    kinds = " and ".join(sorted({c.kind for c in bad}))
+    better = all(check.verdict == "unexplained improvement" for check in bad)
+    return f"{methods}, on {scenes}, in {kinds}{', for the better: a leak looks like progress' if better else ''}"
+
+
+def suspects(bad: Sequence[Check], changed: Sequence[str] | None, *, one_of_many: bool) -> list[str]:
+    """Where to look, and which files there changed since the baseline."""
+    places = _places(bad, one_of_many)
+    lines = [f"Look at: {', '.join(places)}."]
+    if changed is None:
+        return [*lines, "Which files changed since the baseline is not known here (no git, or not its commit)."]
+    deciding = [name for name in changed if name.startswith(SOURCES)]
+    near = [name for name in deciding if name.startswith(places)]
+    other = [name for name in deciding if name not in near]
+    if not deciding:
+        return [*lines, "No source that decides a result changed since the baseline: look at the machine and versions."]
+    lines.append(f"{len(deciding)} sources changed since the baseline, {len(near)} of them there:")
+    shown = [f"  * {name}" for name in near] + [f"    {name}" for name in other]
+    more = [f"    and {len(shown) - SHOWN_FILES} more"] if len(shown) > SHOWN_FILES else []
+    return [*lines, *shown[:SHOWN_FILES], *more]
+
+
+def _share(word: str, moved: set[str], known: set[str]) -> str:
+    if moved == known:
+        return f"the only {word} ({', '.join(moved)})" if len(known) == 1 else f"all {len(known)} {word}s"
+    if len(moved) == 1:
+        return f"one {word} of {len(known)} ({', '.join(moved)})"
+    return f"{len(moved)} of {len(known)} {word}s ({', '.join(sorted(moved))})"
+
+
+def _places(bad: Sequence[Check], one_of_many: bool) -> tuple[str, ...]:
+    """Folders and files that can move these numbers; `one_of_many`: some scenes moved and others did not."""
+    found: list[str] = []
+    methods = {check.method for check in bad}
+    for check in bad:
+        if check.kind == "time" and check.name in STAGES:
+            found += STAGES[check.name]
+        elif check.name.endswith("template_mm"):
+            found += TEMPLATE
+        elif len(methods) > 1:
+            found += MAKING_SCENES if one_of_many else SHARED
+        else:
+            family = check.method.split("_")[0]
+            found += METHODS.get(family, ("baselines/", "the method's own sources"))
+    return tuple(dict.fromkeys(found))

@@ -1,0 +1,1 @@
+"""Trained avatars in motion: played in the browser, filmed, exported, shared."""

@@ -1,0 +1,181 @@
+"""The charts of a scene: its numbers as the tables that `charts.py` draws, with their captions."""
+
+from collections.abc import Sequence
+
+import pandas as pd
+
+from benchmarks.analysis import contrasts, pareto
+from benchmarks.analysis.contrasts import Contrast
+from benchmarks.analysis.names import EXACT, SPLIT_WORDS, look_of
+from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Score, Scores, foreground
+from benchmarks.cell.methods import WRONG_BY_MM
+from benchmarks.report import charts
+from benchmarks.report.charts import Figure, Series
+from benchmarks.report.tables import SPLIT_TITLES
+
+STAGES = {
+    "stg1_ms": Series(title="Stg.1 template", colour="#2f6fde"),
+    "stg2_ms": Series(title="Stg.2 textures", colour="#2a9d8f"),
+    "stg3_ms": Series(title="Stg.3 decoders", colour="#dd6b20"),
+    "stg4_ms": Series(title="Stg.4 skin and draw", colour="#9b59b6"),
+    "": Series(title="other", colour="#8a94a3"),
+}
+STAGE_METRICS = tuple(stage for stage in STAGES if stage)
+MANY_CONTRASTS = 5  # Rows from which contrasts are drawn as well as listed.
+PLANTED = {method for mm, row in WRONG_BY_MM.items() if mm > 0 for method in row}  # They have a chart of their own.
+SPAN_DB = 9.0  # that a chart shows below its best point: what lies lower would press the rest together
+
+
+def speed_figure(scores: Scores, scene: str) -> Figure | None:
+    """Foreground PSNR against milliseconds per frame, for held-out views and held-out motion."""
+    methods = [m for m in scores.methods(scene) if m not in PLANTED and scores.whole(scene, m)]
+    looks = dict(zip(methods, charts.series_of(methods), strict=True))
+    points, front, links = [], [], []
+    notes: dict[str, str] = {}
+    for split in RANKED_SPLITS:
+        panel = SPLIT_WORDS[split].capitalize()
+        competing = contrasts.candidates(scores, scene, split)
+        sufficient = pareto.smallest_sufficient(competing)
+        here = {
+            m: (frame, score) for m in methods for frame, score in [_pair(scores, scene, m, split)] if frame and score
+        }
+        for method, (frame, score) in here.items():
+            spread = score.half_width
+            ends = (
+                {"low": None, "high": None}
+                if spread is None
+                else {"low": score.mean - spread, "high": score.mean + spread}
+            )
+            ringed = sufficient is not None and sufficient.name == method
+            where = {
+                "panel": panel,
+                "series": looks[method].title,
+                "ms": frame.mean,
+                "psnr": score.mean,
+                "ringed": ringed,
+            }
+            points.append({**where, **ends})
+        front += [{"panel": panel, "ms": here[m][0].mean, "psnr": here[m][1].mean} for m in pareto.front(competing)]
+        pairs = [pair for pair in EXACT.items() if set(pair) <= set(here)]
+        links += [
+            {"panel": panel, "link": pair[0], "ms": here[m][0].mean, "psnr": here[m][1].mean}
+            for pair in pairs
+            for m in pair
+        ]
+        ceilings = [c.mean for m in here if (c := scores.get(scene, m, foreground(split, "noise_ceiling")))]
+        notes |= {panel: f"noise ceiling {ceilings[0]:.1f} dB"} if ceilings else {}
+    if not points:
+        return None
+    columns = {"front": ["panel", "ms", "psnr"], "links": ["panel", "link", "ms", "psnr"]}
+    panels, named = charts.speed(
+        _lifted(pd.DataFrame(points)),
+        pd.DataFrame(front, columns=columns["front"]),
+        pd.DataFrame(links, columns=columns["links"]),
+        tuple(looks.values()),
+        notes=notes,
+    )
+    caption = (
+        "Up and to the left is better. Hollow: given the exact surface, a bound and no competitor; the dashed "
+        "line joins it "
+        "with the honest method, so its length is what the template's error costs. Grey staircase: the front of "
+        "those that "
+        "no other beats in both."
+    )
+    if scores.seeds > 1:
+        caption += " Whiskers: 95 % interval over seeds. Ringed: the smallest sufficient method."
+    title = "Accuracy against speed"
+    return Figure(name=scene, title=title, caption=caption, panels=panels, series=tuple(looks.values()), named=named)
+
+
+def _pair(scores: Scores, scene: str, method: str, split: str) -> tuple[Score | None, Score | None]:
+    return scores.get(scene, method, FRAME_MS), scores.get(scene, method, foreground(split))
+
+
+def _lifted(points: pd.DataFrame) -> pd.DataFrame:
+    """Points that lie far below all others, raised to the floor of the chart with their value in `note`."""
+    floor = points["psnr"].max() - SPAN_DB
+    far = points["psnr"] < floor
+    note = points["series"] + points["psnr"].map(": {:.1f} ↓".format)
+    lifted = points.assign(below=points["psnr"].where(far), note=note.where(far), psnr=points["psnr"].clip(lower=floor))
+    return lifted.assign(**{end: points[end].where(~far) for end in ("low", "high")})
+
+
+AHEAD = (
+    Series(title="ASH is ahead", colour=charts.BLUE),
+    Series(title="the row is ahead", colour=charts.ORANGE),
+    Series(title="the interval holds zero", colour=charts.LINE),
+)
+
+
+def effects_figure(found: Sequence[Contrast], scene: str) -> Figure | None:
+    """The contrasts as a chart, where they are many enough for a table to be hard to read."""
+    rows = [
+        {
+            "panel": SPLIT_TITLES[c.split],
+            "row": c.title,
+            "mean": c.test.mean,
+            "low": c.test.low,
+            "high": c.test.high,
+            "series": AHEAD[0 if c.test.low > 0 else 1 if c.test.high < 0 else 2].title,
+        }
+        for c in found
+    ]
+    table = pd.DataFrame(rows)
+    if table.groupby("panel").size().max() < MANY_CONTRASTS:
+        return None
+    return Figure(
+        name=f"effects_{scene}",
+        title="Differences with intervals",
+        caption="Foreground PSNR of ASH minus that of the row, with the 95 % interval over seeds. Arrows: it goes on "
+        "beyond the scale.",
+        panels=charts.forest(table, AHEAD, x="ASH minus the row [dB]"),
+        series=AHEAD,
+    )
+
+
+def training_figure(scores: Scores, curves: pd.DataFrame, scene: str) -> Figure | None:
+    """Foreground PSNR of reserved training views over seconds of training, first seed; `curves`: see `curves_of`."""
+    curves = curves[curves["seed"] == curves.groupby("method")["seed"].transform("min")]
+    methods = [m for m in scores.methods(scene) if (curves["method"] == m).sum() > 1]
+    if not methods:
+        return None
+    looks = charts.series_of(methods)
+    names = {method: look.title for method, look in zip(methods, looks, strict=True)}
+    points = curves[curves["method"].isin(methods)]
+    points = pd.DataFrame({"series": points["method"].map(names), "x": points["seconds"], "y": points["psnr"]})
+    panels, named = charts.curves(points, looks, x="seconds of training", y="PSNR of views that no step sees [dB]")
+    return Figure(
+        name=f"training_{scene}",
+        title="Training",
+        caption="Foreground PSNR of training views that are reserved, so that no step sees them, over seconds of "
+        "training: what stopping earlier would have given. First seed; warm-up included.",
+        panels=panels,
+        series=looks,
+        columns=1,
+        named=named,
+    )
+
+
+def stage_figure(scores: Scores, scene: str) -> Figure | None:
+    """Milliseconds per frame by stage; what no stage claims is shown as other."""
+    rows = []
+    for method in scores.methods(scene):
+        whole = scores.get(scene, method, FRAME_MS)
+        found = {stage: scores.get(scene, method, Quantity("speed", "", stage)) for stage in STAGE_METRICS}
+        if whole is None or scores.failed(scene, method) or not any(found.values()):
+            continue
+        parts = {stage: score.mean if score else 0.0 for stage, score in found.items()}
+        parts[""] = max(0.0, whole.mean - sum(parts.values()))
+        name = look_of(method).title
+        rows += [{"row": name, "series": STAGES[stage].title, "value": value} for stage, value in parts.items()]
+    if not rows:
+        return None
+    series = tuple(STAGES.values())
+    return Figure(
+        name=f"stages_{scene}",
+        title="Time per stage",
+        caption="One frame on one core, median after warm-up, by the paper's stages.",
+        panels=charts.bars(pd.DataFrame(rows), series, x="ms per frame"),
+        series=series,
+        columns=1,
+    )

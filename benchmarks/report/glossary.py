@@ -1,0 +1,102 @@
+"""What the words of a report mean: shown to the pointer wherever they stand, and listed at its end."""
+
+import re
+
+METRIC_TERMS = {
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "flip": "FLIP",
+    "lpips": "LPIPS",
+    "iou": "IoU",
+    "template_mm": "template error",
+    "surface_mm": "to surface",
+    "flicker": "flicker",
+    "noise_ceiling": "noise ceiling",
+    "frame_ms": "frame time",
+    "stg1_ms": "Stg.1",
+    "stg2_ms": "Stg.2",
+    "stg3_ms": "Stg.3",
+    "stg4_ms": "Stg.4",
+    "train_s": "training time",
+    "gap": "gap",
+    "settled_s": "settled",
+    "search_s": "search time",
+    "steps": "steps",
+    "params": "parameters",
+    "gaussians": "Gaussians",
+    "peak_rss_mb": "memory",
+}
+GLOSSARY = {
+    "PSNR": "Peak signal-to-noise ratio in decibels: 10 log10 of one over the mean squared error. Higher is better; "
+    "one decibel is an error smaller by a fifth.",
+    "SSIM": "Structural similarity (Wang et al. 2004), 11x11 Gaussian window, sigma 1.5; 1 is identical.",
+    "FLIP": "The difference that a viewer sees when flipping between two images (Andersson et al. 2020), at 67 pixels "
+    "per degree; 0 is identical.",
+    "LPIPS": "Distance of deep features of AlexNet (Zhang et al. 2018), times 1000, on the whole frame; lower is "
+    "better.",
+    "IoU": "Overlap of the drawn silhouette and the true one: intersection over union; 1 is identical.",
+    "template": "The deformable mesh that a method is given or learns, and on which its Gaussians or its texture lie.",
+    "template error": "Root mean square distance between vertices of the method's posed template and the true "
+    "surface's.",
+    "exact surface": "The true surface in place of a learned template: such a method is a bound and no competitor.",
+    "to surface": "Mean distance of Gaussian centres from the true surface.",
+    "flicker": "How far the change from frame to frame differs from the truth's own, in steps of 1/255.",
+    "noise ceiling": "The PSNR of a perfect method: what the noise of the path-traced truth itself allows.",
+    "foreground": "The pixels that the subject truly covers by more than half: background would only dilute a score.",
+    "release crop": "As the released ASH code validates: masked, on white, cut to a window, blind outside the "
+    "silhouette.",
+    "held-out views": "Cameras that no method was trained on, in frames of the training motion.",
+    "held-out motion": "A motion that no method was trained on, seen by cameras that none was trained on.",
+    "novel view": "Another name for held-out views.",
+    "novel pose": "Another name for held-out motion.",
+    "training view": "Images that the method was trained on.",
+    "frame time": "Milliseconds to draw one frame on one core: the median over frames after warm-up.",
+    "Stg.1": "The paper's first stage: the template is posed and deformed.",
+    "Stg.2": "The paper's second stage: the motion-aware textures are made.",
+    "Stg.3": "The paper's third stage: decoders turn textures into Gaussians, or into a texture.",
+    "Stg.4": "The paper's fourth stage: Gaussians are skinned and splatted, or the mesh is drawn.",
+    "training time": "Seconds of training on one core, warm-up included.",
+    "gap": "By how many decibels training views are better than these: what was learned by heart.",
+    "settled": "Seconds of training after which no score of reserved views differs by more than 0.3 dB from the last.",
+    "search time": "Seconds that a search for sufficient settings took before the training that counts.",
+    "steps": "How many steps of the optimiser training took.",
+    "plateau": "Training had stopped to help: its last third gained less than 0.1 dB on views that no step saw.",
+    "memory": "Peak resident memory of the process, Python and libraries included.",
+    "parameters": "How many numbers the method learned.",
+    "Gaussians": "How many splats are drawn; a mesh has none. Neither more nor fewer is better.",
+    "hypervolume": "The area that the best methods cover between accuracy and the logarithm of time, up to a frame per "
+    "second at 10 dB: one number for the whole field.",
+    "smallest sufficient": "The cheapest method whose loss to the best is surely below half a decibel.",
+    "Welch": "Welch's t test: two means of unequal variance, here over seeds, or over captures in pairs.",
+    "Holm": "Holm's correction (1979): keeps the chance of any false alarm among all rows at 5 %.",
+    "hierarchical bootstrap": "An interval from drawing seeds and images anew; a little too narrow for three seeds.",
+    "detectable": "The smallest true difference that this number of seeds would find four times in five.",
+    "Kendall's tau": "Agreement of two rankings: 1 the same order, -1 the opposite one.",
+    "breakdown point": "The least severity at which a method is surely worse than half way to the nearest "
+    "training image.",
+    "seed": "The random number from which a training starts: the spread over seeds is what chance decides.",
+    "preset": "A complete configuration by name: resolution, steps of training, sizes of networks.",
+    "capture": "What methods are trained and judged on: a synthetic person filmed by many cameras, with its exact "
+    "truth.",
+    "scene": "What a capture shows: a body, its clothes, its motion and its light.",
+    "cell": "One method trained once on one capture.",
+}
+FORMS = {**{term.lower(): term for term in GLOSSARY}, "frame [ms]": "frame time", "held-out view": "held-out views"}
+LONGEST_FIRST = "|".join(re.escape(form) for form in sorted(FORMS, key=len, reverse=True))
+WORDS = re.compile(rf"(?<![\w.])({LONGEST_FIRST})(?!\w)", re.IGNORECASE)
+
+
+def anchor(term: str) -> str:
+    """The name of a term's place in the page."""
+    return "term-" + re.sub(r"\W+", "-", term.lower())
+
+
+def split_terms(text: str) -> list[tuple[str, str]]:
+    """The text in pieces, each with the term that it is, or none; of several mentions only the first is one."""
+    pieces: list[tuple[str, str]] = []
+    seen: set[str] = set()
+    for index, piece in enumerate(WORDS.split(text)):
+        term = FORMS[piece.lower()] if index % 2 and FORMS[piece.lower()] not in seen else ""
+        seen.add(term)
+        pieces.append((piece, term))
+    return pieces

@@ -1,0 +1,256 @@
+"""The pictures of a report: every method beside the truth, frame by frame, and each method's worst frames.
+
+Pictures of the page live in an `Album`, each once, compressed; the page decodes those that are looked at. What goes
+into Markdown is a sheet: one PNG.
+"""
+
+import base64
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from ash.capture.dataset import Capture
+from benchmarks.analysis.causes import REGION_COLOURS, psnr_of, worst_frames
+from benchmarks.analysis.names import SPLIT_WORDS, look_of
+from benchmarks.analysis.scores import RANKED_SPLITS
+from benchmarks.cell import metrics
+from benchmarks.cell.cells import Cell, CellResult, ViewScore, stored_prediction
+from benchmarks.cell.views import View, spread
+from benchmarks.report.content import Strip, Tile
+
+PAPER = 236  # Grey behind the subject: dark hair and light cloth both stand out on it.
+MARGIN = 0.06
+FLIP_WHITE = 0.7  # The error at which the error map's colours end.
+QUALITY = 88  # of WebP; what is scored are the stored PNGs.
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Shown:
+    """A cell whose pictures are shown, and what came out of it."""
+
+    cell: Cell
+    result: CellResult
+
+    @property
+    def title(self) -> str:
+        """The method, for readers."""
+        return look_of(self.cell.config.method).title
+
+
+@dataclass(slots=True)
+class Album:
+    """Compressed pictures, as text that a page can hold."""
+
+    pictures: list[str] = field(default_factory=list)
+    size: int = 0  # bytes of all
+
+    def add(self, pixels: np.ndarray) -> int:
+        """Keep a picture, uint8 `[h, w, 3]`; returns its place."""
+        buffer = io.BytesIO()
+        Image.fromarray(pixels).save(buffer, format="WEBP", quality=QUALITY, method=4)
+        text = base64.b64encode(buffer.getvalue()).decode()
+        self.size += len(text)
+        self.pictures.append(text)
+        return len(self.pictures) - 1
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Frame:
+    """One picture with its caption: uint8 `[h, w, 3]`."""
+
+    caption: str
+    score: str
+    pixels: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Frames:
+    """A row of pictures of one size, and the row below it, which begins under the second."""
+
+    title: str
+    images: tuple[Frame, ...]
+    errors: tuple[Frame, ...] = ()
+
+    def strip(self, album: Album) -> Strip:
+        """The row for the page."""
+        tiles = tuple(Tile(caption=f.caption, score=f.score, key=album.add(f.pixels)) for f in self.images)
+        return Strip(title=self.title, tiles=tiles, width=self.images[0].pixels.shape[1])
+
+
+def tracks(capture: Capture, shown: Sequence[Shown], album: Album, *, room: int) -> list[dict[str, Any]]:
+    """Pictures of all methods by camera, frame after frame, until the album has grown by `room` bytes.
+
+    The first camera of each split is always there, of as many frames, evenly spread, as there is room for; further
+    cameras are there if all of theirs fit. A track is {"title", "split", "camera", "frames", "width", "height",
+    "truth": places in the album by frame, "pictures": the same by method, "psnr": dB by method}.
+    """
+    places = [(split, camera) for split in ("novel_pose", "novel_view") for camera in _cameras(shown[0].result, split)]
+    places.sort(key=lambda place: _cameras(shown[0].result, place[0]).index(place[1]))  # Stable: both splits in turn.
+    found: list[dict[str, Any]] = []
+    start = album.size
+    for split, camera in places:
+        frames = sorted(v.frame for v in shown[0].result.views if (v.split, v.camera) == (split, camera))
+        left = room - (album.size - start)
+        if not any(track["split"] == split for track in found):
+            track = _track(capture, shown, album, split, camera, frames, room=left // 2)
+        elif _cost(found) * len(frames) < left:
+            track = _track(capture, shown, album, split, camera, frames, room=left)
+        else:
+            continue
+        found.append(track)
+    return found
+
+
+def choose_views(result: CellResult, split: str, count: int = 2) -> list[ViewScore]:
+    """Views that say the most about a split: the typical one (median foreground PSNR), and another camera's worst."""
+    views = sorted((view for view in result.views if view.split == split), key=psnr_of)
+    if not views:
+        return []
+    chosen = [views[len(views) // 2]]
+    others = sorted(views, key=lambda view: view.camera == chosen[0].camera)  # Stable: worst first within each half.
+    return chosen + others[: count - 1] if len(views) > 1 else chosen
+
+
+def comparisons(capture: Capture, shown: Sequence[Shown]) -> list[Frames]:
+    """Two held-out views and two of held-out motion, chosen by the first method's scores."""
+    views = [view for split in RANKED_SPLITS for view in choose_views(shown[0].result, split)]
+    return [_compare(capture, shown, view) for view in views]
+
+
+def worst(capture: Capture, shown: Shown, *, count: int) -> list[Frames]:
+    """A method's worst frames of the held-out motion: truth, prediction, FLIP error, and what explains it."""
+    found = []
+    for cause in worst_frames(capture, shown.cell, shown.result, count=count):
+        view, truth, prediction = cause.view, cause.truth, cause.predicted
+        crop = _crop([truth, prediction])
+        flip = view.scores["foreground", "flip"]
+        images = (
+            Frame(caption="Truth", score="", pixels=on_paper(truth[crop])),
+            Frame(caption=shown.title, score=f"{psnr_of(view):.1f} dB", pixels=on_paper(prediction[crop])),
+            Frame(caption="FLIP error", score=f"{flip:.3f}", pixels=_flip(prediction, truth, crop)),
+            Frame(caption="Regions", score="", pixels=_paint(cause.map[crop])),
+        )
+        where = f"{shown.title}, camera {view.camera}, frame {view.frame}"
+        found.append(Frames(title=f"{where}. {cause.explanation}", images=images))
+    return found
+
+
+def sheet(rows: Sequence[Frames], *, scale: int = 2) -> bytes:
+    """All rows in one PNG with captions, for Markdown and README."""
+    font = ImageFont.load_default(size=13)
+    gap, caption = 10, 34
+    lines = [line for row in rows for line in (row.images, row.errors) if line]
+    columns = max(len(row.images) for row in rows)
+    wide = max(frame.pixels.shape[1] for line in lines for frame in line) * scale + gap
+    heights = [max(frame.pixels.shape[0] for frame in line) * scale + caption + gap for line in lines]
+    paper = Image.new("RGB", (columns * wide + gap, sum(heights) + gap), (255, 255, 255))
+    pen, top = ImageDraw.Draw(paper), gap
+    for line, height in zip(lines, heights, strict=True):
+        indent = columns - len(line)  # Errors stand below their methods, not below the truth.
+        for index, frame in enumerate(line):
+            left, big = gap + (indent + index) * wide, Image.fromarray(frame.pixels)
+            size = (big.width * scale, big.height * scale)
+            paper.paste(big.resize(size, Image.Resampling.NEAREST), (left, top + caption))
+            pen.text((left, top), frame.caption, fill=(20, 25, 35), font=font)
+            pen.text((left, top + 16), frame.score, fill=(95, 105, 120), font=font)
+        top += height
+    buffer = io.BytesIO()
+    paper.save(buffer, format="PNG", optimize=True)
+    return buffer.getvalue()
+
+
+def on_paper(on_black: np.ndarray) -> np.ndarray:
+    """A prediction or truth on black, uint8 RGBA, over the paper's grey: uint8 `[h, w, 3]`."""
+    alpha = on_black[..., 3:].astype(float) / 255
+    return np.clip(np.rint(on_black[..., :3] + PAPER * (1 - alpha)), 0, 255).astype(np.uint8)
+
+
+def _track(
+    capture: Capture, shown: Sequence[Shown], album: Album, split: str, camera: str, frames: list[int], *, room: int
+) -> dict[str, Any]:
+    truths = {frame: metrics.on_black(capture.image(camera, frame)) for frame in frames}
+    crop = _crop(list(truths.values()))
+    scores = [{v.frame: psnr_of(v) for v in s.result.views if (v.split, v.camera) == (split, camera)} for s in shown]
+    kept, keys = [frames[0]], {}
+    before = album.size
+    for frame in (frames[0], *frames[1:]):
+        if frame != frames[0] and frame not in kept:
+            continue
+        images = [truths[frame]]
+        images += [stored_prediction(s.cell, capture, View(split=split, camera=camera, frame=frame)) for s in shown]
+        keys[frame] = [album.add(on_paper(image[crop])) for image in images]
+        if frame == frames[0]:
+            fit = max(1, room // max(1, album.size - before))
+            kept = [frames[i] for i in spread(len(frames), min(len(frames), fit))]
+    shape = truths[frames[0]][crop].shape
+    kept = sorted(keys)
+    return {
+        "title": f"{SPLIT_WORDS[split].capitalize()}, camera {camera}",
+        "split": split,
+        "camera": camera,
+        "frames": kept,
+        "width": shape[1],
+        "height": shape[0],
+        "truth": [keys[frame][0] for frame in kept],
+        "pictures": [[keys[frame][1 + i] for frame in kept] for i in range(len(shown))],
+        "psnr": [[round(score[frame], 3) for frame in kept] for score in scores],
+        "bytes": album.size - before,
+    }
+
+
+def _cost(tracks: Sequence[dict[str, Any]]) -> float:
+    """Bytes per frame so far."""
+    return sum(track["bytes"] for track in tracks) / sum(len(track["frames"]) for track in tracks)
+
+
+def _cameras(result: CellResult, split: str) -> list[str]:
+    return list(dict.fromkeys(view.camera for view in result.views if view.split == split))
+
+
+def _compare(capture: Capture, shown: Sequence[Shown], view: ViewScore) -> Frames:
+    """The comparison of several methods on one view, cropped to the subject, with FLIP errors below."""
+    truth = metrics.on_black(capture.image(view.camera, view.frame))
+    place = View(split=view.split, camera=view.camera, frame=view.frame)
+    predictions = [stored_prediction(s.cell, capture, place) for s in shown]
+    crop = _crop([truth, *predictions])
+    ceiling = view.scores.get(("foreground", "noise_ceiling"))
+    noise = "" if ceiling is None else f"noise ceiling {ceiling:.1f} dB"
+    images, errors = [Frame(caption="Truth", score=noise, pixels=on_paper(truth[crop]))], []
+    for each, prediction in zip(shown, predictions, strict=True):
+        own = next(
+            v for v in each.result.views if (v.split, v.camera, v.frame) == (view.split, view.camera, view.frame)
+        )
+        flip = own.scores["foreground", "flip"]
+        images.append(Frame(caption=each.title, score=f"{psnr_of(own):.1f} dB", pixels=on_paper(prediction[crop])))
+        errors.append(Frame(caption="FLIP error", score=f"{flip:.3f}", pixels=_flip(prediction, truth, crop)))
+    return Frames(
+        title=f"{SPLIT_WORDS[view.split]}, camera {view.camera}, frame {view.frame}",
+        images=tuple(images),
+        errors=tuple(errors),
+    )
+
+
+def _crop(images: Sequence[np.ndarray]) -> tuple[slice, slice]:
+    """The rows and columns that any image covers, with a margin."""
+    covered = np.any([image[..., 3] > 8 for image in images], axis=0)
+    extent = max(covered.any(axis).sum() for axis in (0, 1))
+    return metrics.occupied(covered, max(3, round(MARGIN * extent))) or (slice(None), slice(None))
+
+
+def _flip(prediction: np.ndarray, truth: np.ndarray, crop: tuple[slice, slice]) -> np.ndarray:
+    """FLIP error as colours from black (none) over purple and orange to light yellow (FLIP_WHITE and more)."""
+    from matplotlib import colormaps
+
+    error = metrics.flip_map(prediction[..., :3], truth[..., :3])[crop]
+    colours = colormaps["magma"](np.clip(error / FLIP_WHITE, 0, 1))[..., :3]
+    return np.rint(np.asarray(colours) * 255).astype(np.uint8)
+
+
+def _paint(regions: np.ndarray) -> np.ndarray:
+    """Regions `[h, w]` in their colours, background as paper."""
+    colours = np.array([*(tuple(bytes.fromhex(colour[1:])) for colour in REGION_COLOURS), (PAPER,) * 3], np.uint8)
+    return colours[regions]

@@ -1,0 +1,132 @@
+"""The sentences that head a report, computed from its numbers. Differences are taken before anything is rounded."""
+
+import numpy as np
+
+from benchmarks.analysis import contrasts, pareto
+from benchmarks.analysis.names import EXACT, SPLIT_WORDS, is_oracle, look_of
+from benchmarks.analysis.scores import FRAME_MS, Quantity, Scores, foreground
+
+TOO_CLOSE_DB = 0.1
+FEW_METHODS = 6
+
+
+def headline(scores: Scores, scene: str) -> str:
+    """The finding of a scene: who is ahead, by how much, where it changes; and who had not finished learning."""
+    short = _told(scores, scene, "not finished")
+    return _finding(scores, scene) + (f" Not at their plateau when training ended: {short}." if short else "")
+
+
+def _finding(scores: Scores, scene: str) -> str:
+    if {"ash", "ddc"} <= set(scores.methods(scene)):
+        return _duel(scores, scene)
+    ranked = sorted(_means(scores, scene, foreground()), key=lambda pair: -pair[1])
+    if not ranked:
+        return f"On {scene}, no method was ranked on held-out views."
+    (best, most), *others = ranked
+    text = f"On {scene}, {look_of(best).title} is best on held-out views with {most:.1f} dB"
+    return text + (f", {most - others[0][1]:.1f} dB ahead of {look_of(others[0][0]).title}." if others else ".")
+
+
+def remarks(scores: Scores, scene: str) -> list[str]:
+    """What else must be known to read the numbers: the exact surface, cost, template, noise, seeds, failures."""
+    found = [_exact(scores, scene), _cost(scores, scene), _template(scores, scene), _noise(scores, scene)]
+    choices = scores.outcomes.query("scene == @scene and choice != ''").drop_duplicates(["method", "choice"])
+    said = [f"{look_of(method).title}: {choice}" for method, choice in zip(choices.method, choices.choice, strict=True)]
+    found.append(f"What a search found to suffice: {'; '.join(said)}." if said else "")
+    dead = _told(scores, scene, "dead")
+    found.append(f"Decoders carry nothing, the same output in every frame: {dead}." if dead else "")
+    failed = [look_of(method).title for method in scores.methods(scene) if scores.failed(scene, method)]
+    found.append(f"Failed, and scored with the worst value: {', '.join(failed)}." if failed else "")
+    if scores.seeds == 1:
+        found.append("One seed: a difference of a few tenths of a dB may be chance; --seeds 3 gives intervals.")
+    return [remark for remark in found if remark]
+
+
+def frontier(scores: Scores, scene: str) -> tuple[str, ...]:
+    """Who is beaten by nobody in accuracy and speed together, what the field covers, and what would have sufficed."""
+    found = []
+    for split, where in SPLIT_WORDS.items():
+        competing = contrasts.candidates(scores, scene, split)
+        if len(competing) < 2:
+            continue
+        names = ", ".join(look_of(name).title for name in pareto.front(competing))
+        area = f"hypervolume {pareto.hypervolume(competing):.1f} dB·decades"
+        if scores.seeds > 1:
+            low, high = pareto.hypervolume_interval(competing, rng=np.random.default_rng(0))
+            area += f" [{low:.1f}, {high:.1f}]"
+        sentence = f"On {where}, nobody beats {names} in both accuracy and speed ({area})."
+        sufficient = pareto.smallest_sufficient(competing)
+        if sufficient is not None:
+            bound = f"{pareto.SUFFICIENT_DB} dB to {look_of(sufficient.best).title}"
+            cheapest = f"{look_of(sufficient.name).title}, the cheapest that loses less than {bound}"
+            sentence += f" Smallest sufficient: {cheapest} (95 % bound {sufficient.loss_bound_db:.2f} dB)."
+        found.append(sentence)
+    return tuple(found)
+
+
+def _duel(scores: Scores, scene: str) -> str:
+    fallen = [look_of(method).title for method in ("ash", "ddc") if scores.failed(scene, method)]
+    if fallen:
+        return f"On {scene}, {' and '.join(fallen)} failed, so ASH and DDC cannot be compared."
+    parts = []
+    for split, where in SPLIT_WORDS.items():
+        ours, theirs = (scores.get(scene, method, foreground(split)) for method in ("ash", "ddc"))
+        if ours and theirs:
+            standing = _standing(ours.mean - theirs.mean)
+            parts.append(f"{standing} on {where} ({ours.mean:.1f} against {theirs.mean:.1f} dB)")
+    return f"On {scene}, ASH is {' and '.join(parts)}." if parts else f"On {scene}, ASH and DDC were not both scored."
+
+
+def _standing(margin: float) -> str:
+    if abs(margin) < TOO_CLOSE_DB:
+        return "level with DDC"
+    return f"{abs(margin):.1f} dB {'ahead of' if margin > 0 else 'behind'} DDC"
+
+
+def _exact(scores: Scores, scene: str) -> str:
+    ours, theirs = (scores.get(scene, EXACT[method], foreground()) for method in ("ash", "ddc"))
+    if ours is None or theirs is None or not scores.whole(scene, *EXACT.values()):
+        return ""
+    margin = ours.mean - theirs.mean
+    figures = f"(ASH {ours.mean:.1f}, DDC {theirs.mean:.1f} dB on held-out views)"
+    if abs(margin) < TOO_CLOSE_DB:
+        return f"Given the exact surface, the two are level {figures}."
+    return f"Given the exact surface, {'ASH' if margin > 0 else 'the mesh'} leads by {abs(margin):.1f} dB {figures}."
+
+
+def _cost(scores: Scores, scene: str) -> str:
+    """Of many methods only the main two, the fastest and the slowest."""
+    known = [(method, ms) for method, ms in _means(scores, scene, FRAME_MS) if scores.whole(scene, method)]
+    if len(known) > FEW_METHODS:
+        ends = [pair(known, key=lambda each: each[1])[0] for pair in (min, max)]
+        known = [(method, ms) for method, ms in known if method in ("ash", "ddc", *ends)]
+    parts = [f"{look_of(method).title} {ms:.0f} ms" for method, ms in known]
+    return f"A frame takes {', '.join(parts)} on one core." if parts else ""
+
+
+def _template(scores: Scores, scene: str) -> str:
+    errors = {split: _means(scores, scene, Quantity(split, "", "template_mm")) for split in SPLIT_WORDS}
+    if not errors["novel_view"]:
+        return ""
+    method, error = errors["novel_view"][0]
+    later = dict(errors["novel_pose"]).get(method)
+    test = "" if later is None else f", {later:.1f} mm on held-out motion"
+    return f"The template that methods were given is off by {error:.1f} mm (root mean square){test}."
+
+
+def _told(scores: Scores, scene: str, what: str) -> str:
+    """The methods of which a cell tells so of its training."""
+    methods = scores.outcomes.query(f"scene == @scene and {what}")["method"].unique()
+    return ", ".join(look_of(method).title for method in scores.methods(scene) if method in methods)
+
+
+def _noise(scores: Scores, scene: str) -> str:
+    ceiling = foreground(metric="noise_ceiling")
+    found = [score for method in scores.methods(scene) if (score := scores.get(scene, method, ceiling))]
+    return f"Noise of the true images allows at most {found[0].mean:.1f} dB on the foreground." if found else ""
+
+
+def _means(scores: Scores, scene: str, quantity: Quantity) -> list[tuple[str, float]]:
+    """What each method that is no oracle has of a quantity."""
+    names = [method for method in scores.methods(scene) if not is_oracle(method)]
+    return [(method, score.mean) for method in names if (score := scores.get(scene, method, quantity))]

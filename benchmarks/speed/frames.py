@@ -1,0 +1,284 @@
+"""How long a frame takes, stage by stage, and a step of training, beside their definitions: `ash-bench speed frame`."""
+
+import math
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ash.avatar import AshAvatar
+from ash.capture.dataset import Camera, Capture, Pose
+from ash.capture.formats import load_capture
+from ash.config import AshConfig
+from ash.files import write_json
+from ash.gaussians.splatting import Splatted, splat_naive
+from ash.gaussians.texels import place_naive, pose_naive
+from ash.inference import Player, psnr
+from ash.model import AshModel, views_of
+from ash.presets import named
+from ash.protocol import StageClock
+from ash.training.adam import Adam
+from ash.training.batches import Batch, draw_batch, load_training_images
+from ash.training.losses import l1_ssim_loss, l1_ssim_loss_naive, ssim_target
+from benchmarks.speed.rows import SpeedRow, as_json, row_of
+
+STAGES = ("stg1", "stg2", "stg3", "stg4")
+# ASH, appendix "Runtime Analysis": milliseconds on an A100 at 1285x940, by texels per side.
+PAPER_MS = {
+    128: {"stg1": 20.28, "stg2": 1.93, "stg3": 5.57, "stg4": 1.91, "frame": 29.69},
+    256: {"stg1": 21.03, "stg2": 3.60, "stg3": 7.00, "stg4": 2.11, "frame": 33.74},
+    512: {"stg1": 24.25, "stg2": 16.34, "stg3": 18.45, "stg4": 4.31, "frame": 63.35},
+}
+CAPTURE = "mannequin-ci-0"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Subject:
+    """A configuration to be timed."""
+
+    name: str
+    config: AshConfig
+    width: int
+    height: int
+    trains: bool = False  # time steps of training, too
+
+
+def subjects() -> tuple[Subject, ...]:
+    """`cpu` at four resolutions of the texel lattice, `frugal`, and the paper's."""
+    cpu = named("cpu")
+    lattices = {texels: replace(cpu, model=replace(cpu.model, texels=texels)) for texels in (64, 128, 256, 512)}
+    small = [
+        Subject(
+            name="cpu" if config == cpu else f"cpu@{texels}", config=config, width=512, height=512, trains=config == cpu
+        )
+        for texels, config in lattices.items()
+    ]
+    frugal = Subject(name="frugal", config=named("frugal"), width=512, height=512, trains=True)
+    return (*small, frugal, Subject(name="paper", config=named("paper"), width=1285, height=940))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureAgreement:
+    """How far the image that is played is from the one by the definitions, which the avatar was trained against."""
+
+    preset: str
+    gaussians: int
+    psnr_db: float
+    engine: str  # of the decoders, on one thread
+
+
+def speed_frame(
+    capture: Capture,
+    *,
+    timed: tuple[Subject, ...] | None = None,
+    threads: tuple[int, ...] = (1, 2),
+    rounds: int = 15,
+) -> Iterator[list[SpeedRow] | PictureAgreement]:
+    """Time frames and steps on a capture; yields results as they come. `timed`: all `subjects()` where none are given.
+
+    Nothing is trained for long, the template's graph networks for a step: a network takes its time whatever its weights
+    are, and texels start as they are drawn.
+    Frames follow each other as in playback. Large presets are timed a tenth as often.
+    """
+    before = torch.get_num_threads()
+    try:
+        for subject in timed or subjects():
+            config = subject.config
+            few = max(2, rounds // 10) if config.model.width >= 64 else rounds
+            avatar = AshAvatar(replace(config, template=replace(config.template, steps=1)), capture)
+            _wake(avatar)
+            camera = scaled_camera(next(iter(capture.cameras.values())), subject.width, subject.height)
+            players = {}
+            for count in threads:
+                torch.set_num_threads(count)
+                players[count] = Player(avatar, capture.motion, camera)
+            torch.set_num_threads(1)
+            yield agreement(avatar, players[threads[0]], subject.name, capture, camera)
+            yield _time_frames(avatar, players, subject.name, capture, camera, rounds=few)
+            if subject.trains:
+                yield _time_steps(avatar, subject.name, capture, rounds=rounds)
+    finally:
+        torch.set_num_threads(before)
+
+
+def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
+    """The same view in another size of image, the subject as large in the height."""
+    K = camera.K.copy()
+    K[:2] *= height / camera.height
+    K[0, 2] += (width - camera.width * height / camera.height) / 2
+    return Camera(name=camera.name, width=width, height=height, K=K, viewmat=camera.viewmat)
+
+
+def _wake(avatar: AshAvatar) -> None:
+    """Give the networks something to say: an untrained head is zero."""
+    generator = torch.Generator().manual_seed(0)
+    decoders = avatar.module.decoders
+    assert decoders is not None
+    for name, parameter in decoders.named_parameters():
+        if "head" in name or name == "shapes":
+            parameter.data.copy_(0.01 * torch.randn(parameter.shape, generator=generator))
+
+
+@torch.no_grad()
+def frame_by_definition(model: AshModel, capture: Capture, frame: int, camera: Camera) -> Tensor:
+    """The image of a frame by the definitions alone, rgb `[h, w, 3]`."""
+    posed = model.template.pose(Pose(capture.motion, frame))
+    canonical, normals, transforms = place_naive(model.lattice, posed)
+    conditions = replace(
+        model.conditions(Pose(capture.motion, frame)), canonical=canonical, normals=normals, transforms=transforms
+    )
+    return _splatted_by_definition(model, model.decode(conditions), conditions, [camera], None).rgb[0]
+
+
+def _splatted_by_definition(
+    model: AshModel, raw: Tensor, conditions: object, cameras: list[Camera], background: Tensor | None
+) -> Splatted:
+    gaussians = pose_naive(raw, conditions, model.config, model.light)  # type: ignore[arg-type]
+    return splat_naive(gaussians, **views_of(cameras), background=background, dilation=model.config.dilation)
+
+
+def agreement(avatar: AshAvatar, player: Player, preset: str, capture: Capture, camera: Camera) -> PictureAgreement:
+    """Foreground PSNR between the image of a frame as it is played and the one by the definitions."""
+    frame = capture.splits["train"].frames[-1]
+    drawn = player.draw(frame, camera)
+    truth = frame_by_definition(avatar.module, capture, frame, camera).clamp(0, 1).numpy()
+    engine = player.engine.name if player.engine else "none"
+    agrees = psnr(drawn[..., :3], truth, drawn[..., 3])
+    return PictureAgreement(preset=preset, gaussians=avatar.gaussian_count(), psnr_db=agrees, engine=engine)
+
+
+def _time_frames(
+    avatar: AshAvatar, players: dict[int, Player], preset: str, capture: Capture, camera: Camera, *, rounds: int
+) -> list[SpeedRow]:
+    """Rows of every stage and of the whole frame, by threads; the definitions first, drawn once."""
+    threads = tuple(players)
+    frames = capture.splits["train"].frames
+    start = time.perf_counter()
+    torch.set_num_threads(1)
+    frame_by_definition(avatar.module, capture, frames[0], camera)
+    naive_ms = (time.perf_counter() - start) * 1e3
+    samples: dict[tuple[str, int], list[float]] = defaultdict(list)
+    for number in range(rounds + 1):
+        for count in threads:
+            torch.set_num_threads(count)
+            # Another motion frame every time, and the history of each posed already, as in playback.
+            frame = frames[(1 + number * len(threads) + threads.index(count)) % len(frames)]
+            clock, start = StageClock(), time.perf_counter()
+            players[count].draw(frame, camera, clock=clock)
+            elapsed = (time.perf_counter() - start) * 1e3
+            if number:
+                for stage in STAGES:
+                    samples[stage, count].append(clock.ms[stage])
+                samples["frame", count].append(elapsed)
+    size = f"{camera.width}x{camera.height}"
+    rows = [row_of("frame", size, "forward", 1, f"{preset}-naive", [naive_ms], naive_ms)]
+    for (what, count), taken in samples.items():
+        rows.append(row_of(what, size, "forward", count, preset, taken, naive_ms if what == "frame" else math.nan))
+    return rows
+
+
+def _time_steps(avatar: AshAvatar, preset: str, capture: Capture, *, rounds: int) -> list[SpeedRow]:
+    """A step of training on the capture's images, with the definitions in torch and with the kernels, by turns."""
+    torch.set_num_threads(1)
+    images = load_training_images(capture)
+    groups = avatar.parameter_groups()
+    optimisers = {name: Adam([group | {"lr": 0.0} for group in groups]) for name in ("naive", "native")}
+    samples: dict[str, list[float]] = {"naive": [], "native": []}
+    for number in range(1 + max(1, rounds // 5)):
+        for name in ("naive", *["native"] * 5):
+            batch = draw_batch(images, avatar.config.training, 0, number)
+            avatar._conditions_of(batch.frame)
+            start = time.perf_counter()
+            _step(avatar, batch, optimisers[name], naive=name == "naive")
+            if number:
+                samples[name].append((time.perf_counter() - start) * 1e3)
+    camera = next(iter(images.cameras.values()))
+    size = f"{camera.width}x{camera.height}"
+    reference = min(samples["naive"])
+    return [
+        row_of(
+            "train_step",
+            size,
+            "forward+backward",
+            1,
+            preset if name == "native" else f"{preset}-naive",
+            taken,
+            reference,
+        )
+        for name, taken in samples.items()
+    ]
+
+
+def _step(avatar: AshAvatar, batch: Batch, optimiser: Adam, *, naive: bool) -> None:
+    training = avatar.config.training
+    conditions = avatar._conditions_of(batch.frame)
+    if naive:
+        raw = avatar.module.decode(conditions)
+        drawn = _splatted_by_definition(avatar.module, raw, conditions, batch.cameras, batch.background).rgb
+    else:
+        drawn = avatar.draw_training_views(batch.frame, batch.cameras, batch.background, training.steps)
+    loss = l1_ssim_loss_naive if naive else l1_ssim_loss
+    losses = [
+        loss(image, ssim_target(target), l1_weight=training.l1_weight, ssim_weight=training.ssim_weight)
+        for image, target in zip(drawn, batch.targets, strict=True)
+    ]
+    optimiser.zero_grad()
+    torch.stack(losses).mean().backward()  # type: ignore[no-untyped-call]
+    optimiser.step()
+
+
+def speed_capture(data: Path) -> Capture:
+    """The small mannequin of the suite `ci`, rendered if it is not there."""
+    from benchmarks.provenance import cores
+    from benchmarks.suites.captures import make_capture_in
+    from benchmarks.suites.suites import CaptureSpec
+
+    make_capture_in(CaptureSpec(scene="mannequin", size="ci"), data / CAPTURE, workers=cores())
+    return replace(load_capture(data / CAPTURE), store=data / "templates")
+
+
+def captured(folder: Path | None) -> Capture:
+    """The capture in a folder, or the one that is timed where none is named."""
+    if folder is None:
+        return speed_capture(Path("data"))
+    return replace(load_capture(folder), store=folder.parent / "templates")
+
+
+def main(json_path: Path | None, folder: Path | None = None) -> int:
+    """Print the table of a capture, and write it to `json_path`; returns the exit code."""
+    capture = captured(folder)
+    print(f"{'what':10} {'size':9} {'pass':17} th {'by':12} {'min ms':>9} {'median ms':>9} {'naive/min':>9} {'1/s':>6}")
+    rows: list[SpeedRow] = []
+    agreements: list[PictureAgreement] = []
+    for result in speed_frame(capture):
+        if isinstance(result, PictureAgreement):
+            agreements.append(result)
+            about = f"{result.gaussians:,} Gaussians, decoders in {result.engine}"
+            print(f"  {result.preset}: {about}; agrees with the definitions to {result.psnr_db:.1f} dB", flush=True)
+            continue
+        rows += result
+        for row in result:
+            ratio = "" if math.isnan(row.ratio) else f"{row.ratio:9.1f}"
+            rate = f"{1e3 / row.median_ms:6.1f}" if row.what in ("frame", "train_step") else ""
+            print(
+                f"{row.what:10} {row.size:9} {row.pass_:17} {row.threads:2} {row.candidate:12}"
+                f" {row.min_ms:9.2f} {row.median_ms:9.2f} {ratio:>9} {rate:>6}",
+                flush=True,
+            )
+    print("the paper, on an A100 with its learned template at 1285x940:")
+    for texels, found in PAPER_MS.items():
+        stages = ", ".join(f"{name} {ms:.2f}" for name, ms in found.items())
+        print(f"  {texels} texels: {stages} ms, {1e3 / found['frame']:.2f} frames per second")
+    if json_path is not None:
+        content = {"rows": [_as_json(row) for row in rows], "agreements": [vars(a) for a in agreements]}
+        write_json(json_path, content | {"paper_ms": PAPER_MS})
+    return 0
+
+
+def _as_json(row: SpeedRow) -> dict[str, object]:
+    fields = as_json(row)
+    return fields | {"ratio": None if math.isnan(row.ratio) else row.ratio}

@@ -1,0 +1,269 @@
+"""How fast the kernels are beside their definitions, all in one run: `ash-bench speed kernels`."""
+
+import statistics
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import ash.gaussians.splatting
+from ash.files import InputError, write_json
+from ash.gaussians.gaussians import Gaussians
+from ash.gaussians.splatting import splat, splat_naive
+from ash.mesh.rasterizing import rasterize_mesh, rasterize_mesh_naive
+from ash.native.library import fma_peak, instruction_set, stage_ms
+from ash.training.losses import l1_ssim_loss, l1_ssim_loss_naive, ssim_target
+from benchmarks.cell.timing import peak_memory_mb
+from benchmarks.speed.rows import SpeedRow, TimedCandidate, _print_rows, as_json, rows_of, time_interleaved
+from benchmarks.speed.scenes import SplatScene, body_mesh, splat_scene
+
+# Floating point operations of one splat at one pixel, counted in native/blend.inc: the exponent and its power of two,
+# the cap and the transmittance, four accumulated channels; backward all but the channels again, and the gradients.
+FORWARD_FLOPS = 36
+BACKWARD_FLOPS = 66
+LOSS_SIZES = {"256": (256, 256), "512": (512, 512), "1285x940": (940, 1285)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplatDetail:
+    """Where the time of the native splatter goes in one scene."""
+
+    size: str
+    threads: int
+    covered: float  # share of the pixels that any splat reaches
+    pairs: int  # splats blended, summed over pixels
+    stages_ms: dict[str, float]  # minimum of each
+    forward_pairs_per_second: float
+    backward_pairs_per_second: float
+    forward_peak_share: float  # of the measured peak of fused multiply-adds
+    backward_peak_share: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mixture:
+    """What splatting and torch's convolutions cost each other, both on two threads."""
+
+    convolution_ms: float
+    splat_ms: float
+    alternating_ms: float
+
+    @property
+    def ratio(self) -> float:
+        """Alternating over the sum of both alone; 1: they do not disturb each other."""
+        return self.alternating_ms / (self.convolution_ms + self.splat_ms)
+
+
+def speed_kernels(
+    *, rounds: int = 3, threads: tuple[int, ...] = (1, 2)
+) -> Iterator[list[SpeedRow] | SplatDetail | Mixture]:
+    """Time splatting, loss and rasteriser, naive and native by turns; yields results as they come."""
+    for scene in (splat_scene("S"), splat_scene("P")):
+        yield from time_splat(scene, rounds=rounds, threads=threads)
+    for size, (height, width) in LOSS_SIZES.items():
+        yield _time_loss(size, height, width, rounds=rounds, threads=threads)
+    for size, pixels in (("256", 256), ("512", 512)):
+        yield _time_rasterizer(size, pixels, rounds=rounds, threads=threads)
+    yield time_mixture(rounds=10 * rounds)
+
+
+def time_splat(scene: SplatScene, *, rounds: int, threads: tuple[int, ...]) -> Iterator[list[SpeedRow] | SplatDetail]:
+    """Rows of forward and of forward with backward, naive and native by turns, then a detail per number of threads."""
+    cameras = {"viewmats": scene.viewmats, "Ks": scene.Ks, "width": scene.width, "height": scene.height}
+    leaves = {name: getattr(scene.gaussians, name).clone().requires_grad_() for name in Gaussians.__slots__}
+    gradient = torch.randn(1, scene.height, scene.width, 3, generator=torch.Generator().manual_seed(1))
+    stages: dict[int, list[dict[str, float]]] = {count: [] for count in threads}
+
+    def forward(draw: Callable[..., ash.gaussians.splatting.Splatted], **more: int) -> None:
+        with torch.no_grad():
+            draw(scene.gaussians, **cameras, **more)
+
+    def both(draw: Callable[..., ash.gaussians.splatting.Splatted], **more: int) -> None:
+        for leaf in leaves.values():
+            leaf.grad = None
+        torch.autograd.backward(draw(Gaussians(**leaves), **cameras, **more).rgb, gradient)
+        if more:
+            stages[more["threads"]].append(stage_ms())
+
+    for pass_, run in (("forward", forward), ("forward+backward", both)):
+        candidates = [
+            TimedCandidate(name="naive", threads=torch.get_num_threads(), call=lambda run=run: run(splat_naive))
+        ]  # type: ignore[misc]
+        candidates += [
+            TimedCandidate(
+                name="native", threads=count, repeats=10, call=lambda run=run, n=count: run(splat, threads=n)
+            )  # type: ignore[misc]
+            for count in threads
+        ]
+        yield rows_of("splat", scene.name, pass_, time_interleaved(candidates, rounds=rounds))
+    covered, pairs = count_pairs(scene)
+    for count in threads:
+        minima = {stage: min(sample[stage] for sample in stages[count]) for stage in stages[count][0]}
+        peak = fma_peak(count)
+        forward_rate, backward_rate = (1e3 * pairs / minima[stage] for stage in ("blend", "blend_backward"))
+        yield SplatDetail(
+            size=scene.name,
+            threads=count,
+            covered=covered,
+            pairs=pairs,
+            stages_ms=minima,
+            forward_pairs_per_second=forward_rate,
+            backward_pairs_per_second=backward_rate,
+            forward_peak_share=forward_rate * FORWARD_FLOPS / peak,
+            backward_peak_share=backward_rate * BACKWARD_FLOPS / peak,
+        )
+
+
+def time_mixture(*, rounds: int, threads: int = 2) -> Mixture:
+    """Forward and backward of a convolution and of scene S, each alone and by turns: medians in milliseconds."""
+    scene = splat_scene("S")
+    leaves = {name: getattr(scene.gaussians, name).clone().requires_grad_() for name in Gaussians.__slots__}
+    layer = torch.nn.Conv2d(32, 32, 3, padding=1)
+    features = torch.randn(1, 32, 64, 64, generator=torch.Generator().manual_seed(0))
+
+    def convolve() -> None:
+        layer(features).square().sum().backward()
+
+    def draw() -> None:
+        drawn = splat(
+            Gaussians(**leaves),
+            viewmats=scene.viewmats,
+            Ks=scene.Ks,
+            width=scene.width,
+            height=scene.height,
+            threads=threads,
+        )
+        drawn.rgb.sum().backward()
+
+    def both() -> None:
+        convolve()
+        draw()
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        medians = []
+        for call in (convolve, draw, both):
+            candidate = TimedCandidate(name="mixture", threads=threads, call=call)
+            samples = time_interleaved([candidate], rounds=rounds)["mixture", threads]
+            medians.append(statistics.median(samples[len(samples) // 10 :]))
+    finally:
+        torch.set_num_threads(before)
+    return Mixture(convolution_ms=medians[0], splat_ms=medians[1], alternating_ms=medians[2])
+
+
+def count_pairs(scene: SplatScene) -> tuple[float, int]:
+    """The share of covered pixels, and the pairs of a pixel and a splat that contributes to it, by the definition."""
+    gaussians, counted, covered = scene.gaussians, 0, 0
+    projected = ash.gaussians.splatting._project_naive(
+        gaussians,
+        ash.gaussians.splatting._project_means(gaussians.means, scene.viewmats[0], scene.Ks[0], near=0.01),
+        scene.viewmats[0],
+        scene.Ks[0],
+        width=scene.width,
+        height=scene.height,
+        dilation=0.3,
+        compensate=False,
+        near=0.01,
+    )
+
+    def count(splats: Tensor, pixels: Tensor) -> Tensor:
+        nonlocal counted, covered
+        alpha, left = ash.gaussians.splatting._opacities_naive(splats, pixels)
+        contributes = ((alpha > 0) & (left >= ash.gaussians.splatting.TRANSMITTANCE_MIN)).sum(0)
+        counted += int(contributes.sum())
+        covered += int((contributes > 0).sum())
+        return torch.zeros(len(pixels), 5)
+
+    ash.gaussians.splatting._draw_naive(projected, width=scene.width, height=scene.height, tile=16, composite=count)
+    return covered / (scene.width * scene.height), counted
+
+
+def _time_loss(size: str, height: int, width: int, *, rounds: int, threads: tuple[int, ...]) -> list[SpeedRow]:
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(height, width, 3, generator=generator)
+    image = (target + 0.1 * torch.randn(height, width, 3, generator=generator)).requires_grad_()
+    cached = ssim_target(target)
+
+    def run(loss: Callable[..., Tensor], **more: int) -> None:
+        image.grad = None
+        loss(image, cached, l1_weight=0.9, ssim_weight=0.1, **more).backward()
+
+    candidates = [TimedCandidate(name="naive", threads=torch.get_num_threads(), call=lambda: run(l1_ssim_loss_naive))]
+    candidates += [
+        TimedCandidate(name="native", threads=count, repeats=10, call=lambda n=count: run(l1_ssim_loss, threads=n))  # type: ignore[misc]
+        for count in threads
+    ]
+    return rows_of("l1_ssim", size, "forward+backward", time_interleaved(candidates, rounds=2 * rounds))
+
+
+def _time_rasterizer(size: str, pixels: int, *, rounds: int, threads: tuple[int, ...]) -> list[SpeedRow]:
+    vertices, faces = body_mesh(pixels)
+    sides = {"width": pixels, "height": pixels}
+    candidates = [
+        TimedCandidate(
+            name="naive", threads=torch.get_num_threads(), call=lambda: rasterize_mesh_naive(vertices, faces, **sides)
+        )
+    ]
+    candidates += [
+        TimedCandidate(
+            name="native",
+            threads=count,
+            repeats=10,
+            call=lambda n=count: rasterize_mesh(vertices, faces, **sides, threads=n),  # type: ignore[misc]
+        )
+        for count in threads
+    ]
+    return rows_of("rasterize_mesh", size, "forward", time_interleaved(candidates, rounds=max(1, rounds // 3)))
+
+
+def _print_detail(detail: SplatDetail) -> None:
+    stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in detail.stages_ms.items())
+    print(
+        f"  {detail.size}, {detail.threads} thread(s): {stages} ms\n"
+        f"  {detail.pairs / 1e6:.2f} M pairs on {100 * detail.covered:.1f} % of the pixels;"
+        f" blended per second: {detail.forward_pairs_per_second / 1e9:.2f} G forward"
+        f" ({100 * detail.forward_peak_share:.1f} % of the FMA peak),"
+        f" {detail.backward_pairs_per_second / 1e9:.2f} G backward ({100 * detail.backward_peak_share:.1f} %)",
+        flush=True,
+    )
+
+
+def main(what: str, json_path: Path | None) -> int:
+    """Print the table of `what`, and write it to `json_path`; returns the exit code."""
+    if what != "kernels":
+        raise InputError(f"speed: expected kernels, got {what}")
+    print(f"instruction set {instruction_set()}, FMA peak {1e-9 * fma_peak(1):.0f} GFLOP/s on one thread", end="")
+    print(f" and {1e-9 * fma_peak(2):.0f} on two; torch {torch.__version__}, {torch.get_num_threads()} thread(s)")
+    print(f"{'what':15} {'size':9} {'pass':17} th {'by':7} {'min ms':>10} {'median ms':>10} {'ratio':>8}")
+    rows: list[SpeedRow] = []
+    details: list[SplatDetail] = []
+    mixtures: list[Mixture] = []
+    for result in speed_kernels():
+        if isinstance(result, SplatDetail):
+            details.append(result)
+            _print_detail(result)
+        elif isinstance(result, Mixture):
+            mixtures.append(result)
+            print(
+                f"on two threads each: convolution {result.convolution_ms:.2f} ms, splat S {result.splat_ms:.2f} ms,"
+                f" by turns {result.alternating_ms:.2f} ms: {result.ratio:.2f} of the sum"
+            )
+        else:
+            rows += result
+            _print_rows(result)
+    peak_mb = peak_memory_mb()
+    print(f"peak memory of this process, torch and the definitions included: {peak_mb:.0f} MB")
+    if json_path is not None:
+        write_json(
+            json_path,
+            {
+                "rows": [as_json(row) for row in rows],
+                "splat_details": [vars(detail) for detail in details],
+                "mixtures": [vars(mixture) | {"ratio": mixture.ratio} for mixture in mixtures],
+                "peak_rss_mb": peak_mb,
+                "instruction_set": instruction_set(),
+            },
+        )
+    return 0

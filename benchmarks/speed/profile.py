@@ -1,0 +1,177 @@
+"""Where a step of training spends its time, part by part: `ash-bench speed frame --profile`.
+
+The step is the loop's own. Its parts are timed from outside: a part's forward pass as it is called, its backward pass
+from the moment when the gradients of all that it returned are there until those of the part before it are.
+"""
+
+import statistics
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from torch import Tensor
+
+import ash.training.loop
+from ash import presets
+from ash.avatar import AshAvatar
+from ash.capture.dataset import Capture
+from ash.config import TrainingConfig
+from ash.files import write_json
+from ash.gaussians.gaussians import Gaussians
+from ash.gaussians.splatting import Splatted
+from ash.training.batches import TrainingImages, draw_batch, load_training_images
+from baselines.ddc import DdcAvatar, ddc
+from benchmarks.speed.frames import captured
+
+FORWARD = ("batch", "decode", "pose", "draw", "loss")
+BACKWARD = ("loss backward", "draw backward", "pose backward", "decode backward")
+PARTS = (*FORWARD, *BACKWARD, "adam", "rest", "step")  # "step": the whole; "rest": what no other part holds
+ROUNDS = 60
+SUBJECTS = (("ash", "cpu"), ("ash", "frugal"), ("ddc", "cpu"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartTime:
+    """One part of one method's step."""
+
+    method: str
+    preset: str
+    part: str
+    min_ms: float
+    median_ms: float
+
+
+class _Parts:
+    """Seconds of the parts of the step in progress."""
+
+    def __init__(self) -> None:
+        self.spent: dict[str, float] = defaultdict(float)
+        self.gradients_at: dict[str, float] = {}  # when the last gradient of what a part returned was there
+        self.span: dict[str, tuple[float, float]] = {}  # of the last call
+
+    def timed(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        """The same function, with its time counted for the part, and the moment of its results' gradients noted."""
+
+        def run(*arguments: Any, **options: Any) -> Any:
+            start = time.perf_counter()
+            result = call(*arguments, **options)
+            self.span[name] = start, time.perf_counter()
+            self.spent[name] += self.span[name][1] - start
+            for tensor in _tensors_in(result):
+                if tensor.requires_grad and not tensor.is_leaf:
+                    tensor.register_hook(lambda _: self.gradients_at.__setitem__(name, time.perf_counter()))
+            return result
+
+        return run
+
+    def split_backward(self) -> None:
+        """Share out the backward pass, from the loss to Adam, between the parts whose results it passed."""
+        order = [name for name in ("draw", "pose", "decode") if name in self.gradients_at]
+        moments = [self.span["loss"][1], *(self.gradients_at[name] for name in order), self.span["adam"][0]]
+        self.spent |= dict.fromkeys(BACKWARD, 0.0)
+        for name, (begun, done) in zip(("loss", *order), pairwise(moments), strict=True):
+            self.spent[f"{name} backward"] = done - begun
+
+
+def _tensors_in(result: Any) -> list[Tensor]:
+    """What the loss sees of a part's results."""
+    if isinstance(result, Gaussians):
+        return [getattr(result, name) for name in result.__slots__]
+    if isinstance(result, Splatted):
+        return [result.rgb]
+    return [result] if isinstance(result, Tensor) else []
+
+
+def profile_step(
+    method: str, learner: AshAvatar | DdcAvatar, images: TrainingImages, preset: str, *, rounds: int
+) -> list[PartTime]:
+    """The parts of `rounds` steps of the loop, after an epoch that is not counted. The learner learns meanwhile."""
+    config = replace(learner.config.training, warmup="none", warmup_steps=0, steps=10**9)
+    samples = list(_profiled_steps(learner, images, config, rounds))
+    return [
+        PartTime(
+            method=method,
+            preset=preset,
+            part=part,
+            min_ms=1e3 * min(sample[part] for sample in samples),
+            median_ms=1e3 * statistics.median(sample[part] for sample in samples),
+        )
+        for part in PARTS
+    ]
+
+
+def _profiled_steps(
+    learner: AshAvatar | DdcAvatar, images: TrainingImages, config: TrainingConfig, rounds: int
+) -> Iterator[dict[str, float]]:
+    first = learner.config.training.warmup_steps  # Before, decoders do not take part.
+    warm = len(images.frames)  # An epoch: each frame's template is posed once.
+    with tempfile.TemporaryDirectory() as folder:
+        run = ash.training.loop._Run(learner, config, images, Path(folder))
+        for number in range(rounds + warm):
+            run.step = first + number
+            parts = _Parts()
+            start = time.perf_counter()
+            with _watched(parts, learner, run):
+                run.advance(parts.timed("batch", draw_batch)(images, config, 0, run.step))
+            whole = time.perf_counter() - start
+            parts.split_backward()
+            if number >= warm:
+                yield parts.spent | {"rest": whole - sum(parts.spent.values()), "step": whole}
+
+
+@contextmanager
+def _watched(parts: _Parts, learner: AshAvatar | DdcAvatar, run: ash.training.loop._Run) -> Iterator[None]:
+    """Count the parts of the step that the body makes."""
+    if isinstance(learner, AshAvatar):
+        drawing = [(learner, "_decode", "decode"), (learner.module, "pose", "pose"), (learner.module, "draw", "draw")]
+    else:
+        drawing = [
+            (learner, "_training_texture", "decode"),
+            (learner.module, "refined", "pose"),
+            (learner.module, "draw", "draw"),
+        ]
+    rest = [(ash.training.loop, "view_loss", "loss"), (run.optimiser, "step", "adam")]
+    with ExitStack() as stack:
+        for owner, name, part in (*drawing, *rest):
+            stack.enter_context(patch.object(owner, name, parts.timed(part, getattr(owner, name))))
+        yield
+
+
+def profiles(capture: Capture) -> Iterator[list[PartTime]]:
+    """The subjects' steps on one thread, as they learn from a capture."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        images = load_training_images(capture)
+        for method, preset in SUBJECTS:
+            make = presets.ash if method == "ash" else ddc
+            learner: AshAvatar | DdcAvatar = make(capture, seed=0, preset=preset)
+            yield profile_step(method, learner, images, preset, rounds=ROUNDS)
+    finally:
+        torch.set_num_threads(before)
+
+
+def print_profile(profile: list[PartTime]) -> None:
+    """A line per part: least and median milliseconds."""
+    print(f"{profile[0].method}, {profile[0].preset}: milliseconds of a training step on one thread, least and median")
+    for row in profile:
+        print(f"  {row.part:16} {row.min_ms:8.2f} {row.median_ms:8.2f}", flush=True)
+
+
+def main(json_path: Path | None, folder: Path | None) -> int:
+    """Print the profiles on a capture, and write them to `json_path`; returns the exit code."""
+    found = []
+    for profile in profiles(captured(folder)):
+        print_profile(profile)
+        found += profile
+    if json_path is not None:
+        write_json(json_path, {"parts": [vars(part) for part in found]})
+    return 0

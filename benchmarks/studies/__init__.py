@@ -1,0 +1,1 @@
+"""Studies of one method: conformance, search, display, retargeting."""

@@ -1,0 +1,147 @@
+"""`ash-bench retarget`: drive trained avatars with a motion of another skeleton, and score them against its truth.
+
+The paper drives its avatars with motions of AMASS and shows pictures: nobody filmed the person doing that. Here the
+truth for any motion can be rendered.
+"""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ash.capture.dataset import Capture, Motion, Pose
+from ash.capture.formats import load_capture, read_template_truth
+from ash.files import InputError, sha256_of, write_image, write_json
+from ash.protocol import PosedGeometry, StageClock
+from benchmarks.cell import metrics
+from benchmarks.cell.cells import Cell, is_trained, result_of
+from benchmarks.cell.methods import ORACLES
+from benchmarks.cell.process import load_avatar
+from benchmarks.cell.sealing import watched
+from benchmarks.cell.views import spread
+from benchmarks.report.pictures import on_paper
+from benchmarks.suites.progress import Progress
+from synth.capture import make_body, make_capture
+from synth.motion.clips import pose_novelty
+from synth.readers.retargeting import retargeted, scene_of
+
+STRIP_FRAMES = 6
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Retargeted:
+    """How one avatar came through: means over cameras and frames, and beside them its own test motion's."""
+
+    title: str
+    method: str
+    seed: int
+    psnr: float  # foreground, dB
+    ssim: float  # foreground
+    flip: float  # foreground
+    iou: float
+    template_mm: float | None  # None where the method shows no template
+    own_psnr: float | None  # foreground, dB, on the test motion of its capture
+    frame_psnr: tuple[float, ...]  # foreground, mean over cameras
+
+
+def retarget(cells: list[Cell], motion: Path, out: Path, *, frames: int, workers: int) -> list[Retargeted]:
+    """Render the truth of the motion into `out`, score every avatar on it, and draw a strip of pictures of each.
+
+    Raises:
+        InputError: nothing to drive, the motion cannot be read, or a capture is not a scene of this version.
+    """
+    driven = [cell for cell in cells if cell.config.source not in ORACLES and is_trained(cell)]
+    if not driven:
+        raise InputError("no trained avatar to drive (oracles know their surface for their capture's motion only)")
+    rows = []
+    for place in dict.fromkeys(cell.capture_folder for cell in driven):
+        own = load_capture(place)
+        truth = render_truth(own, motion, out / f"truth-{own.scene}", frames=frames, workers=workers)
+        novelty = novelty_deg(own, truth)
+        here = [cell for cell in driven if cell.capture_folder == place]
+        found = [score(cell, own, truth, out) for cell in here]
+        rows += found
+        content = {
+            "scene": own.scene,
+            "capture": own.identity,
+            "motion": motion.name,
+            "motion_sha256": sha256_of(motion),
+            "frames": len(truth.splits["novel_pose"].frames),
+            "fps": truth.motion.fps,
+            "made_by_the_same_code": own.manifest.code == truth.manifest.code,
+            "novelty_deg": novelty,
+            "avatars": [asdict(row) for row in found],
+        }
+        write_json(out / f"result-{own.scene}.json", content)
+    return rows
+
+
+def render_truth(own: Capture, motion: Path, folder: Path, *, frames: int, workers: int) -> Capture:
+    """The capture of the same person doing what the motion file says."""
+    scene = scene_of(own.manifest, own.folder)
+    wanted = retargeted(scene, make_body(scene), motion, frames=frames)
+    progress = Progress(f"images of {motion.name}", 0, expected_s=0.0, workers=workers)
+    make_capture(wanted, folder, workers=workers, progress=progress.advance)
+    progress.close()
+    truth = load_capture(folder)
+    if own.manifest.code != truth.manifest.code:
+        progress.say(f"{own.folder} was rendered by other code: its person may differ a little from the truth's")
+    return truth
+
+
+def score(cell: Cell, own: Capture, truth: Capture, out: Path) -> Retargeted:
+    """Drive one avatar and compare it with the truth."""
+    split = truth.splits["novel_pose"]
+    images, vertices = {}, {}
+    with load_avatar(cell, own) as (avatar, seen), watched(truth, seen):
+        for camera, frame in split.views:
+            drawn = avatar.render(Pose(truth.motion, frame), truth.cameras[camera], clock=StageClock())
+            images[camera, frame] = metrics.quantise(drawn)
+        if isinstance(avatar, PosedGeometry):
+            vertices = {frame: avatar.template_vertices(Pose(truth.motion, frame)) for frame in split.frames}
+    scores = {view: metrics.score_view(image, metrics.on_black(truth.image(*view))) for view, image in images.items()}
+    write_image(out / f"strip-{own.scene}-{cell.config.method}-{cell.config.seed}.png", strip(truth, images))
+    before = result_of(cell)
+
+    def mean(region: str, metric: str) -> float:
+        return float(np.mean([found[region, metric] for found in scores.values()]))
+
+    return Retargeted(
+        title=cell.config.title,
+        method=cell.config.method,
+        seed=cell.config.seed,
+        psnr=mean("foreground", "psnr"),
+        ssim=mean("foreground", "ssim"),
+        flip=mean("foreground", "flip"),
+        iou=mean("full", "iou"),
+        template_mm=_template_mm(truth, vertices),
+        own_psnr=None if before is None else before.value("novel_pose", "foreground", "psnr"),
+        frame_psnr=tuple(
+            float(np.mean([scores[camera, frame]["foreground", "psnr"] for camera in split.cameras]))
+            for frame in split.frames
+        ),
+    )
+
+
+def novelty_deg(own: Capture, truth: Capture) -> float:
+    """How far the motion's poses lie from the nearest training pose, degrees rms over joints."""
+    train, test = own.splits["train"].frames, truth.splits["novel_pose"].frames
+    dofs = np.concatenate([own.motion.dofs[list(train)], truth.motion.dofs[list(test)]])
+    both = Motion(dofs=dofs, sequence=np.zeros(len(dofs), dtype=np.int64), fps=truth.motion.fps)
+    return pose_novelty(both, train=tuple(range(len(train))), test=tuple(range(len(train), len(dofs))))
+
+
+def strip(truth: Capture, images: dict[tuple[str, int], np.ndarray]) -> np.ndarray:
+    """Truth above, the avatar below, in a few frames of the first held-out camera; uint8 `[h, w, 3]` on light grey."""
+    split = truth.splits["novel_pose"]
+    camera = split.cameras[0]
+    frames = [split.frames[i] for i in spread(len(split.frames), STRIP_FRAMES)]
+    pairs = [(metrics.on_black(truth.image(camera, frame)), images[camera, frame]) for frame in frames]
+    seen = np.any([image[..., 3] > 0 for pair in pairs for image in pair], axis=0)
+    window = metrics.occupied(seen, 0) or (slice(None), slice(None))
+    rows = [[on_paper(pair[row][window]) for pair in pairs] for row in range(2)]
+    return np.concatenate([np.concatenate(row, axis=1) for row in rows], axis=0)
+
+
+def _template_mm(truth: Capture, vertices: dict[int, np.ndarray]) -> float | None:
+    return metrics.template_error_mm(list(vertices.values()), read_template_truth(truth)[list(vertices)])

@@ -1,0 +1,1 @@
+"""Suites: matrices of cells, their captures, and the engine that runs them."""

@@ -1,0 +1,69 @@
+"""The captures that a suite needs, made or taken up where they lie."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+from ash.capture.formats import load_capture
+from ash.capture.manifest import Manifest, is_capture, read_manifest, verify_capture
+from ash.files import InputError, hash_of
+from benchmarks.suites.scenes import draw_scene, identity_of, scene_of
+from benchmarks.suites.stress import Stress
+from benchmarks.suites.suites import CaptureSpec
+from synth.readers.perturb import perturb
+from synth.scene import Scene
+
+
+def make_capture(spec: CaptureSpec, data: Path, *, workers: int) -> Path:
+    """The folder of a finished capture under `data`, rendering what is missing of it.
+
+    A capture that an older version of the scene left under the same name is not touched: the new one goes beside it.
+    """
+    if spec.stress is not None:
+        return _spoilt_capture(spec, spec.stress, make_capture(replace(spec, stress=None), data, workers=workers), data)
+    if spec.folder is not None:
+        return spec.folder
+    folder = data / spec.name
+    wanted = identity_of(spec.of or spec.scene, described(spec))
+    if is_capture(folder) and read_manifest(folder).identity not in ("", wanted):
+        folder = data / f"{spec.name}-{wanted[:8]}"
+    make_capture_in(spec, folder, workers=workers)
+    return folder
+
+
+def described(spec: CaptureSpec) -> Scene:
+    """The scene of a capture that is to be made."""
+    return scene_of(spec.of or spec.scene, size=spec.size, seed=spec.seed, name=spec.scene, changes=spec.changes)
+
+
+def _spoilt_capture(spec: CaptureSpec, stress: Stress, clean: Path, data: Path) -> Path:
+    """The clean capture, spoilt; made anew where an earlier attempt did not come to its manifest, the last file."""
+    capture = load_capture(clean)
+    folder = data / f"{spec.name}-{capture.identity[:8]}"
+    if not is_capture(folder):
+        shutil.rmtree(folder, ignore_errors=True)
+        perturb(clean, folder, stress.perturbation(capture), seed=spec.seed)
+    return folder
+
+
+def make_capture_in(spec: CaptureSpec, folder: Path, *, workers: int) -> None:
+    """Render into `folder` what is missing of a capture."""
+    draw_scene(spec.of or spec.scene, described(spec), folder, title=spec.name, workers=workers)
+
+
+def require_intact(folder: Path) -> None:
+    """Hash a capture again before anything is learned from it.
+
+    Raises:
+        InputError: a file is missing, altered or foreign; names the first.
+    """
+    problems = verify_capture(folder)
+    if problems:
+        more = f" (and {len(problems) - 1} more, see ash-bench verify)" if len(problems) > 1 else ""
+        raise InputError(f"{folder}: {problems[0]}{more}")
+
+
+def truth_of(manifest: Manifest) -> str:
+    """A name for what a capture shows that does not depend on the machine that rendered it."""
+    spoilt = {name: value for name, value in manifest.perturbed.items() if name != "of"}
+    return hash_of([manifest.identity or None, manifest.source or None, spoilt])

@@ -1,0 +1,36 @@
+"""What a suite would cost, before anything is started."""
+
+from benchmarks.cell.methods import find_method
+from benchmarks.suites.captures import described
+from benchmarks.suites.engine import shard_of
+from benchmarks.suites.runs import RunOptions
+from benchmarks.suites.scenes import SPLATS
+from benchmarks.suites.suites import CellSpec, Suite
+
+
+def estimate(suite: Suite, options: RunOptions) -> str:
+    """Cells, hours and gigabytes of a suite, as lines."""
+    from synth.cost import estimate as estimate_capture
+
+    for method in suite.methods:
+        find_method(method.of or method.name)
+    cells: list[CellSpec] = list(suite.cells)
+    if options.shard:
+        cells = list(shard_of(cells, options.shard))
+    lines = [f"{suite.name}: {suite.about}", ""]
+    for spec in suite.captures:
+        if spec.stress is not None:
+            lines.append(f"capture {spec.name}: made from the clean one, what does not change is linked")
+            continue
+        if spec.folder is not None:
+            lines.append(f"capture {spec.folder}: is there")
+            continue
+        if (spec.of or spec.scene) == SPLATS:
+            lines.append(f"capture {spec.name}: splatted, under a minute")
+            continue
+        lines.append(f"capture {spec.name}: {estimate_capture(described(spec)).text}")
+    lines += [f"cell {cell.capture.name} · {cell.method}:{cell.preset} · seed {cell.seed}" for cell in cells]
+    hours = len(cells) * suite.cell_minutes / 60
+    wall = hours / min(options.workers, max(1, len(cells)))
+    lines += ["", f"{len(cells)} cells, about {hours:.2f} core-hours, {wall:.2f} hours with {options.workers} workers"]
+    return "\n".join(lines)

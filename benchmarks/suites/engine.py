@@ -1,0 +1,318 @@
+"""Runs cells side by side, each in a process of its own, and goes on where an earlier run stopped."""
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import psutil
+
+from ash.files import InputError, one_line, read_json
+from benchmarks.cell.cells import (
+    Cell,
+    CellResult,
+    Status,
+    failed_result,
+    read_cell,
+    result_of,
+    write_config,
+    write_result,
+)
+from benchmarks.cell.process import KILLED
+from benchmarks.suites.progress import Progress
+
+AnyCell = TypeVar("AnyCell")
+
+POLL_S = 0.2
+ATTEMPTS = 2  # at a cell that is killed from outside
+TAIL = 1 << 16  # bytes of a log that are looked at
+WRONG_INPUT = 2
+INTERRUPTIONS = (130, -signal.SIGINT, -signal.SIGTERM)  # A scheduler's wish: no result, resumed later.
+
+_children: set[subprocess.Popen[bytes]] = set()
+_starting = threading.Lock()  # No child may start between the decision to stop and the end of the children.
+_stopping = threading.Event()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Limits:
+    """What one cell may use before it is ended and recorded as failed."""
+
+    seconds: float
+    memory_mb: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Failure:
+    """Why a cell was ended."""
+
+    status: Status
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Ending:
+    """How a watched process ended: by itself, for exceeding a limit, or at somebody's wish."""
+
+    exit_code: int
+    failure: Failure | None = None
+    interrupted: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CellPlan:
+    """Cells of a run: those to do, and those with a result. `reasons` says why a cell must run again."""
+
+    todo: tuple[Cell, ...]
+    done: tuple[Cell, ...]
+    reasons: tuple[str, ...]
+
+
+def plan_cells(cells: Sequence[Cell], *, retry_failed: bool = False) -> CellPlan:
+    """Split cells into those with a result and those without.
+
+    Raises:
+        InputError: a result.json is damaged; nothing is overwritten.
+    """
+    todo: list[Cell] = []
+    done: list[Cell] = []
+    reasons = []
+    for cell in cells:
+        result = result_of(cell)
+        if result is not None and retry_failed and result.status != "done":
+            shutil.rmtree(cell.folder)
+            reasons.append(f"{cell.config.title}: {result.status} before, tried again")
+            result = None
+        elif result is None and (reason := _why_stale(cell)):
+            reasons.append(f"{cell.config.title}: {reason}")
+        (todo if result is None else done).append(cell)
+    return CellPlan(todo=tuple(todo), done=tuple(done), reasons=tuple(reasons))
+
+
+def shard_of(cells: Sequence[AnyCell], shard: str) -> tuple[AnyCell, ...]:
+    """Shard `i/n` (1-based) of the cells: every n-th, so that shards are of about equal work."""
+    try:
+        index, count = (int(part) for part in shard.split("/"))
+        if not 1 <= index <= count:
+            raise ValueError
+    except ValueError:
+        raise InputError(f"expected a shard i/n with 1 <= i <= n, got {shard!r}") from None
+    return tuple(cells[index - 1 :: count])
+
+
+def run_cells(plan: CellPlan, executor: Executor, limits: Limits, progress: Progress) -> None:
+    """Run the plan's cells. A failed cell leaves a result that says so; the others go on.
+
+    Raises:
+        InputError: a cell found its input wrong; cells that wait are given up, results that are there stay.
+        KeyboardInterrupt: the user's; all child processes have ended when it is seen.
+    """
+    for cell in plan.todo:
+        write_config(cell)
+    _stopping.clear()  # Not when a run is over: a thread that the interruption kept from its executor may still look.
+    futures: dict[Future[str], Cell] = {}
+    try:
+        for cell in plan.todo:
+            futures[executor.submit(run_in_process, str(cell.folder), limits)] = cell
+        pending = set(futures)
+        while pending:
+            finished, pending = wait(pending, timeout=POLL_S, return_when=FIRST_COMPLETED)
+            for future in finished:
+                progress.finish(futures[future].config.title, status=future.result())
+            progress.tick(running=[futures[f].config.title for f in pending if f.running()])
+    except BaseException:
+        for future in futures:
+            future.cancel()
+        stop_children()
+        executor.shutdown(wait=True, cancel_futures=True)
+        raise
+
+
+def run_in_process(folder: str, limits: Limits) -> str:
+    """Run one cell in its own process, watched for time and memory. Returns the status of its result.
+
+    Self-contained, so that an executor may carry it to another machine that sees the same folder.
+    """
+    cell = read_cell(Path(folder))
+    for path in cell.folder.rglob(".*.*"):  # What a killed process left half-written.
+        path.unlink(missing_ok=True)
+    command = [sys.executable, "-m", "benchmarks.cell.process", str(cell.folder), "--follow-parent"]
+    for _ in range(ATTEMPTS):
+        ending = watched_process(command, cell.folder / "output.log", limits)
+        for left in ("input", "exam", "room"):  # By a method that was ended.
+            shutil.rmtree(cell.folder / left, ignore_errors=True)
+        if ending.interrupted:
+            return "interrupted"
+        if not _was_killed(ending):
+            break
+    return _outcome(cell, ending, limits).status
+
+
+def watched_process(command: Sequence[str], log: Path, limits: Limits) -> Ending:
+    """Run a command, its output appended to `log`, until it ends or exceeds its time or memory."""
+    start = time.monotonic()
+    with log.open("ab") as output, _starting:
+        if _stopping.is_set():
+            return Ending(exit_code=INTERRUPTIONS[0], interrupted=True)
+        child = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=output, stderr=output, env=_environment(), start_new_session=True
+        )
+        _children.add(child)
+    try:
+        failure = _watch(child, limits, start)
+    finally:
+        _kill(child)
+        _children.discard(child)
+    interrupted = _stopping.is_set() or (failure is None and child.returncode in INTERRUPTIONS)
+    return Ending(exit_code=child.returncode, failure=failure, interrupted=interrupted)
+
+
+def stop_children() -> None:
+    """End every child process at once; their cells stay unfinished and can be resumed."""
+    with _starting:
+        _stopping.set()
+        for child in list(_children):
+            _kill(child)
+
+
+@contextlib.contextmanager
+def make_executor(spec: str, *, workers: int) -> Iterator[Executor]:
+    """An executor: `local`, or a Dask scheduler's address such as `dask://host:8786`.
+
+    Locally, threads suffice, for each only waits for the process of its cell.
+    """
+    if spec == "local":
+        executor = ThreadPoolExecutor(workers)
+        try:
+            yield executor
+        finally:
+            executor.shutdown(wait=True, cancel_futures=True)
+        return
+    if not spec.startswith("dask://"):
+        raise InputError(f"unknown executor {spec!r}, expected local or dask://HOST:PORT")
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError(
+            "the executor dask:// needs the extra dask: pip install 'ash-bench[dask]', or in a checkout"
+            " .venv/bin/python -m pip install -c constraints.txt -e '.[dask]'"
+        ) from None
+    try:
+        client = Client("tcp://" + spec.removeprefix("dask://"), timeout="10s", set_as_default=False)
+    except (OSError, TimeoutError) as error:
+        raise InputError(f"no Dask scheduler answers at {spec} ({error})") from error
+    with client:
+        yield client.get_executor(retries=2, pure=False)
+
+
+def _watch(child: subprocess.Popen[bytes], limits: Limits, start: float) -> Failure | None:
+    process = psutil.Process(child.pid)
+    while True:
+        try:
+            child.wait(POLL_S)
+            return None
+        except subprocess.TimeoutExpired:
+            pass
+        if time.monotonic() - start > limits.seconds:
+            return Failure(status="timeout", reason=f"not finished after the limit of {limits.seconds / 60:.0f} min")
+        with contextlib.suppress(psutil.Error):
+            family = [process, *process.children(recursive=True)]
+            if (used := sum(member.memory_info().rss for member in family) / 2**20) > limits.memory_mb:
+                return _too_large(used, limits)
+
+
+def _too_large(used_mb: float, limits: Limits) -> Failure:
+    return Failure(status="out of memory", reason=f"{used_mb:.0f} MB, the limit is {limits.memory_mb} MB")
+
+
+def _outcome(cell: Cell, ending: Ending, limits: Limits) -> CellResult:
+    """The result that the child left, or else one that says how it failed."""
+    failure = ending.failure
+    if failure is None:
+        if ending.exit_code == WRONG_INPUT:
+            raise InputError(last_line(cell.folder / "output.log"))
+        result = result_of(cell)
+        peak = result.value("memory", "", "peak_rss_mb") if result is not None else None
+        if result is not None and (peak is None or peak <= limits.memory_mb):
+            return result
+        if peak is not None:  # Too short a peak for the watch to see.
+            failure = _too_large(peak, limits)
+    if failure is None and _was_killed(ending):
+        reason = f"killed from outside in each of {ATTEMPTS} attempts; the kernel does that when memory runs out"
+        failure = Failure(status="crashed", reason=f"{reason}; --retry-failed tries again")
+    if failure is None:
+        log = last_line(cell.folder / "output.log")
+        reason = f"the process ended with {_exit_name(ending.exit_code)}: {log}"
+        failure = Failure(status="crashed", reason=reason)
+    result = failed_result(cell.config, failure.status, failure.reason)
+    write_result(cell.folder, result)
+    return result
+
+
+def _was_killed(ending: Ending) -> bool:
+    """Whether somebody else killed the cell: not we for a limit, and not the user, who resumes."""
+    return ending.failure is None and ending.exit_code in (KILLED, -signal.SIGKILL)
+
+
+def _kill(child: subprocess.Popen[bytes]) -> None:
+    """End a child with all processes that it started, also those that left its group, and those that outlived it."""
+    family: list[psutil.Process] = []
+    if child.poll() is None:
+        with contextlib.suppress(psutil.Error):
+            family = psutil.Process(child.pid).children(recursive=True)
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(child.pid, signal.SIGKILL)
+    for member in family:
+        with contextlib.suppress(psutil.Error):
+            member.kill()
+    child.wait()
+    if child.stdin is not None:
+        child.stdin.close()
+
+
+def _environment() -> dict[str, str]:
+    """One thread per cell: two buy 1.35x alone and cost 6x when cells run side by side."""
+    threads = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+    return {**os.environ, **threads, "PYTHONUNBUFFERED": "1"}
+
+
+def _why_stale(cell: Cell) -> str | None:
+    """Which input changed since this method and seed were last run in this folder, if they were."""
+    fresh = asdict(cell.config)
+    same = ("scene", "size", "method", "preset", "seed", "capture_seed", "axis", "severity", "factory", "changes")
+    for path in cell.folder.parent.glob("*/config.json"):
+        content = read_json(path)
+        old = content.get("config", {}) if isinstance(content, dict) else {}
+        if not isinstance(old, dict):  # Other versions of this program knew other fields.
+            continue
+        if path.parent != cell.folder and all((old.get(name) or 0) == (fresh[name] or 0) for name in same):
+            changed = [name for name in ("code", "capture", "protocol") if old.get(name) != fresh[name]]
+            if (path.parent / "result.json").exists() and changed:
+                return f"the {' and the '.join(changed)} changed since its last result"
+    return None
+
+
+def last_line(log: Path) -> str:
+    """The last line of a log: mostly what went wrong."""
+    if not log.exists():
+        return "(it printed nothing)"
+    with log.open("rb") as file:
+        file.seek(max(0, log.stat().st_size - TAIL))
+        lines = file.read(TAIL).decode(errors="replace").strip().splitlines()
+    return one_line(lines[-1]) if lines else "(it printed nothing)"
+
+
+def _exit_name(code: int) -> str:
+    try:
+        return signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    except ValueError:
+        return f"signal {-code}"

@@ -1,0 +1,259 @@
+"""Reads a suite from its file, ours (beside this module) or a user's; every error names file, line and key.
+
+    about = "is width needed?"
+    scenes = ["tight", { of = "tight", name = "tight_swing", outfit.swing = 0.8 }, { capture = "data/mine" }]
+    size = "quick"               # of scenes; `size` in a scene's table overrules it
+    methods = ["ash", { of = "ash", model.width = 8 }, { of = "my_package.avatar:mine", name = "mine" }]
+    preset = "cpu"               # of methods; `preset` in a method's table overrules it
+    seeds = 3
+    stresses.cameras = [25, 50]  # axis = severities, see `benchmarks.suites.stress`
+    limit_minutes = 60           # of one cell, and limit_mb
+    cell_minutes = 2.5           # what one cell takes, for estimates
+
+`[[methods]]` and `[[scenes]]` as tables of their own mean the same; all further keys of such a table are replacements
+in the scene or in the method's configuration.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from tomlkit.exceptions import NonExistentKey, ParseError
+from tomlkit.items import AbstractTable, Table
+
+from ash.capture.manifest import read_manifest
+from ash.fields import WRITTEN, Changes, nearest
+from ash.files import InputError
+from benchmarks.cell.methods import configured, find_method
+from benchmarks.suites.stress import Stress
+from benchmarks.suites.suites import MethodSpec, SceneSpec, Suite, varied_name
+
+FOLDER = Path(__file__).parent
+MARK = "ba5e11ne"  # Found again where it was put; no file has it.
+Place = tuple[str | int, ...]  # A key of the file, from the top.
+PLAIN: dict[str, type] = {
+    "about": str,
+    "size": str,
+    "preset": str,
+    "seeds": int,
+    "cell_minutes": float,
+    "limit_minutes": float,
+    "limit_mb": int,
+}
+
+
+def suite_files() -> dict[str, Path]:
+    """Our own suites by name."""
+    return {path.stem: path for path in sorted(FOLDER.glob("*.toml"))}
+
+
+def find_suite(name: str | Path) -> Suite:
+    """A suite of ours by name, or anyone's by its file."""
+    known = suite_files()
+    path = known.get(str(name), Path(name))
+    if path.suffix != ".toml":
+        raise InputError(f"unknown suite {str(name)!r}, {nearest(str(name), (*known, 'FILE.toml'))}")
+    return read_suite(path)
+
+
+def read_suite(path: Path) -> Suite:
+    """The suite that a file describes; its name is the file's.
+
+    Raises:
+        InputError: names file, line and key.
+    """
+    try:
+        text = path.read_text()
+        content: dict[str, Any] = tomlkit.parse(text).unwrap()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: expected TOML in UTF-8 ({error})") from error
+    except ParseError as error:
+        raise InputError(f"{path}:{error.line}: not valid TOML ({error})") from error
+    return _Reader(path, text).suite(content)
+
+
+SUITE_KEYS = tuple(field.name for field in fields(Suite) if field.name != "name")
+REQUIRED = ("scenes", "methods", "preset")
+SCENE_KEYS, METHOD_KEYS = ("name", "of", "size", "capture"), ("name", "of", "preset")
+
+
+class _Reader:
+    """Checks the content of one file; knows where in the file a key stands."""
+
+    def __init__(self, path: Path, text: str) -> None:
+        self.path, self.text = path, text
+
+    def suite(self, content: dict[str, Any]) -> Suite:
+        """The whole file."""
+        for key in content:
+            if key not in SUITE_KEYS:
+                raise self.error((key,), f"unknown key {key!r}, {nearest(key, SUITE_KEYS)}")
+        for key in REQUIRED:
+            if key not in content:
+                raise InputError(f"{self.path}: expected the key {key!r}")
+        plain = {"about": "", "size": "quick", **content}
+        plain = {key: self.checked(key, value) for key, value in plain.items() if key in PLAIN}
+        size, preset = plain["size"], plain["preset"]
+        scenes = tuple(self.scene(index, row, size) for index, row in enumerate(self.rows(content, "scenes")))
+        methods = tuple(self.method(index, row, preset) for index, row in enumerate(self.rows(content, "methods")))
+        stresses = tuple(self.stresses(content.get("stresses", {})))
+        try:
+            return Suite(name=self.path.stem, scenes=scenes, methods=methods, stresses=stresses, **plain)
+        except InputError as error:
+            named = [key for key in content if str(error).startswith((f"{key}:", f"two {key}"))]
+            raise self.error(tuple(named), str(error)) from error
+
+    def rows(self, content: dict[str, Any], key: str) -> list[dict[str, Any]]:
+        """Scenes or methods: names, which stand for themselves, and tables."""
+        rows = content[key]
+        if not isinstance(rows, list) or not all(isinstance(row, str | dict) for row in rows):
+            raise self.error((key,), f"{key}: expected a list of names and tables, got {rows!r}")
+        return [{"of": row} if isinstance(row, str) else row for row in rows]
+
+    def scene(self, index: int, row: dict[str, Any], size: str) -> SceneSpec:
+        """One row of scenes."""
+        from benchmarks.suites.scenes import scene_of
+
+        place: Place = ("scenes", index)
+        known, changes = self.split(row, place, SCENE_KEYS)
+        if "capture" in known:
+            if changes or set(known) - {"capture", "name"}:
+                raise self.error(place, "a finished capture is taken as it is: expected no key but capture and name")
+            return self.told(place, lambda: given_capture(Path(known["capture"]), name=known.get("name", "")))
+        of = self.required(known, place)
+        spec = SceneSpec(
+            name=known.get("name") or varied_name(of, changes), of=of, size=known.get("size", ""), changes=changes
+        )
+        self.told(place, lambda: scene_of(of, size=spec.size or size))
+        self.each(place, changes, lambda some: scene_of(of, size=spec.size or size, changes=some))
+        return spec
+
+    def method(self, index: int, row: dict[str, Any], preset: str) -> MethodSpec:
+        """One row of methods; its configuration is made once, so that it is refused here and not in its cells."""
+        place: Place = ("methods", index)
+        known, changes = self.split(row, place, METHOD_KEYS)
+        of = self.required(known, place)
+        self.told((*place, "of"), lambda: find_method(of))
+        own = known.get("preset", "")
+        self.each(place, changes, lambda some: configured(of, own or preset, some))
+        varied = changes + ((("preset", own),) if own else ())
+        return MethodSpec(name=known.get("name") or varied_name(of, varied), of=of, preset=own, changes=changes)
+
+    def stresses(self, table: Any) -> Iterator[Stress]:
+        """Every step of every axis."""
+        if not isinstance(table, dict):
+            raise self.error(("stresses",), f"stresses: expected axes with lists of severities, got {table!r}")
+        for axis, severities in table.items():
+            place = ("stresses", axis)
+            if not isinstance(severities, list) or not all(type(step) in (int, float) for step in severities):
+                raise self.error(place, f"stresses.{axis}: expected a list of numbers, got {severities!r}")
+            for severity in severities:
+                yield self.told(place, lambda axis=axis, s=severity: Stress(axis=axis, severity=float(s)))
+
+    def split(self, row: dict[str, Any], place: Place, own: tuple[str, ...]) -> tuple[dict[str, str], Changes]:
+        """What says which row it is, and what is replaced in it."""
+        known = {key: value for key, value in row.items() if key in own}
+        for key, value in known.items():
+            if not isinstance(value, str) or not value:
+                raise self.error((*place, key), f"{key}: expected a text, got {value!r}")
+        if "seed" in row:
+            raise self.error((*place, "seed"), "seed: a row has none of its own, the suite's `seeds` counts them")
+        return known, _dotted({key: value for key, value in row.items() if key not in own})
+
+    def required(self, known: dict[str, str], place: Place) -> str:
+        """The name of what a row is a variant of."""
+        if "of" not in known:
+            raise self.error(place, f"{place[0]}: expected the key 'of', what this row is or is a variant of")
+        return known["of"]
+
+    def each(self, place: Place, changes: Changes, make: Callable[[Changes], Any]) -> None:
+        """Try the changes of a row; where they are refused, name the line of the first that is refused by itself."""
+        if not changes:
+            return
+        try:
+            make(changes)
+        except InputError as error:
+            for key, value in changes:
+                try:
+                    make(((key, value),))
+                except InputError as single:
+                    raise self.error((*place, *key.split(".")), str(single)) from single
+            raise self.error(place, str(error)) from error
+
+    def checked(self, key: str, value: Any) -> Any:
+        """A value of the type that the suite has there."""
+        kind = PLAIN[key]
+        fits = isinstance(value, int | float) if kind is float else isinstance(value, kind)
+        if not fits or isinstance(value, bool):
+            raise self.error((key,), f"{key}: expected {WRITTEN[kind]}, got {value!r}")
+        return kind(value)
+
+    def told(self, place: Place, make: Callable[[], Any]) -> Any:
+        """What `make` makes; its errors say where in the file."""
+        try:
+            return make()
+        except InputError as error:
+            raise self.error(place, str(error)) from error
+
+    def error(self, place: Place, message: str) -> InputError:
+        """An error at a key of the file."""
+        return InputError(f"{self.path}:{line_of(self.text, place)}: {message}")
+
+
+def given_capture(folder: Path, *, name: str = "") -> SceneSpec:
+    """A finished capture as a row of a suite; it is called as its scene is, where no name is given."""
+    manifest = read_manifest(folder)
+    return SceneSpec(name=name or manifest.scene, size=manifest.size or "as given", folder=folder)
+
+
+def given_captures(folders: Sequence[Path]) -> tuple[SceneSpec, ...]:
+    """Finished captures as rows; of several that are called alike, each is called as its folder is."""
+    rows = [given_capture(folder) for folder in folders]
+    names = [row.name for row in rows]
+    return tuple(
+        row if names.count(row.name) == 1 else given_capture(folder, name=folder.resolve().name)
+        for row, folder in zip(rows, folders, strict=True)
+    )
+
+
+def _dotted(table: Mapping[str, Any]) -> Changes:
+    found: dict[str, Any] = {}
+    for key, value in table.items():
+        inner = _dotted(value) if isinstance(value, dict) else None
+        found |= {key: value} if inner is None else {f"{key}.{name}": each for name, each in inner}
+    return tuple((key, tuple(value) if isinstance(value, list) else value) for key, value in sorted(found.items()))
+
+
+def line_of(text: str, place: Place) -> int:
+    """The line of a key in a TOML text, or of the innermost table around it that is there. Counted from one."""
+    document = tomlkit.parse(text)
+    item: Any = document
+    holder: Any = None
+    name: str | int = 0
+    for part in place:
+        inner = _inner(item, part)
+        if inner is None:
+            break
+        holder, name, item = item, part, inner
+    if item is document:
+        return 1
+    if isinstance(item, Table) and not item.is_super_table():
+        item.comment(MARK)  # Beside its header.
+    else:
+        holder[name] = MARK
+    marked = (number for number, line in enumerate(tomlkit.dumps(document).splitlines(), 1) if MARK in line)
+    return next(marked, 1)
+
+
+def _inner(item: Any, part: str | int) -> Any:
+    try:
+        if isinstance(part, int):
+            return item[part]
+        container = item.value if isinstance(item, AbstractTable) else item
+        return container.item(part)
+    except (KeyError, IndexError, AttributeError, TypeError, NonExistentKey):
+        return None

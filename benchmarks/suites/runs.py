@@ -1,0 +1,188 @@
+"""A run: a suite's captures, then its cells, then what they came to, all in one folder."""
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ash.capture.formats import load_capture
+from ash.capture.typed import from_json
+from ash.files import InputError, only_run_in, read_json, require_plain, write_json
+from benchmarks.cell.cells import Cell, CellConfig, CellResult, read_cell, result_of
+from benchmarks.cell.methods import code_version, find_method
+from benchmarks.cell.metrics import PROTOCOL
+from benchmarks.suites.captures import make_capture, require_intact, truth_of
+from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells, shard_of
+from benchmarks.suites.progress import Progress
+from benchmarks.suites.suites import CellSpec, Suite
+
+RUN_FILE = "run.json"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Run:
+    """A run on disk: what was asked, and the cells that answer it."""
+
+    folder: Path
+    suite: str
+    about: str
+    command: str
+    cells: tuple[Cell, ...]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RunFile:
+    """`run.json`."""
+
+    protocol: str
+    suite: str
+    about: str
+    command: str
+    cells: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RunOptions:
+    """How a suite is run: what does not change its results."""
+
+    out: Path
+    data: Path
+    workers: int
+    executor: str = "local"
+    shard: str | None = None
+    retry_failed: bool = False
+    command: str = ""
+
+
+def run_suite(suite: Suite, options: RunOptions) -> Run:
+    """Make the captures, run the missing cells, and return the run; finished work is never repeated."""
+    for method in suite.methods:
+        find_method(method.of or method.name)
+    options.out.mkdir(parents=True, exist_ok=True)
+    with contextlib.nullcontext() if options.shard else only_run_in(options.out):
+        return _run_suite(suite, options)
+
+
+def _run_suite(suite: Suite, options: RunOptions) -> Run:
+    folders = {spec: make_capture(spec, options.data, workers=options.workers) for spec in suite.captures}
+    for folder in folders.values():
+        require_intact(folder)
+    cells = [cell_for(spec, folders[spec.capture], options.out) for spec in suite.cells]
+    run = Run(folder=options.out, suite=suite.name, about=suite.about, command=options.command, cells=tuple(cells))
+    write_run(run)
+    run_missing(shard_of(cells, options.shard) if options.shard else cells, suite, options)
+    return run
+
+
+def run_missing(cells: Sequence[Cell], suite: Suite, options: RunOptions) -> None:
+    """Run the cells that have no result, within the suite's limits, and show how far they are."""
+    plan = plan_cells(cells, retry_failed=options.retry_failed)
+    limits = Limits(seconds=suite.limit_minutes * 60, memory_mb=suite.limit_mb)
+    progress = Progress("cells", len(plan.todo), expected_s=suite.cell_minutes * 60, workers=options.workers)
+    for reason in plan.reasons:
+        progress.say(reason)
+    if plan.done:
+        progress.say(f"{len(plan.done)} of {len(plan.done) + len(plan.todo)} cells are there already")
+    with make_executor(options.executor, workers=options.workers) as executor:
+        run_cells(plan, executor, limits, progress)
+    progress.close()
+
+
+def cell_for(spec: CellSpec, capture_folder: Path, out: Path) -> Cell:
+    """The cell of a method on a capture, in its folder under `out`."""
+    capture = load_capture(capture_folder)
+    config = CellConfig(
+        scene=spec.capture.scene,
+        size=spec.capture.size,
+        capture_seed=spec.capture.seed,
+        capture=capture.identity,
+        truth=truth_of(capture.manifest),
+        method=spec.method,
+        preset=spec.preset,
+        seed=spec.seed,
+        code=code_version(spec.factory or spec.method),
+        factory=spec.factory,
+        changes=dict(spec.changes),
+        axis=spec.capture.stress.axis if spec.capture.stress else "",
+        severity=spec.capture.stress.severity if spec.capture.stress else 0.0,
+    )
+    return Cell(config=config, folder=out / "cells" / config.key, capture_folder=capture_folder)
+
+
+def write_run(run: Run) -> None:
+    """Write `run.json`: the whole matrix, also the cells that other shards will fill."""
+    content = {
+        "protocol": PROTOCOL,
+        "suite": run.suite,
+        "about": run.about,
+        "command": run.command,
+        "cells": [cell.config.key for cell in run.cells],
+    }
+    write_json(run.folder / RUN_FILE, content)
+
+
+def read_run(folder: Path) -> Run:
+    """Read a run's folder; a single cell's folder is a run of one cell.
+
+    Raises:
+        InputError: no run is there, it is of another protocol, or a cell's config is damaged.
+    """
+    if (folder / "config.json").exists():
+        cell = read_cell(folder)
+        return Run(folder=folder, suite="one cell", about=cell.config.title, command="", cells=(cell,))
+    path = folder / RUN_FILE
+    content = read_json(path)
+    try:
+        told: RunFile = from_json(RunFile, content)
+        keys = [require_plain(key, what="cell") for key in told.cells]
+        require_plain(told.suite, what="suite")
+    except ValueError as error:
+        raise InputError(f"{path}: expected the description of a run ({error})") from error
+    if told.protocol != PROTOCOL:
+        raise InputError(f"{path}: expected protocol {PROTOCOL}, got {told.protocol}; results do not mix")
+    names = {"suite": told.suite, "about": told.about, "command": told.command}
+    found = [folder / "cells" / key for key in keys if (folder / "cells" / key / "config.json").exists()]
+    return Run(folder=folder, cells=tuple(read_cell(cell) for cell in found), **names)
+
+
+def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
+    """The finished cells of several runs as one, to be reported in `out`; a cell that several have is taken once.
+
+    Where one scene's name stands for different captures, each is called as its capture's folder is.
+    """
+    runs = [read_run(folder) for folder in folders]
+    cells = list({cell.config.key: cell for run in runs for cell in run.cells}.values())
+    shown: dict[str, set[str]] = {}
+    for cell in cells:
+        shown.setdefault(cell.config.place, set()).add(cell.config.truth)
+    named = [_told_apart(cell) if len(shown[cell.config.place]) > 1 else cell for cell in cells]
+    about = f"cells of {', '.join(map(str, folders))}"
+    return Run(folder=out, suite=out.name, about=about, command=command, cells=tuple(named))
+
+
+def _told_apart(cell: Cell) -> Cell:
+    """The cell on a scene that is called as its capture's folder is."""
+    return replace(cell, config=replace(cell.config, scene=cell.capture_folder.resolve().name))
+
+
+def results_of(run: Run) -> list[CellResult]:
+    """The results of a run's finished cells, in the suite's order.
+
+    Raises:
+        InputError: nothing is finished yet, or a result is damaged.
+    """
+    results = finished_results(run)
+    if not results:
+        raise InputError(f"{run.folder}: no cell is finished, so there is nothing to report")
+    return results
+
+
+def finished_results(run: Run) -> list[CellResult]:
+    """The results that are there, in the suite's order; perhaps none."""
+    found = [(cell, result_of(cell)) for cell in run.cells]
+    return [replace(result, config=cell.config) for cell, result in found if result is not None]
+
+
+def failures(results: Sequence[CellResult]) -> list[CellResult]:
+    """The results of cells that did not come through."""
+    return [result for result in results if result.status != "done"]

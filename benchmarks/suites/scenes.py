@@ -1,0 +1,73 @@
+"""Every scene by its name, those of the generator and `splats`, and how each becomes a capture."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ash.fields import Changes, nearest, replaced
+from ash.files import InputError
+from benchmarks.suites.progress import Progress
+from synth.presets import SCENES, scene, skinned
+from synth.scene import Scene
+
+SPLATS = "splats"  # The first rung, drawn by `benchmarks.suites.splats`.
+
+
+def scene_names() -> tuple[str, ...]:
+    """All scenes that there are."""
+    return (*SCENES, SPLATS)
+
+
+def scene_of(of: str, *, size: str, seed: int = 0, name: str = "", changes: Changes = ()) -> Scene:
+    """A scene by name, with fields replaced; `name` is what it is called then.
+
+    Raises:
+        InputError: no such scene, size or field, or a value that the scene refuses.
+    """
+    if of not in scene_names():
+        raise InputError(f"unknown scene {of!r}, {nearest(of, scene_names())}")
+    return replaced(replace(_plain(of, size, seed), name=name or of), changes, of=of)
+
+
+def _plain(of: str, size: str, seed: int) -> Scene:
+    if of == SPLATS:  # The poses and cameras of `skinned`; what it looks like is the splatter's.
+        return replace(skinned(size=size, seed=seed), body="mannequin")
+    return scene(of, size=size, seed=seed)
+
+
+def identity_of(of: str, wanted: Scene) -> str:
+    """What the manifest of a capture of the scene says it is."""
+    if of == SPLATS:
+        from benchmarks.suites import splats
+
+        return splats.identity(wanted)
+    return wanted.identity
+
+
+def draw_scene(of: str, wanted: Scene, folder: Path, *, title: str, workers: int) -> None:
+    """Render into `folder` what is missing of the capture of a scene that is a variant of `of`."""
+    if of == SPLATS:
+        from benchmarks.suites import splats
+
+        splats.draw_capture(wanted, folder)
+        return
+    from synth.capture import make_capture as render
+
+    progress = Progress(f"images of {title}", 0, expected_s=0.0, workers=workers)
+    if not (folder / "cameras.json").exists():  # Written last before the images.
+        progress.say(f"preparing {title}: body, motion, clothes, texture (up to two minutes)")
+    render(wanted, folder, workers=workers, progress=progress.advance)
+    progress.close()
+
+
+def draw_views_of(of: str) -> Callable[..., list[np.ndarray]]:
+    """What draws single views of a scene, for sheets."""
+    if of == SPLATS:
+        from benchmarks.suites.splats import draw_views
+
+        return draw_views
+    from synth.readers.sheets import path_traced
+
+    return path_traced

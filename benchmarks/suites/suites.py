@@ -1,0 +1,151 @@
+"""What a suite is: a matrix of scenes x methods x seeds. `benchmarks.suites.files` reads it; ours are `*.toml` here."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ash.fields import Changes
+from ash.files import InputError, hash_of
+from benchmarks.cell.methods import find_method
+from benchmarks.suites.stress import Stress
+
+LONGEST_VALUE = 24  # Characters of a changed value in a name; its hash stands for a longer one.
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SceneSpec:
+    """A row of scenes: one of the generator's with fields replaced, or a capture that is there already."""
+
+    name: str  # in tables
+    of: str = ""  # the generator's scene, where it has another name
+    size: str = ""  # none: the suite's
+    changes: Changes = ()  # in `synth.scene.Scene`
+    folder: Path | None = None  # of a finished capture
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class MethodSpec:
+    """A row of methods: an entry point or `package.module:factory`, perhaps with its configuration changed."""
+
+    name: str  # in tables
+    of: str = ""  # the entry point or factory, where it has another name
+    preset: str = ""  # none: the suite's
+    changes: Changes = ()  # in the configuration that the preset means
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CaptureSpec:
+    """Which capture a cell needs: a scene, its root seed, and how it is spoilt, if it is."""
+
+    scene: str
+    size: str
+    seed: int = 0
+    stress: Stress | None = None
+    of: str = ""  # the generator's scene, where `scene` is a name of the suite's
+    changes: Changes = ()
+    folder: Path | None = None  # where it lies, if it is a finished one
+
+    @property
+    def name(self) -> str:
+        """The capture's folder."""
+        name = f"{self.scene}-{self.size}-{self.seed}"
+        return name if self.stress is None else f"{name}-{self.stress.axis}-{self.stress.severity:g}"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CellSpec:
+    """A cell before its capture exists."""
+
+    capture: CaptureSpec
+    method: str
+    preset: str
+    seed: int
+    factory: str = ""  # the entry point or factory, where `method` is a name of the suite's
+    changes: Changes = ()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Suite:
+    """A matrix of cells. `cell_minutes`: what one cell takes on one core of an ordinary machine, for estimates only."""
+
+    name: str
+    about: str
+    scenes: tuple[SceneSpec, ...]
+    size: str
+    methods: tuple[MethodSpec, ...]
+    preset: str
+    seeds: int = 1
+    cell_minutes: float = 1.0
+    stresses: tuple[Stress, ...] = ()
+    limit_minutes: float = 60.0
+    limit_mb: int = 8192
+
+    def __post_init__(self) -> None:
+        """Refuse what makes no table."""
+        for what, rows in (("scene", self.scenes), ("method", self.methods)):
+            names = [row.name for row in rows]
+            if not names:
+                raise InputError(f"expected at least one {what}")
+            if twice := [name for name in names if names.count(name) > 1]:
+                raise InputError(f"two {what}s are called {twice[0]!r}, expected a name of its own for each")
+        if self.seeds < 1:
+            raise InputError(f"seeds: expected at least 1, got {self.seeds}")
+        for name in ("cell_minutes", "limit_minutes", "limit_mb"):
+            if getattr(self, name) <= 0:
+                raise InputError(f"{name}: expected more than 0, got {getattr(self, name)}")
+
+    @property
+    def captures(self) -> tuple[CaptureSpec, ...]:
+        """One capture per scene, and one per scene and stress, shared by all methods and seeds."""
+        return tuple(_capture(scene, self.size, stress) for stress in (None, *self.stresses) for scene in self.scenes)
+
+    @property
+    def cells(self) -> Iterator[CellSpec]:
+        """Seeds outermost: whoever interrupts early has one whole table, not three thirds of one."""
+        for seed in range(self.seeds):
+            for capture in self.captures:
+                for method in self.methods:
+                    yield CellSpec(
+                        capture=capture,
+                        method=method.name,
+                        factory="" if method.of == method.name else method.of,
+                        preset=method.preset or self.preset,
+                        seed=seed,
+                        changes=method.changes,
+                    )
+
+    def narrowed(
+        self, *, scenes: tuple[SceneSpec, ...] = (), methods: tuple[str, ...] = (), **others: object
+    ) -> "Suite":
+        """The suite with other rows and values where they are given; a method that is no row of it becomes one.
+
+        Raises:
+            InputError: a method that is neither a row nor installed.
+        """
+        rows = {row.name: row for row in self.methods}
+        chosen = tuple(rows[name] if name in rows else MethodSpec(name=find_method(name).name) for name in methods)
+        given: dict[str, object] = {name: value for name, value in others.items() if value is not None}
+        given |= {"scenes": scenes} if scenes else {}
+        given |= {"methods": chosen} if chosen else {}
+        return replace(self, **given)  # type: ignore[arg-type]
+
+
+def varied_name(of: str, changes: Changes) -> str:
+    """A name for what differs from `of` in some fields, such as `ash+texels=128`; fit for files and links."""
+    parts = [of]
+    for key, value in changes:
+        text = re.sub(r"[^\w.,-]", "", ",".join(map(str, value)) if isinstance(value, tuple) else str(value))
+        parts.append(f"{key.rpartition('.')[2]}={text if len(text) <= LONGEST_VALUE else hash_of(value)[:8]}")
+    return "+".join(parts)
+
+
+def _capture(scene: SceneSpec, size: str, stress: Stress | None) -> CaptureSpec:
+    return CaptureSpec(
+        scene=scene.name,
+        size=scene.size or size,
+        stress=stress,
+        of="" if scene.of == scene.name else scene.of,
+        changes=scene.changes,
+        folder=scene.folder,
+    )

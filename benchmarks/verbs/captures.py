@@ -1,0 +1,255 @@
+"""Verbs that make, check and convert captures: synth, verify, undistort, export, motions, sheets."""
+
+import contextlib
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from ash.files import InputError
+from benchmarks.verbs.arguments import DONE, WRONG_INPUT, Count, CountIfAny, File, Folder, Natural, changes_of
+
+if TYPE_CHECKING:
+    from synth.scene import Scene, Take
+
+
+@dataclass(frozen=True, kw_only=True)
+class Excerpt:
+    """Which part of a motion file is taken, and how the file is read."""
+
+    up: str = "auto"  # what is up in the file: auto, x, y, z, -x, -y, -z
+    start: float = 0.0  # leave out the file's first seconds
+    length: float | None = None  # take so many seconds of the file
+    stride: Count = 1  # take every N-th frame: N times as fast
+    joint_map: File | None = None  # JSON: our joints' names in the BVH file
+
+    @property
+    def take(self) -> "Take":
+        """The same as part of a scene."""
+        from synth.motion.importing import read_joint_map
+        from synth.scene import Take
+
+        joints = read_joint_map(self.joint_map) if self.joint_map else ()
+        return Take(up=self.up, start=self.start, length=self.length, stride=self.stride, joints=joints)
+
+
+Excerpts = Annotated[Excerpt, arg(name="", prefix_name=False)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Synth:
+    """Render the ground truth of a scene into a capture folder.
+
+    Every field of the scene is a flag (--rig.cameras 24 --outfit.swing 0.8); `synth SCENE --help` lists them.
+
+    A motion file replaces the scene's own training (or test) motion: BVH, or AMASS-style .npz with poses, trans and
+    mocap_framerate. It is retargeted to our skeleton, its path centred on the origin, its first frames at the scene's
+    rate taken. A rig file is a cameras.json as captures have it, or the bare list of its cameras: name, width, height,
+    K, viewmat, and k1 k2 p1 p2 as "distortion" where a lens has one; metres, y up, and the cameras must see the origin.
+    """
+
+    scene: Positional[str]  # its name
+    size: str = "quick"  # of the capture: ci, quick, table or paper
+    out: Folder | None = None  # default: data/SCENE-SIZE-SEED
+    seed: Natural = 0  # root seed of the scene
+    motion: File | None = None  # train on this motion (BVH or AMASS .npz)
+    test_motion: File | None = None  # test on this motion
+    excerpt: Excerpts = Excerpt()
+    rig_file: Annotated[Path | None, arg(name="rig", metavar="FILE")] = None  # see the scene by its cameras
+    shutter: float = 0.0  # open for this share of a frame, as --rig.shutter
+    workers: CountIfAny = None  # processes; default: all cores
+    executor: str = "local"  # or dask://HOST:PORT, for a cluster
+    shard: Annotated[str | None, arg(metavar="i/n")] = None  # every n-th frame only, from the i-th; for job arrays
+
+    def settings(self) -> "Scene":
+        """The scene, before flags change it."""
+        from benchmarks.suites.scenes import scene_of
+        from synth.presets import with_rig
+
+        plain = scene_of(self.scene, size=self.size, seed=self.seed)
+        seen = plain if self.rig_file is None else with_rig(plain, self.rig_file)
+        return replace(seen, rig=replace(seen.rig, shutter=self.shutter)) if self.shutter else seen
+
+    def __call__(self) -> int:
+        """Render what is missing of it."""
+        from benchmarks.provenance import cores
+        from benchmarks.suites.engine import make_executor
+        from benchmarks.suites.progress import Progress
+        from benchmarks.suites.scenes import SPLATS, draw_scene
+        from synth.capture import is_finished, make_capture
+        from synth.cost import estimate
+
+        scene, name = self._described()
+        folder = self.out or Path("data") / name
+        workers = self.workers or cores()
+        if self.scene == SPLATS:
+            draw_scene(self.scene, scene, folder, title=name, workers=workers)
+            print(folder)
+            return DONE
+        progress = Progress(f"images of {name}", 0, expected_s=0.0, workers=workers)
+        if not is_finished(scene, folder):
+            progress.say(f"{name}: {estimate(scene).text}; first body, motion, clothes and texture (up to two minutes)")
+        shard, local = _shard(self.shard), self.executor == "local"
+        with contextlib.nullcontext() if local else make_executor(self.executor, workers=workers) as executor:
+            make_capture(scene, folder, workers=workers, progress=progress.advance, executor=executor, shard=shard)
+        progress.close()
+        if not is_finished(scene, folder):
+            print(
+                f"{folder}: this shard is done; the capture is finished by the shard that comes last", file=sys.stderr
+            )
+        print(folder)
+        return DONE
+
+    def _described(self) -> tuple["Scene", str]:
+        """The scene that is asked for, and its name among captures."""
+        from ash.fields import replaced
+        from benchmarks.suites.scenes import scene_of
+        from benchmarks.suites.suites import varied_name
+
+        changes = dict(changes_of(self))
+        wanted = replaced(self.settings(), changes, of=self.scene)
+        if changes and "name" not in changes:
+            wanted = replace(wanted, name=varied_name(self.scene, tuple(changes.items())))
+        wanted = self._moved(wanted)
+        name = f"{self.scene}-{self.size}-{self.seed}"
+        plain = wanted == scene_of(self.scene, size=self.size, seed=self.seed)
+        return wanted, name if plain else f"{name}-{wanted.identity[:8]}"
+
+    def _moved(self, scene: "Scene") -> "Scene":
+        """The scene driven by the user's motions, if there are any."""
+        if self.motion is None and self.test_motion is None:
+            return scene
+        from synth.capture import make_body
+        from synth.motion.clips import make_motion, pose_novelty
+        from synth.presets import with_motion
+
+        skeleton = make_body(scene).skeleton
+        moved = with_motion(scene, skeleton, train=self.motion, test=self.test_motion, take=self.excerpt.take)
+        motion = make_motion(skeleton, moved.train + moved.test, fps=moved.fps, seed=0)
+        count = sum(clip.frames for clip in moved.train)
+        novelty = pose_novelty(motion, train=tuple(range(count)), test=tuple(range(count, len(motion.dofs))))
+        print(f"test poses lie {novelty:.1f} degrees from the nearest training pose (rms over joints)", file=sys.stderr)
+        return moved
+
+
+def _shard(text: str | None) -> tuple[int, int]:
+    from benchmarks.suites.engine import shard_of
+
+    if text is None:
+        return 1, 1
+    shard_of([], text)
+    index, count = (int(part) for part in text.split("/"))
+    return index, count
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verify:
+    """Hash every file of a capture again."""
+
+    folder: Positional[Path]  # of the capture
+
+    def __call__(self) -> int:
+        """Name every problem."""
+        from ash.capture.manifest import read_manifest, verify_capture
+
+        manifest = read_manifest(self.folder)
+        problems = verify_capture(self.folder)
+        if not manifest.complete:
+            problems.append("the capture is unfinished")
+        for problem in problems:
+            print(f"{self.folder}: {problem}", file=sys.stderr)
+        if problems:
+            return WRONG_INPUT
+        print(f"{self.folder}: {len(manifest.files)} files, all as the manifest says")
+        return DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Undistort:
+    """Resample a capture whose lenses distort for pinhole cameras."""
+
+    folder: Positional[Path]  # of the capture
+    out: Folder  # of the new one
+
+    def __call__(self) -> int:
+        """Write the new capture."""
+        from synth.readers.undistorting import undistort as resample
+
+        print(resample(self.folder, self.out))
+        return DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write a capture in another format: ash (the release's), nerfstudio, colmap, glb."""
+
+    folder: Positional[Path]  # of the capture
+    form: Annotated[str, arg(name="format", metavar="FORMAT")]  # ash, nerfstudio, colmap or glb
+    out: Folder | None = None  # default: DIR-FORMAT
+    split: str | None = None  # of nerfstudio and colmap: train (default), novel_view or novel_pose
+    frame: int | None = None  # of nerfstudio and colmap: only this frame of the split
+
+    def __call__(self) -> int:
+        """Write it."""
+        from ash.capture.formats import load_capture
+        from synth.readers.export import FORMATS
+        from synth.readers.export import export as write
+
+        if self.form not in FORMATS:
+            raise InputError(f"unknown format {self.form!r}, expected one of {', '.join(FORMATS)}")
+        folder = self.out or self.folder.with_name(f"{self.folder.name}-{self.form}")
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise InputError(f"{folder}: expected an empty folder")
+        print(write(load_capture(self.folder), folder, form=self.form, split=self.split, frame=self.frame))
+        if (folder / "ABOUT.txt").exists():
+            print((folder / "ABOUT.txt").read_text(), end="", file=sys.stderr)
+        return DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motions:
+    """Draw what a motion file becomes on our skeleton, in seconds: nothing is rendered."""
+
+    file: Positional[Path]  # BVH or AMASS .npz
+    out: Annotated[Path | None, arg(metavar="PNG")] = None  # default: FILE's name with .png, here
+    fps: float = 12.0  # frames per second
+    excerpt: Excerpts = Excerpt()
+
+    def __call__(self) -> int:
+        """Draw it, and refuse a person who stands on the head."""
+        from ash.files import write_image
+        from synth.motion.importing import read_motion_file, require_upright
+        from synth.motion.strip import describe, draw_strip
+        from synth.person.mannequin import heads
+        from synth.skeleton import make_skeleton
+
+        skeleton = make_skeleton(heads())
+        found = read_motion_file(self.file, skeleton, fps=self.fps, take=self.excerpt.take)
+        out = self.out or Path(f"{self.file.stem}.png")
+        write_image(out, draw_strip(skeleton, found.motion))
+        print(describe(found), file=sys.stderr)
+        print(out)
+        require_upright(found)
+        return DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sheets:
+    """Draw a contact sheet of all scenes and a turntable."""
+
+    out: Folder = Path("reports/scenes")  # where they go
+    scene: UseAppendAction[tuple[str, ...]] = ()  # only this scene; may be repeated
+
+    def __call__(self) -> int:
+        """Draw them."""
+        from benchmarks.suites.scenes import draw_views_of, scene_of
+        from synth.readers.sheets import SHOWN, draw_sheets
+
+        names = self.scene or SHOWN
+        for path in draw_sheets(
+            self.out, [(name, scene_of(name, size="quick"), draw_views_of(name)) for name in names]
+        ):
+            print(path)
+        return DONE

@@ -1,0 +1,132 @@
+"""Verbs about this checkout and machine: speed, doctor, test, suites, docs."""
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import FlagCreatePairsOff, Positional
+
+from ash.files import InputError
+from benchmarks.verbs.arguments import DONE, FAILED, File, Folder
+
+PUBLIC = (
+    "ash.capture",
+    "ash.protocol",
+    "ash.config",
+    "ash.fields",
+    "ash.presets",
+    "benchmarks.play.avatars",
+    "benchmarks.suites.files",
+    "synth.scene",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Speed:
+    """Time the kernels, or whole frames by stage, beside their definitions."""
+
+    what: Positional[Literal["kernels", "frame"]]  # kernels or frame
+    profile: FlagCreatePairsOff[bool] = False  # frame: the parts of a training step, of ASH and the mesh
+    capture: Folder | None = None  # frame: on this capture; default: the mannequin of the suite ci
+    json: File | None = None  # write the rows there as well
+
+    def __call__(self) -> int:
+        """Measure and print."""
+        if (self.profile or self.capture) and self.what != "frame":
+            raise InputError(f"speed: --profile and --capture go with frame, got {self.what}")
+        if self.profile:
+            from benchmarks.speed.profile import main as profile
+
+            return profile(self.json, self.capture)
+        if self.what == "frame":
+            from benchmarks.speed.frames import main as measure_frames
+
+            return measure_frames(self.json, self.capture)
+        from benchmarks.speed.kernels import main as measure
+
+        return measure(self.what, self.json)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doctor:
+    """What this machine has, and what follows from it."""
+
+    def __call__(self) -> int:
+        """Look and print."""
+        from benchmarks.verbs.doctor import examine, table
+
+        findings = examine(Path())
+        print(table(findings))
+        return DONE if all(finding.good for finding in findings) else FAILED
+
+
+@dataclass(frozen=True, kw_only=True)
+class Suites:
+    """Print our suites, each as the file that makes it: a copy of one is a start for your own (`run FILE.toml`)."""
+
+    name: Positional[str] = ""  # only this one
+
+    def __call__(self) -> int:
+        """Print them."""
+        from ash.fields import nearest
+        from benchmarks.suites.files import suite_files
+
+        known = suite_files()
+        if self.name and self.name not in known:
+            raise InputError(f"unknown suite {self.name!r}, {nearest(self.name, tuple(known))}")
+        for name, path in known.items():
+            if self.name in ("", name):
+                print(f"# {name}.toml\n{path.read_text()}")
+        return DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Docs:
+    """Write the reference of the public names as HTML, from their docstrings; needs pdoc."""
+
+    out: Folder = Path("runs/docs")  # where the pages go
+
+    def __call__(self) -> int:
+        """Write it."""
+        try:
+            import pdoc
+        except ImportError:
+            raise InputError("the reference needs the package pdoc, of the extra dev") from None
+        pdoc.render.configure(docformat="google", show_source=True)
+        pdoc.pdoc(*PUBLIC, output_directory=self.out)
+        print(self.out / "index.html")
+        return DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Test:
+    """Run every check that CI runs; what follows -- goes to pytest."""
+
+    pytest: Positional[tuple[str, ...]] = ()  # arguments for pytest
+
+    def __call__(self) -> int:
+        """Run them on the checkout."""
+        from benchmarks.provenance import cores
+
+        root = Path(__file__).parents[2]
+        if not (root / "tests").is_dir() or not (root / "pyproject.toml").is_file():
+            raise InputError(f"{root}: expected a checkout with tests/; an installed package has none")
+        module = [sys.executable, "-m"]
+        checks = {
+            "ruff check": [*module, "ruff", "check", "."],
+            "ruff format": [*module, "ruff", "format", "--check", "."],
+            "import-linter": [sys.executable, "-c", "from importlinter.cli import lint_imports_command as f; f()"],
+            "mypy": [*module, "mypy"],
+            "pytest": [*module, "pytest", "-n", str(cores()), "--dist", "loadfile", *self.pytest],
+        }
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        failed = []
+        for name, command in checks.items():
+            print(f"--- {name}", flush=True)
+            if subprocess.run(command, cwd=root, env=environment, check=False).returncode:
+                failed.append(name)
+        print(f"--- failed: {', '.join(failed)}" if failed else "--- all checks passed")
+        return FAILED if failed else DONE

@@ -1,0 +1,72 @@
+"""Verbs of the gate."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import FlagCreatePairsOff
+
+from benchmarks.verbs.arguments import DONE, FAILED, Count, CountIfAny, File, Folder, Natural
+from benchmarks.verbs.runs import run_and_report
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gate:
+    """Compare a run with a committed baseline; exit code 1 where it is worse."""
+
+    baseline: File = Path("reports/baseline.json")  # what the run is compared with
+    head: Folder | None = None  # the run to judge; default: run the suite now
+    suite: str = "ci"  # of a new baseline
+    seeds: Count = 3  # of the run
+    data: Folder = Path("data")  # where captures are kept
+    markdown: File | None = None  # write the summary there, for a pull request
+    junit: File | None = None  # write the checks there as JUnit
+    update_baseline: FlagCreatePairsOff[bool] = False  # make the run the new baseline
+
+    def __call__(self) -> int:
+        """Judge the run, or make it the baseline."""
+        from ash.files import write_atomic
+        from benchmarks.gate import gate as rules
+        from benchmarks.gate.words import terminal
+        from benchmarks.provenance import changed_since, cores
+        from benchmarks.suites.files import find_suite
+        from benchmarks.suites.runs import RunOptions, read_run, results_of
+
+        baseline = None if self.update_baseline else rules.read_baseline(self.baseline)
+        folder = self.head
+        if folder is None:
+            suite = find_suite(self.suite if baseline is None else baseline.suite).narrowed(seeds=self.seeds)
+            folder = Path("runs/gate")
+            code = run_and_report(suite, RunOptions(out=folder, data=self.data, workers=cores()))
+            if code not in (DONE, FAILED):
+                return code
+        found = read_run(folder)
+        head = rules.summarise(found.suite, results_of(found))
+        if baseline is None:
+            rules.write_baseline(self.baseline, head)
+            print(f"{self.baseline}: now holds {len(head.entries)} methods at commit {head.commit}")
+            return DONE
+        checks = rules.judge(baseline, head)
+        print(terminal(baseline, head, checks, changed_since(baseline.commit)))
+        if self.markdown:
+            write_atomic(self.markdown, rules.markdown(baseline, head, checks).encode())
+        if self.junit:
+            write_atomic(self.junit, rules.junit(checks).encode())
+        return DONE if all(check.verdict in rules.FINE for check in checks) else FAILED
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateRates:
+    """Measure the gate's false alarms and the planted defects it catches."""
+
+    reruns: Natural = 20  # unchanged runs
+    out: Folder = Path("runs/gate-rates")  # where they go
+    data: Folder = Path("data")  # where captures are kept
+    workers: CountIfAny = None  # default: one per core
+
+    def __call__(self) -> int:
+        """Measure and print."""
+        from benchmarks.gate.rates import markdown, measure
+        from benchmarks.provenance import cores
+
+        print(markdown(measure(self.out, self.data, reruns=self.reruns, workers=self.workers or cores())))
+        return DONE

@@ -1,0 +1,317 @@
+"""Verbs that make, score and report cells and runs: run, train, eval, rescore, report, compare, merge."""
+
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
+
+from ash.files import InputError
+from benchmarks.verbs.arguments import (
+    DONE,
+    FAILED,
+    INTERRUPTED,
+    CountIfAny,
+    Folder,
+    Names,
+    Natural,
+    changes_of,
+    typed,
+)
+
+if TYPE_CHECKING:
+    from benchmarks.suites.runs import Run as RunOnDisk
+    from benchmarks.suites.runs import RunOptions
+    from benchmarks.suites.suites import SceneSpec, Suite
+
+LpipsWeights = Annotated[Path | None, arg(metavar="FILE")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """Run a suite: capture, train, evaluate, report.
+
+    SUITE is one of ours (`suites` prints them) or a file of yours. Flags narrow or widen it.
+
+    On a cluster whose machines share a disk, as a Slurm array of 20 jobs, each one core, all into one folder; each job
+    resumes if started again: `ash-bench synth tight`, `ash-bench synth loose` once, then `sbatch --array=1-20 --wrap
+    'ash-bench run table --out runs/table --workers 1 --shard $SLURM_ARRAY_TASK_ID/20'`, then `ash-bench report
+    runs/table`. Without a shared disk give each shard its own --out and put them together with `ash-bench merge`. On a
+    Dask cluster, `ash-bench run table --executor dask://HOST:8786`.
+    """
+
+    suite: Positional[str] = "quick"  # quick, ci, table, ... or FILE.toml
+    methods: Names = ()  # only these rows, or installed methods besides
+    scenes: Names = ()  # only these rows, or other scenes
+    capture: UseAppendAction[tuple[Path, ...]] = ()  # in place of the scenes: a finished capture; may be repeated
+    size: str | None = None  # of scenes: ci, quick, table or paper
+    preset: str | None = None  # budget of the methods
+    seeds: CountIfAny = None  # train every method with so many seeds
+    out: Folder | None = None  # where results go; default: runs/SUITE
+    data: Folder = Path("data")  # where captures are kept
+    workers: CountIfAny = None  # cells side by side; default: all cores
+    executor: str = "local"  # or dask://HOST:PORT, for a cluster
+    shard: Annotated[str | None, arg(metavar="i/n")] = None  # do every n-th cell only, from the i-th; for job arrays
+    lpips_weights: LpipsWeights = None  # AlexNet's, of torchvision; default: torch's cache; without them LPIPS is n/a
+    retry_failed: FlagCreatePairsOff[bool] = False  # run cells again that failed before
+    dry_run: FlagCreatePairsOff[bool] = False  # print cells, hours and gigabytes, and do nothing
+
+    def __call__(self) -> int:
+        """Captures, cells, report."""
+        from benchmarks.provenance import cores
+        from benchmarks.suites.runs import RunOptions
+
+        suite = self._chosen()
+        _use_lpips(self.lpips_weights)
+        options = RunOptions(
+            out=self.out or Path("runs") / suite.name,
+            data=self.data,
+            workers=self.workers or cores(),
+            executor=self.executor,
+            shard=self.shard,
+            retry_failed=self.retry_failed,
+            command=typed(),
+        )
+        if self.dry_run:
+            from benchmarks.suites.dry_run import estimate
+
+            print(estimate(suite, options))
+            return DONE
+        return run_and_report(suite, options)
+
+    def _chosen(self) -> "Suite":
+        """The suite, as the flags have it."""
+        from benchmarks.suites.files import find_suite
+
+        suite = find_suite(self.suite)
+        return suite.narrowed(
+            scenes=self._scenes(suite), methods=self.methods, size=self.size, preset=self.preset, seeds=self.seeds
+        )
+
+    def _scenes(self, suite: "Suite") -> "tuple[SceneSpec, ...]":
+        from benchmarks.suites.files import given_captures
+        from benchmarks.suites.scenes import scene_of
+        from benchmarks.suites.suites import SceneSpec
+
+        if self.capture and self.scenes:
+            raise InputError("--capture takes the place of the scenes: expected it or --scenes")
+        rows = {row.name: row for row in suite.scenes}
+        for name in self.scenes:
+            if name not in rows:
+                scene_of(name, size=self.size or suite.size)
+        return given_captures(self.capture) or tuple(rows.get(name, SceneSpec(name=name)) for name in self.scenes)
+
+
+def run_and_report(suite: "Suite", options: "RunOptions") -> int:
+    """Run a suite to its end, or to the end of this shard, and write its report."""
+    from benchmarks.suites.runs import failures, finished_results, run_suite
+
+    finished = run_suite(suite, options)
+    results = finished_results(finished)
+    if len(results) < len(finished.cells):
+        there = f"{len(results)} of {len(finished.cells)} cells are there"
+        if options.shard is None:
+            print(f"{there}, the others were interrupted; the same command goes on", file=sys.stderr)
+            return INTERRUPTED
+        print(f"{there}; the report waits for the other shards")
+        return FAILED if failures(results) else DONE
+    return _report(finished)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Write a report: of a run again, or of any cells and runs together."""
+
+    runs: Positional[tuple[Path, ...]]  # folders of runs or of single cells
+    out: Folder | None = None  # where the report goes; default: the run's own folder, for several runs/report
+    publish: Folder | None = None  # copy all of it but the page there, to be committed
+
+    def __call__(self) -> int:
+        """Write it, and copy it where that is asked for."""
+        from benchmarks.suites.runs import gathered, read_run
+
+        if not self.runs:
+            raise InputError("expected the folder of a run or of a cell")
+        if len(self.runs) == 1 and self.out is None:
+            run = read_run(self.runs[0])
+        else:
+            run = gathered(self.runs, self.out or Path("runs/report"), command=typed())
+        code = _report(run)
+        if self.publish is not None:
+            from benchmarks.report.page import publish
+
+            publish(run.folder, self.publish)
+        return code
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compare:
+    """Put two runs side by side: before and after, row by row, with the worst frames of each."""
+
+    before: Positional[Path]  # a run's folder or a cell's
+    after: Positional[Path]  # another
+    out: Folder | None = None  # write compare.html and compare.csv there; default: AFTER/compare
+
+    def __call__(self) -> int:
+        """Print the table, and write the page."""
+        from benchmarks.report.compare import write_comparison
+        from benchmarks.suites.runs import read_run
+
+        out = self.out or self.after / "compare"
+        print(write_comparison(read_run(self.before), read_run(self.after), out))
+        print(out / "compare.html")
+        return DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Merge:
+    """Put the cells of shards together and report."""
+
+    shards: Positional[tuple[Path, ...]]  # folders of runs
+    out: Folder  # of the whole run
+
+    def __call__(self) -> int:
+        """Copy, then report."""
+        from benchmarks.suites.merge import merge_runs
+        from benchmarks.suites.runs import read_run
+
+        merge_runs(self.shards, self.out)
+        return _report(read_run(self.out))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train:
+    """Train and evaluate one method on one capture.
+
+    Every field of the method's configuration is a flag (--model.texels 128 --training.steps 5000), if the method offers
+    one; `train METHOD --help` lists them.
+    """
+
+    method: Positional[str]  # an entry point, or package.module:factory
+    capture: Positional[Path]  # the capture's folder
+    preset: str = "cpu"  # budget of the method: ci, cpu, ...
+    seed: Natural = 0  # of the training
+    out: Folder = Path("runs/train")  # where cells go
+    row: str = ""  # what it is called in tables; default: the method's name and what is changed
+
+    def settings(self) -> Any:
+        """The configuration that the preset means, if the method offers one."""
+        from benchmarks.cell.methods import offered
+
+        return offered(self.method, self.preset)
+
+    def __call__(self) -> int:
+        """One cell by hand."""
+        from ash.capture.formats import load_capture
+        from benchmarks.cell.cells import read_result, write_config
+        from benchmarks.cell.methods import configured
+        from benchmarks.cell.process import run_cell
+        from benchmarks.suites.captures import require_intact
+        from benchmarks.suites.engine import plan_cells
+        from benchmarks.suites.runs import cell_for
+        from benchmarks.suites.suites import CaptureSpec, CellSpec, varied_name
+
+        changes = changes_of(self)
+        if changes:
+            configured(self.method, self.preset, changes)
+        capture = load_capture(self.capture)
+        require_intact(self.capture)
+        row = self.row or varied_name(self.method, changes)
+        spec = CellSpec(
+            capture=CaptureSpec(scene=capture.scene, size="as given", seed=capture.manifest.seed),
+            method=row,
+            factory="" if row == self.method else self.method,
+            preset=self.preset,
+            seed=self.seed,
+            changes=changes,
+        )
+        cell = cell_for(spec, self.capture, self.out)
+        plan_cells([cell], retry_failed=True)
+        if read_result(cell.folder) is not None:
+            print(
+                f"{cell.config.title} was trained before, from the same inputs: nothing is done again", file=sys.stderr
+            )
+        else:
+            write_config(cell)
+            print(f"training {cell.config.title} in {cell.folder}", file=sys.stderr)
+        return _tell(cell.folder, run_cell(cell))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Eval:
+    """Render and score a run's cells again from their checkpoints."""
+
+    run: Positional[Path]  # a run's folder or a cell's
+
+    def __call__(self) -> int:
+        """Render and score."""
+        from benchmarks.cell.process import evaluate_cell
+
+        return _again(self.run, evaluate_cell)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rescore:
+    """Recompute every quality from a run's stored predictions."""
+
+    run: Positional[Path]  # a run's folder or a cell's
+    lpips_weights: LpipsWeights = None  # AlexNet's, of torchvision; default: torch's cache; without them LPIPS is n/a
+
+    def __call__(self) -> int:
+        """Score."""
+        from benchmarks.cell.process import rescore_cell
+
+        _use_lpips(self.lpips_weights)
+        return _again(self.run, rescore_cell)
+
+
+def _use_lpips(weights: Path | None) -> None:
+    """Hand the user's weights on to the cells' processes, once they are known to load."""
+    if weights is None:
+        return
+    from benchmarks.cell.lpips import Lpips
+    from benchmarks.cell.weights import ENVIRONMENT
+
+    os.environ[ENVIRONMENT] = str(weights.resolve())
+    Lpips(weights)
+
+
+def _report(run: "RunOnDisk") -> int:
+    from benchmarks.report.page import write_report
+    from benchmarks.suites.runs import failures, results_of
+
+    lines = write_report(run)
+    print("\n".join(lines))
+    failed = failures(results_of(run))
+    for result in failed:
+        print(f"{result.config.title}: {result.status}: {result.reason}", file=sys.stderr)
+    return FAILED if failed else DONE
+
+
+def _again(folder: Path, function: Callable[[Any], Any]) -> int:
+    from benchmarks.suites.runs import read_run, results_of
+
+    found = read_run(folder)
+    results_of(found)
+    worst = DONE
+    for cell in found.cells:
+        if (cell.folder / "result.json").exists():
+            worst = max(worst, _tell(cell.folder, function(cell)))
+    return worst
+
+
+def _tell(folder: Path, result: Any) -> int:
+    """Print what came out of one cell in one line."""
+    if result.status != "done":
+        print(f"{result.config.title}: {result.status}: {result.reason}", file=sys.stderr)
+        return FAILED
+    parts = []
+    for split in ("novel_view", "novel_pose"):
+        if (value := result.value(split, "foreground", "psnr")) is not None:
+            parts.append(f"{split.replace('_', ' ')} {value:.2f} dB")
+    parts.append(f"{result.value('speed', '', 'frame_ms'):.1f} ms per frame")
+    print(f"{result.config.title}: {', '.join(parts)} (foreground PSNR) in {folder}")
+    return DONE

@@ -1,0 +1,49 @@
+"""What a capture will cost before it is made: images, hours, bytes."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from ash.files import InputError
+from synth.scene import Scene
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Estimate:
+    """What a capture will cost, from figures measured on two cores of a 2019 server."""
+
+    images: int
+    core_seconds: float
+    bytes: int
+
+    @property
+    def text(self) -> str:
+        """One line for the user."""
+        hours = self.core_seconds / 3600
+        time = f"{hours:.1f} core-hours" if hours >= 1 else f"{self.core_seconds / 60:.1f} core-minutes"
+        return f"{self.images} images, about {time}, {self.bytes / 1e9:.2f} GB"
+
+
+def estimate(scene: Scene) -> Estimate:
+    """Images, core seconds and bytes of a capture before it is made."""
+    training = sum(clip.frames for clip in scene.train)
+    rig = scene.rig
+    train_views = (rig.cameras - rig.held_out) * training
+    novel_views = rig.held_out * (len(range(scene.novel_view_stride // 2, training, scene.novel_view_stride)))
+    images = train_views + novel_views + rig.held_out * (scene.frames - training)
+    pixels = rig.width * rig.height
+    per_image = 0.07 + 1.6e-7 * pixels * scene.samples
+    fixed = (40.0 if scene.body == "anny" else 6.0) + 0.25 * scene.frames
+    size = int(images * pixels * 1.1 + scene.frames * 1.2e6 + 3 * scene.texture**2)
+    return Estimate(images=images, core_seconds=fixed + images * per_image, bytes=size)
+
+
+def require_space(scene: Scene, folder: Path) -> None:
+    """Refuse a capture that the disk cannot hold. What an earlier run wrote counts as there already."""
+    there = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    needed = estimate(scene).bytes - there
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        raise InputError(
+            f"{folder}: the capture needs {needed / 1e9:.1f} GB more and the disk has {free / 1e9:.1f} GB free"
+        )

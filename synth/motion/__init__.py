@@ -1,0 +1,1 @@
+"""Motions: generated and imported."""

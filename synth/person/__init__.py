@@ -1,0 +1,1 @@
+"""The person: body, clothes, texture at rest."""

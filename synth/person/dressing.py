@@ -1,0 +1,264 @@
+"""Dressing the realistic body at rest: shirt and trousers as meshes of their own, hair, shoes and a skirt."""
+
+import hashlib
+import inspect
+import sys
+from dataclasses import replace
+
+import numpy as np
+
+from ash.capture.dataset import Skeleton
+from ash.files import InputError, read_arrays, write_arrays
+from synth.person import body, garments, mesh, tubes
+from synth.person.anny_body import bake_key, baked_body, cache_folder
+from synth.person.body import PARTS, Body, Face, Surface, neighbour_mean
+from synth.person.garments import cut_garment, soft_normals
+from synth.person.mesh import Charted, beside, decimate, joined, pack, select, subdivide, uv_charts
+from synth.person.tubes import Tube, chain_weights, chart_uvs, grid_faces, lattice, skirt_weights
+from synth.skeleton import JOINTS, SIDES, make_skeleton
+
+TEMPLATE_VERTICES = 7000
+WAIST = 0.985  # metres above the floor
+UNTUCKED = 0.05  # metres that the shirt hangs over the trousers
+CUFF = 0.17  # height at which the trousers end
+BAND = 3  # rings of faces that the skin goes on beneath a hem
+ANKLE = 0.085  # where the foot is hidden in its shoe
+HAIR = 0.016
+DENSITY = {"head": 1.45, "hand": 1.25, "eye": 2.0}
+STORED = (
+    "vertices", "weights", "faces", "uvs", "uv_faces", "part", "kept", "template_faces", "template_uv_faces",
+    "heads", "eyes", "mouth", "cage", "cage_faces",
+)  # fmt: skip
+
+
+def anny_body(*, skirt: bool) -> Body:
+    """The dressed anny body: in loose clothes with a skirt, or in tight clothes without."""
+    modules = (sys.modules[__name__], garments, mesh, tubes, body)
+    source = "".join(inspect.getsource(module) for module in modules)
+    key = hashlib.sha256(f"{skirt} {bake_key()} {source}".encode()).hexdigest()[:12]
+    path = cache_folder() / f"dressed-{key}.npz"
+    if path.is_file():
+        try:
+            return _unpack(read_arrays(path, expected=STORED))
+        except InputError:
+            path.unlink()
+    write_arrays(path, **_dress(skirt=skirt))
+    return _unpack(read_arrays(path, expected=STORED))
+
+
+def _unpack(stored: dict[str, np.ndarray]) -> Body:
+    names = [name for name, _ in JOINTS]
+    return Body(
+        skeleton=make_skeleton(dict(zip(names, stored["heads"], strict=True))),
+        surface=Surface(**{name: stored[name] for name in ("vertices", "faces", "uvs", "uv_faces", "part")}),
+        skin_weights=stored["weights"],
+        face=Face(eyes=stored["eyes"], mouth=stored["mouth"], modelled=True),
+        kept=stored["kept"],
+        template_faces=stored["template_faces"],
+        template_uv_faces=stored["template_uv_faces"],
+        cage=stored["cage"],
+        cage_faces=stored["cage_faces"],
+    )
+
+
+def _dress(*, skirt: bool) -> dict[str, np.ndarray]:
+    baked = baked_body()
+    skeleton = make_skeleton(dict(zip([name for name, _ in JOINTS], baked["heads"], strict=True)))
+    body, chart, density = _clothed(baked, "loose" if skirt else "tight")
+    tubes = [_shoe(skeleton, side) for side in SIDES]
+    if skirt:
+        tubes.append(_skirt(body))
+    for tube in tubes:
+        body = _append(body, tube, skeleton)
+        chart = np.concatenate([chart, np.full(len(body.faces) - len(chart), chart.max() + 1)])
+        density = np.append(density, 1.0)
+    body = pack(body, chart, density, gutter=0.004)
+    extremities = body.weights[:, [j for j, name in enumerate(skeleton.names) if "hand" in name]].sum(axis=1)
+    face = np.exp(-np.sum((body.vertices - baked["eyes"].mean(axis=0)) ** 2, axis=1) / 0.06**2)
+    keep = 1 + 2 * face + extremities
+    template_faces, template_uv_faces = decimate(body, target=TEMPLATE_VERTICES, keep=keep)
+    fine = subdivide(body, np.isin(body.part, [PARTS.index(part) for part in ("shirt", "trousers", "skirt")]))
+    used = np.unique(fine.faces)
+    number = np.full(len(fine.vertices), -1)
+    number[used] = np.arange(len(used))
+    kept, template = np.unique(template_faces, return_inverse=True)
+    cage, cage_faces = np.unique(body.faces[body.part == PARTS.index("skirt")], return_inverse=True)
+    return {
+        "vertices": fine.vertices[used],
+        "weights": fine.weights[used],
+        "faces": number[fine.faces],
+        "uvs": fine.uvs,
+        "uv_faces": fine.uv_faces,
+        "part": fine.part,
+        "kept": number[kept],
+        "template_faces": template.reshape(-1, 3),
+        "template_uv_faces": template_uv_faces,
+        "heads": baked["heads"],
+        "eyes": baked["eyes"],
+        "mouth": baked["mouth"],
+        "cage": number[cage],
+        "cage_faces": cage_faces.reshape(-1, 3),
+    }
+
+
+def _clothed(baked: dict[str, np.ndarray], fit: str) -> tuple[Charted, np.ndarray, np.ndarray]:
+    """Skin, hair, eyes, shirt and trousers as one mesh, the chart of each face, and each chart's texel density."""
+    bare, kind, group = _bare(baked, feet=False)
+    centre = bare.vertices[bare.faces].mean(axis=1)
+    neck = baked["heads"][[name for name, _ in JOINTS].index("neck")]
+    collar = (np.linalg.norm((centre - neck) * [1, 0.8, 1], axis=1) < 0.085) | (centre[:, 1] > neck[1] + 0.01)
+    trunk = kind == "body"
+    worn = {
+        "shirt": trunk & (centre[:, 1] > WAIST - UNTUCKED) & ~collar,
+        "trousers": trunk & (centre[:, 1] <= WAIST) & (centre[:, 1] > CUFF),
+    }
+    kept = beside(bare.faces, ~(worn["shirt"] | worn["trousers"]), rings=BAND)
+    pieces, groups, kinds = [select(_with_hair(bare), kept)], [group[kept]], [kind[kept]]
+    for layer, (name, faces) in enumerate(worn.items()):
+        piece, source = cut_garment(bare, faces, name=name, fit=fit)
+        pieces.append(piece)
+        groups.append(group[source] + 1000 * (layer + 1))
+        kinds.append(kind[source])
+    mesh = joined(pieces)
+    return mesh, *_charts(mesh, np.concatenate(kinds), np.concatenate(groups))
+
+
+def body_parts(baked: dict[str, np.ndarray]) -> tuple[Charted, np.ndarray, np.ndarray]:
+    """The naked body with its feet, the chart of each face, and each chart's texel density."""
+    mesh, kind, group = _bare(baked, feet=True)
+    return mesh, *_charts(mesh, kind, group)
+
+
+def _charts(mesh: Charted, kind: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    chart = _merge_small(uv_charts(mesh.uv_faces, group), group)
+    return chart, np.array([DENSITY.get(str(kind[chart == k][0]), 1.0) for k in range(chart.max() + 1)])
+
+
+def _bare(baked: dict[str, np.ndarray], *, feet: bool) -> tuple[Charted, np.ndarray, np.ndarray]:
+    """Split quads, drop what is never seen (mouth, sockets, feet in shoes), and label hair and eyes.
+
+    Also what each face is of (body, head, hand, eye, foot), and its limb or original chart, which the atlas is cut by.
+    """
+    quads, uv_quads = baked["quads"], baked["uv_quads"]
+    faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    uv_faces = np.concatenate([uv_quads[:, [0, 1, 2]], uv_quads[:, [0, 2, 3]]])
+    vertices, weights = baked["vertices"], baked["weights"]
+    centre = vertices[faces].mean(axis=1)
+    original = uv_charts(uv_faces, np.zeros(len(faces), dtype=np.int64))
+    sizes = np.bincount(original)
+    names = np.full(len(sizes), "none", dtype=object)
+    body, head = np.argsort(-sizes)[:2]
+    for k in range(len(sizes)):
+        middle = centre[original == k].mean(axis=0)
+        eye = np.linalg.norm(baked["eyes"] - middle, axis=1).min()
+        if k in (body, head):
+            names[k] = "body" if k == body else "head"
+        elif abs(middle[0]) > 0.35:
+            names[k] = "hand"
+        elif feet and middle[1] < 2 * ANKLE:
+            names[k] = "foot"
+        elif eye < 0.03 and sizes[k] < 200 and middle[2] > baked["eyes"][0, 2]:
+            names[k] = "eye"
+    kind = names[original]
+    part = np.full(len(faces), PARTS.index("skin"))
+    part[kind == "eye"] = PARTS.index("eyes")
+    part[(kind == "head") & _is_scalp(centre)] = PARTS.index("hair")
+    seen = (kind != "none") & (feet | ~((kind == "body") & (centre[:, 1] < ANKLE)))
+    group = np.where(kind == "body", _limb(weights[faces].mean(axis=1)), 10 + original)
+    mesh = Charted(vertices=vertices, weights=weights, faces=faces, uvs=baked["uvs"], uv_faces=uv_faces, part=part)
+    return select(mesh, seen), kind[seen], group[seen]
+
+
+def _merge_small(chart: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Islands of a few faces that a cut by limbs leaves join the large chart of their group."""
+    sizes = np.bincount(chart)
+    result = chart.copy()
+    for k in np.flatnonzero(sizes < 20):
+        alike = group == group[chart == k][0]
+        result[chart == k] = np.argmax(np.bincount(chart[alike], minlength=len(sizes)))
+    return np.unique(result, return_inverse=True)[1].reshape(-1)
+
+
+def _is_scalp(points: np.ndarray) -> np.ndarray:
+    """Above a slanted hairline, and not on the ears."""
+    x, y, z = points.T
+    ears = (np.abs(x) > 0.074) & (y < 1.65) & (z > 0.0) & (z < 0.085)
+    return (y > 1.553 + 0.98 * z) & ~ears
+
+
+def _limb(weights: np.ndarray) -> np.ndarray:
+    """0 torso, 1 and 2 arms, 3 and 4 legs, by the heavier joints."""
+    shares = np.zeros((len(weights), 5))
+    for j, (name, _) in enumerate(JOINTS):
+        arm, leg = "arm" in name or "hand" in name, any(word in name for word in ("thigh", "shin", "foot", "toe"))
+        shares[:, (1 if arm else 3) + ("right" in name) if arm or leg else 0] += weights[:, j]
+    return np.argmax(shares, axis=1)
+
+
+def _with_hair(mesh: Charted) -> Charted:
+    """Push the scalp outwards, less towards the hairline."""
+    hair = mesh.part == PARTS.index("hair")
+    inner, hairy = np.zeros(len(mesh.vertices), dtype=bool), np.zeros(len(mesh.vertices), dtype=bool)
+    hairy[mesh.faces[hair]] = True
+    inner[mesh.faces[hair]] = True
+    inner[mesh.faces[~hair]] = False
+    depth = neighbour_mean(np.where(inner, HAIR, 0.0), mesh.faces, rounds=4) * hairy
+    return replace(mesh, vertices=mesh.vertices + depth[:, None] * soft_normals(mesh))
+
+
+def _shoe(skeleton: Skeleton, side: str) -> Tube:
+    ankle, ball = (skeleton.heads[skeleton.names.index(f"{name}_{side}")] for name in ("foot", "toe"))
+    middle = np.array([(ankle[0] + ball[0]) / 2, 0, ball[2]])
+    # Each ring: distance in front of the ball, height of its centre, half its width, half its height.
+    rings = np.array(
+        [
+            (0.107, 0.028, 0.002, 0.002), (0.104, 0.028, 0.016, 0.012), (0.09, 0.030, 0.034, 0.022),
+            (0.04, 0.034, 0.050, 0.031), (-0.02, 0.039, 0.050, 0.038),
+            (-0.09, 0.050, 0.043, 0.049), (-0.15, 0.066, 0.042, 0.066),
+            (-0.195, 0.064, 0.038, 0.062),
+            (-0.218, 0.055, 0.02, 0.04), (-0.223, 0.052, 0.002, 0.003),
+        ]
+    )  # fmt: skip
+    knots = middle + np.stack([np.zeros(len(rings)), rings[:, 1], rings[:, 0]], axis=1)
+    return Tube(
+        part="shoes", knots=knots, radii=rings[:, 2:], front=(0.0, 1.0, 0.0),
+        chain=(f"toe_{side}", f"foot_{side}"), borders=(0.36,), rings=20, segments=20,
+        chart=(0, 0, 0.3, 0.33), blend=0.1,
+    )  # fmt: skip
+
+
+def _skirt(body: Charted) -> Tube:
+    """A flared skirt that leaves room for the legs."""
+    clothed = np.unique(body.faces[np.isin(body.part, [PARTS.index("shirt"), PARTS.index("trousers")])])
+    points = body.vertices[clothed]
+    points = points[(np.abs(points[:, 0]) < 0.3) & (points[:, 1] < 1.05)]
+    knots, radii = [], []
+    for height, flare in ((0.52, 0.115), (0.62, 0.095), (0.74, 0.072), (0.86, 0.05), (0.95, 0.022), (1.01, 0.006)):
+        ring = points[np.abs(points[:, 1] - height) < 0.02]
+        low, high = ring.min(axis=0), ring.max(axis=0)
+        knots.append([0, height, (low[2] + high[2]) / 2])
+        radii.append([(high[0] - low[0]) / 2 + flare, (high[2] - low[2]) / 2 + flare])
+    return Tube(
+        part="skirt", knots=np.array(knots), radii=np.array(radii), front=(0.0, 0.0, 1.0), chain=("pelvis",),
+        borders=(), rings=20, segments=56, chart=(0, 0, 1.5, 0.5),
+    )  # fmt: skip
+
+
+def _append(mesh: Charted, tube: Tube, skeleton: Skeleton) -> Charted:
+    points, along = lattice(tube, tube.rings, tube.segments)
+    flat = points.reshape(-1, 3)
+    if tube.part == "shoes":
+        flat[:, 1] = np.maximum(flat[:, 1], 0)  # A flat sole.
+        weights = np.repeat(chain_weights(tube, along, skeleton.names), tube.segments, axis=0)
+    else:
+        weights = skirt_weights(flat, skeleton.names, top=1.0, length=0.48)
+    faces = grid_faces(tube.rings, tube.segments, stride=tube.segments, wrap=tube.segments)
+    uv_faces = grid_faces(tube.rings, tube.segments, stride=tube.segments + 1, wrap=tube.segments + 1)
+    return Charted(
+        vertices=np.concatenate([mesh.vertices, flat]),
+        weights=np.concatenate([mesh.weights, weights]),
+        faces=np.concatenate([mesh.faces, len(mesh.vertices) + faces]),
+        uvs=np.concatenate([mesh.uvs, chart_uvs(tube.rings, tube.segments) * tube.chart[2:]]),
+        uv_faces=np.concatenate([mesh.uv_faces, len(mesh.uvs) + uv_faces]),
+        part=np.concatenate([mesh.part, np.full(len(faces), PARTS.index(tube.part))]),
+    )

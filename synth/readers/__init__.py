@@ -1,0 +1,1 @@
+"""What reads captures and decides no byte of them."""

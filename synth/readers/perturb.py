@@ -1,0 +1,161 @@
+"""Stress: pure, seeded functions from a capture to a capture, so that truth stays truth.
+
+Only what a method may learn from or is told changes (training images, tracked motion, calibration of training cameras,
+which views exist); held-out images, their cameras and everything under `truth/` are the original's bytes.
+"""
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter1d
+
+from ash.capture.dataset import Camera, Capture, Motion, Split, image_path, pixels_path
+from ash.capture.formats import load_capture, write_cameras, write_motion
+from ash.files import InputError, hash_of, link_or_copy, read_arrays, sha256_of, write_image
+from synth.camera.rig import spread
+from synth.posing import rotvec_to_rotmat
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Perturbation:
+    """Severities; zero (or None) leaves a part as it is."""
+
+    tracking_deg: float = 0.0  # rms error of tracked joint rotations, smooth in time
+    tracking_mm: float = 0.0  # rms error of the tracked root
+    calibration_px: float = 0.0  # rms shift of training images by wrong extrinsics
+    mask_px: int = 0  # training masks dilated (> 0) or eroded (< 0)
+    exposure_stops: float = 0.0  # rms drift of brightness between training cameras
+    colour_stops: float = 0.0  # rms drift of each channel's brightness between training cameras
+    noise_factor: float = 1.0  # variance of training images' noise as a multiple of the renders' own
+    cameras: int | None = None  # how many training cameras are left, spread evenly
+    frames: int | None = None  # how many training frames are left, spread evenly over time
+    first_frames: int | None = None  # how many training frames are left, the first of the training motion
+
+    def __post_init__(self) -> None:
+        for name in ("tracking_deg", "tracking_mm", "calibration_px", "exposure_stops", "colour_stops"):
+            if not 0 <= getattr(self, name) <= 1000:
+                raise InputError(f"perturbation: {name} is {getattr(self, name)}, expected 0 to 1000")
+        if not (1 <= self.noise_factor <= 1e6 and abs(self.mask_px) <= 100):
+            raise InputError("perturbation: expected noise_factor from 1 and mask_px between -100 and 100")
+        for name in ("cameras", "frames", "first_frames"):
+            if getattr(self, name) is not None and getattr(self, name) < 1:
+                raise InputError(f"perturbation: {name} is {getattr(self, name)}, expected at least 1")
+
+
+def perturb(source: Path, folder: Path, perturbation: Perturbation, *, seed: int = 0) -> Path:
+    """Write the perturbed capture of `source` into `folder` and return it. Unchanged files are linked, not copied."""
+    capture = load_capture(source)
+    if folder.exists() and any(folder.iterdir()):
+        raise InputError(f"{folder}: expected an empty folder")
+    changed = _subset(capture, perturbation)
+    written = dict(_changed_files(capture, changed, folder, perturbation, seed))
+    kept = _kept_files(changed)
+    for name in kept - set(written):
+        link_or_copy(source / name, folder / name)
+    files = {name: written.get(name) or capture.manifest.files[name] for name in sorted(kept | set(written))}
+    perturbed = {"of": capture.identity, "seed": seed, **asdict(perturbation)}
+    replace(capture.manifest, splits=changed.splits, perturbed=perturbed, files=files).write(folder)
+    return folder
+
+
+def _subset(capture: Capture, perturbation: Perturbation) -> Capture:
+    """The capture with fewer training cameras and frames; held-out splits stay."""
+    train = capture.splits["train"]
+    cameras, frames = train.cameras, train.frames
+    if perturbation.cameras is not None:
+        if perturbation.cameras > len(cameras):
+            raise InputError(f"perturbation: {perturbation.cameras} cameras of {len(cameras)}")
+        positions = np.stack([capture.cameras[name].position for name in cameras])
+        cameras = tuple(cameras[k] for k in sorted(spread(positions, perturbation.cameras)))
+    if perturbation.frames is not None:
+        if perturbation.frames > len(frames):
+            raise InputError(f"perturbation: {perturbation.frames} frames of {len(frames)}")
+        chosen = np.unique(np.round(np.linspace(0, len(frames) - 1, perturbation.frames)).astype(int))
+        frames = tuple(frames[k] for k in chosen)
+    if perturbation.first_frames is not None:
+        if perturbation.first_frames > len(frames):
+            raise InputError(f"perturbation: the first {perturbation.first_frames} frames of {len(frames)}")
+        frames = frames[: perturbation.first_frames]
+    return replace(capture, splits={**capture.splits, "train": Split(cameras=cameras, frames=frames)})
+
+
+def _kept_files(capture: Capture) -> set[str]:
+    """Files of the original that the perturbed capture still has: all but the images of dropped views."""
+    views = {pair for split in capture.splits.values() for pair in split.views}
+    shown = {str(place(Path(), *view)) for view in views for place in (image_path, pixels_path)}
+    pictures = ("frames/", "truth/pixels/")
+    return {name for name in capture.manifest.files if name in shown or not name.startswith(pictures)}
+
+
+def _changed_files(
+    original: Capture, capture: Capture, folder: Path, perturbation: Perturbation, seed: int
+) -> Iterator[tuple[str, str]]:
+    """Write what changes; yields each file's name and hash."""
+    if perturbation.tracking_deg or perturbation.tracking_mm:
+        write_motion(folder / "motion.npz", mistrack(original.motion, perturbation, seed=seed))
+        yield "motion.npz", sha256_of(folder / "motion.npz")
+    if perturbation.calibration_px:
+        names = set(capture.splits["train"].cameras)
+        cameras = [
+            miscalibrate(camera, perturbation.calibration_px, seed=seed) if name in names else camera
+            for name, camera in original.cameras.items()
+        ]
+        write_cameras(folder / "cameras.json", cameras)
+        yield "cameras.json", sha256_of(folder / "cameras.json")
+    drifts = perturbation.exposure_stops or perturbation.colour_stops
+    if perturbation.mask_px or drifts or perturbation.noise_factor > 1:
+        for camera, frame in capture.splits["train"].views:
+            path = image_path(folder, camera, frame)
+            write_image(path, _spoil(original, camera, frame, perturbation, seed))
+            yield str(image_path(Path(), camera, frame)), sha256_of(path)
+
+
+def mistrack(motion: Motion, perturbation: Perturbation, *, seed: int) -> Motion:
+    """Motion as a tracker with errors reports it: smooth in time, with the stated rms per joint and of the root."""
+    rng = np.random.default_rng([seed, 1])
+    noise = rng.standard_normal(motion.dofs.shape)
+    for index in np.unique(motion.sequence):
+        chosen = motion.sequence == index
+        noise[chosen] = gaussian_filter1d(noise[chosen], 1.5, axis=0, mode="wrap")
+    noise /= np.sqrt(np.mean(noise**2, axis=0, keepdims=True))
+    scale = np.full(motion.dofs.shape[1], np.deg2rad(perturbation.tracking_deg) / np.sqrt(3))
+    scale[:3] = perturbation.tracking_mm / 1000 / np.sqrt(3)
+    return replace(motion, dofs=motion.dofs + scale * noise)
+
+
+def miscalibrate(camera: Camera, pixels: float, *, seed: int) -> Camera:
+    """The camera turned by a small random rotation that shifts its image by about `pixels` rms."""
+    rng = np.random.default_rng([seed, 2, int(hash_of(camera.name)[:8], 16)])
+    angles = rng.standard_normal(3) * pixels / np.sqrt(2) / camera.K[0, 0]
+    viewmat = camera.viewmat.copy()
+    viewmat[:3] = rotvec_to_rotmat(angles) @ viewmat[:3]
+    return replace(camera, viewmat=viewmat)
+
+
+def _spoil(capture: Capture, camera: str, frame: int, perturbation: Perturbation, seed: int) -> np.ndarray:
+    image = capture.image(camera, frame)
+    colour, alpha = image[..., :3].astype(np.float64) / 255, image[..., 3]
+    rng = np.random.default_rng([seed, 3, int(hash_of([camera, frame])[:8], 16)])
+    if perturbation.noise_factor > 1:
+        variance = read_arrays(pixels_path(capture.folder, camera, frame), expected=("noise",))["noise"]
+        deviation = np.sqrt(np.maximum(variance.astype(np.float64), 0) * (perturbation.noise_factor - 1))
+        colour = colour + deviation[..., None] * rng.standard_normal(colour.shape)
+    if perturbation.exposure_stops or perturbation.colour_stops:
+        own = np.random.default_rng([seed, 4, int(hash_of(camera)[:8], 16)])
+        stops = perturbation.exposure_stops * own.standard_normal() + perturbation.colour_stops * own.standard_normal(3)
+        colour = np.clip(np.clip(colour, 0, 1) ** 2.2 * 2**stops, 0, 1) ** (1 / 2.2)
+    if perturbation.mask_px:
+        alpha = _shift_mask(alpha, perturbation.mask_px)
+    rgb = np.round(np.clip(colour, 0, 1) * 255).astype(np.uint8)
+    return np.concatenate([np.where(alpha[..., None] > 0, rgb, 0), alpha[..., None]], axis=-1)
+
+
+def _shift_mask(alpha: np.ndarray, pixels: int) -> np.ndarray:
+    inside = alpha > 127
+    cross = np.ones((3, 3), dtype=bool)
+    if pixels > 0:
+        grown = binary_dilation(inside, cross, iterations=pixels)
+        return np.where(grown, 255, alpha).astype(np.uint8)
+    return np.where(binary_erosion(inside, cross, iterations=-pixels), alpha, 0).astype(np.uint8)

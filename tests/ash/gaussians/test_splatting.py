@@ -1,0 +1,505 @@
+"""`splat` against its definition in value and gradient, the definition against closed forms, near hard spots too."""
+
+import math
+import os
+import sys
+import types
+from collections.abc import Callable, Iterator
+from dataclasses import fields, replace
+from typing import Any
+
+import pytest
+import torch
+from helpers.numerics import Scene, assert_same, cast, random_scene, relative_error, tensors_of, values_and_gradients
+from torch import Tensor
+
+from ash.files import InputError
+from ash.gaussians.gaussians import Gaussians
+from ash.gaussians.splatting import Splatted, splat, splat_naive
+from ash.native import splatting
+from ash.native.library import instruction_set, use_instruction_set, use_team
+
+# Errors are a few units in the last place of float32 (6e-8), summed: 1e-6 is typical. A halved gradient is off by 0.5.
+TOLERANCE = 2e-5
+INSTRUCTION_SETS = ("avx512", "avx2", "plain")
+
+
+@pytest.fixture(params=INSTRUCTION_SETS)
+def instructions(request: pytest.FixtureRequest) -> Iterator[str]:
+    before = instruction_set()
+    if not use_instruction_set(request.param):
+        pytest.skip(f"this machine does not run {request.param}")
+    yield request.param
+    use_instruction_set(before)
+
+
+def draw(drawer: Callable[..., Splatted], scene: Scene, **more: Any) -> Splatted:
+    return drawer(**{field.name: getattr(scene, field.name) for field in fields(scene)}, **more)
+
+
+def change(scene: Scene, **tensors: Tensor) -> Scene:
+    return replace(scene, gaussians=Gaussians(**(tensors_of(scene.gaussians) | tensors)))
+
+
+def compare(scene: Scene, tolerance: float = TOLERANCE, **wider: float) -> dict[str, Tensor]:
+    results = values_and_gradients(splat, scene, torch.float32)
+    assert_same(results, values_and_gradients(splat_naive, scene, torch.float64), tolerance, wider)
+    return results
+
+
+def one_gaussian(**tensors: Tensor) -> Scene:
+    """An isotropic Gaussian of 0.1 m, 2 m before a camera of focal length 40, in the middle of 21x21 pixels."""
+    gaussian = {
+        "means": torch.tensor([[0.0, 0.0, 2.0]]),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        "scales": torch.full((1, 3), 0.1),
+        "opacities": torch.tensor([0.8]),
+        "sh": torch.tensor([[[1.0, 0.0, -1.0]]]),
+    }
+    K = torch.tensor([[[40.0, 0, 10.5], [0, 40.0, 10.5], [0, 0, 1]]])
+    return Scene(gaussians=Gaussians(**(gaussian | tensors)), viewmats=torch.eye(4)[None], Ks=K, width=21, height=21)
+
+
+# --- the definition ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("drawer", [splat_naive, splat])
+def test_one_gaussian_has_its_closed_form(drawer: Callable[..., Splatted]) -> None:
+    drawn = draw(drawer, one_gaussian())
+    offsets = torch.arange(21) - 10.0
+    squared = offsets[:, None] ** 2 + offsets**2
+    alpha = 0.8 * torch.exp(-0.5 * squared / (2.0**2 + 0.3))  # 40 / 2 * 0.1 = 2 pixels, and the dilation
+    alpha = torch.where(alpha >= 1 / 255, alpha, 0.0)
+    colour = torch.tensor([0.5 + 0.28209479, 0.5, 0.5 - 0.28209479])
+    assert relative_error(drawn.alpha[0], alpha) < 1e-6
+    assert relative_error(drawn.rgb[0], alpha[..., None] * colour) < 1e-6
+    assert relative_error(drawn.depth[0], 2 * alpha) < 1e-6
+    assert relative_error(drawn.means2d, torch.tensor([[[10.5, 10.5]]])) < 1e-7
+
+
+@pytest.mark.parametrize("drawer", [splat_naive, splat])
+def test_nearer_gaussians_cover_farther_ones_and_the_background_shines_through(drawer: Callable[..., Splatted]) -> None:
+    two = one_gaussian(
+        means=torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 2.0]]),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),
+        scales=torch.full((2, 3), 0.1),
+        opacities=torch.tensor([0.5, 0.6]),
+        sh=torch.tensor([[[1.0, 0, 0]], [[0.0, 1.0, 0]]]),
+    )
+    drawn = draw(drawer, replace(two, background=torch.tensor([0.0, 0.0, 2.0])))
+    far, near = torch.tensor([0.78209479, 0.5, 0.5]), torch.tensor([0.5, 0.78209479, 0.5])
+    expected = 0.6 * near + 0.4 * 0.5 * far + 0.2 * torch.tensor([0.0, 0.0, 2.0])
+    assert relative_error(drawn.rgb[0, 10, 10], expected) < 1e-6
+    assert drawn.depth[0, 10, 10].item() == pytest.approx(0.6 * 2 + 0.2 * 4, rel=1e-6)
+
+
+@pytest.mark.parametrize("drawer", [splat_naive, splat])
+def test_opacity_is_capped_and_a_finished_pixel_takes_no_more(drawer: Callable[..., Splatted]) -> None:
+    count = 5
+    wall = one_gaussian(
+        means=torch.tensor([[0.0, 0.0, 2.0 + i] for i in range(count)]),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        scales=torch.full((count, 3), 5.0),
+        opacities=torch.ones(count),
+        sh=torch.zeros(count, 1, 3),
+    )
+    # The first leaves 0.01; the second would leave 1e-4, which rounds to either side; a faint one decides.
+    faint = change(wall, opacities=torch.tensor([1.0, 0.98, 0.9, 0.5, 1.0]))
+    centre = draw(drawer, faint).alpha[0, 10, 10].item()
+    assert centre == pytest.approx(1 - 0.01 * 0.02, abs=1e-7)
+
+
+def test_definition_does_not_depend_on_its_tiles() -> None:
+    scene = cast(random_scene(), torch.float64)
+    small, whole = draw(splat_naive, scene, tile=8), draw(splat_naive, scene, tile=128)
+    for name in ("rgb", "alpha", "depth"):
+        assert relative_error(getattr(small, name), getattr(whole, name)) < 1e-14
+
+
+@pytest.mark.parametrize("compensate", [False, True])
+def test_definition_has_the_gradient_of_its_value(compensate: bool) -> None:
+    """Finite differences, where no opacity lies at a threshold."""
+    scene = replace(random_scene(count=6, coefficients=16, width=9, height=8, seed=3), compensate=compensate)
+    scene = cast(replace(scene, Ks=torch.tensor([[[14.0, 0, 4.2], [0, 13, 4.4], [0, 0, 1]]])), torch.float64)
+
+    def images(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor, viewmats: Tensor) -> Any:
+        gaussians = Gaussians(means=means, quats=quats, scales=scales, opacities=opacities, sh=sh)
+        moved = cameras + viewmats  # not checked to be a rotation: it is one to first order only
+        drawn = draw(splat_naive, replace(scene, gaussians=gaussians, viewmats=moved))
+        return drawn.rgb, drawn.alpha, drawn.depth
+
+    cameras = scene.viewmats.detach()
+    tensors = [*tensors_of(scene.gaussians).values(), torch.zeros_like(cameras, requires_grad=True)]
+    assert torch.autograd.gradcheck(images, tensors, eps=1e-7, atol=1e-5, rtol=1e-4, fast_mode=True)
+
+
+# --- the fast path ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("compensate", [False, True])
+@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
+def test_splat_is_its_definition(coefficients: int, compensate: bool) -> None:
+    compare(replace(random_scene(coefficients=coefficients, cameras=2), compensate=compensate))
+
+
+def test_every_instruction_set_is_the_definition(instructions: str) -> None:
+    assert instruction_set() == instructions
+    compare(random_scene(coefficients=9, cameras=2, seed=1))
+    compare(replace(random_scene(count=400, coefficients=4, seed=2), compensate=True, dilation=0.05, background=None))
+
+
+@pytest.mark.parametrize("output", ["rgb", "alpha", "depth"])
+def test_each_image_alone_has_its_gradient(output: str) -> None:
+    """The others' gradients are then absent altogether."""
+    gradients = []
+    for drawer, dtype in ((splat, torch.float32), (splat_naive, torch.float64)):
+        scene = cast(random_scene(), dtype)
+        image = getattr(draw(drawer, scene), output)
+        (image * torch.linspace(0.1, 1, image.numel(), dtype=dtype).reshape(image.shape)).sum().backward()
+        tensors = tensors_of(scene.gaussians) | {"viewmats": scene.viewmats}
+        gradients.append({name: torch.zeros_like(t) if t.grad is None else t.grad for name, t in tensors.items()})
+    assert_same(*gradients, TOLERANCE)
+
+
+MUTATIONS = ("means", "quats", "scales", "opacities", "sh", "viewmats")
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.5])
+@pytest.mark.parametrize("parameter", [*MUTATIONS, "means2d"])
+def test_a_halved_or_zeroed_gradient_is_noticed(parameter: str, factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    node, position = (
+        (splatting._Blend, 2) if parameter == "means2d" else (splatting._Project, 1 + MUTATIONS.index(parameter))
+    )
+    honest = node.backward
+
+    def mutant(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        results = list(honest(ctx, *grads))
+        results[position] = factor * results[position]
+        return tuple(results)
+
+    compare(random_scene())
+    monkeypatch.setattr(node, "backward", staticmethod(mutant))
+    with pytest.raises(AssertionError, match=f"grad_{parameter}"):
+        compare(random_scene())
+
+
+@pytest.mark.parametrize("of_torch", [True, False])
+def test_threads_and_repetition_change_no_bit(of_torch: bool) -> None:
+    scene = random_scene(count=3000, coefficients=9, cameras=2, width=150, height=100)
+    first = values_and_gradients(splat, scene, torch.float32, threads=1)
+    try:
+        use_team(of_torch=of_torch)
+        for threads in (1, 2, 5):
+            again = values_and_gradients(splat, scene, torch.float32, threads=threads)
+            assert all(torch.equal(first[name], again[name]) for name in first)
+    finally:
+        use_team(of_torch=True)
+
+
+def test_several_cameras_are_one_camera_several_times() -> None:
+    scene = random_scene(cameras=3)
+    together = draw(splat, scene)
+    for i in range(3):
+        alone = draw(splat, replace(scene, viewmats=scene.viewmats[i : i + 1], Ks=scene.Ks[i : i + 1]))
+        assert torch.equal(alone.rgb[0], together.rgb[i])
+
+
+def test_threads_work_after_a_fork() -> None:
+    scene = random_scene()
+    expected = draw(splat, scene, threads=2).rgb
+    child = os.fork()
+    if child == 0:
+        os._exit(0 if torch.equal(draw(splat, scene, threads=2).rgb, expected) else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+def test_backward_may_come_twice_and_late() -> None:
+    scene = cast(random_scene(), torch.float32)
+    drawn = draw(splat, scene)
+    for _ in range(6):  # other drawings come and go in between
+        draw(splat, random_scene(count=40, seed=9))
+    drawn.rgb.sum().backward(retain_graph=True)
+    once = scene.gaussians.means.grad.clone()
+    drawn.rgb.sum().backward()
+    assert torch.equal(scene.gaussians.means.grad, 2 * once)
+
+
+def test_a_camera_finds_its_way_back() -> None:
+    """Descending the gradient of the pose undoes a shift of a calibrated camera."""
+    scene = random_scene(count=300)
+    target = draw(splat, scene).rgb
+    shift = torch.tensor([0.02, -0.015, 0.03])
+    offset = shift.clone().requires_grad_()
+    optimizer = torch.optim.Adam([offset], lr=3e-3)
+    for _ in range(40):
+        viewmats = scene.viewmats.clone()
+        viewmats[:, :3, 3] += offset
+        loss = (draw(splat, replace(scene, viewmats=viewmats)).rgb - target).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert offset.detach().norm() < 0.15 * shift.norm()
+
+
+# --- hard spots -------------------------------------------------------------------------------------------------------
+
+
+def behind_and_across_the_near_plane() -> Scene:
+    scene = random_scene(count=200)
+    return replace(scene, near=2.9)  # of 3 m to the middle: half the Gaussians lie before the plane
+
+
+def centres_close_to_the_camera() -> Scene:
+    """Far outside the image for their depth: the Jacobian's clamp decides."""
+    scene = random_scene(count=60)
+    viewmats = scene.viewmats.clone()
+    viewmats[:, 2, 3] = 0.3
+    return change(replace(scene, viewmats=viewmats, near=0.05), scales=0.3 * scene.gaussians.scales)
+
+
+def needles() -> Scene:
+    scene = random_scene(count=80)
+    return change(scene, scales=torch.tensor([0.4, 1e-4, 1e-5]).repeat(80, 1))
+
+
+def pancakes() -> Scene:
+    scene = random_scene(count=80)
+    return change(scene, scales=torch.tensor([0.2, 0.15, 0.0]).repeat(80, 1))
+
+
+def pancakes_compensated() -> Scene:
+    return replace(pancakes(), compensate=True)
+
+
+def specks() -> Scene:
+    scene = random_scene(count=300)
+    return change(scene, scales=torch.tensor([1e-3, 1e-4, 1e-5]).repeat(300, 1))
+
+
+def opacities_zero_and_one() -> Scene:
+    scene = random_scene(count=80)
+    return change(scene, opacities=(torch.arange(80) % 3 == 0).float())
+
+
+def equal_depths() -> Scene:
+    scene = replace(random_scene(count=90), viewmats=torch.eye(4)[None])
+    means = scene.gaussians.means.clone()
+    means[:, 2] = 3.0
+    means[::3, 2] = torch.nextafter(torch.tensor(3.0), torch.tensor(4.0))
+    return change(scene, means=means)
+
+
+def black_colours() -> Scene:
+    scene = random_scene(count=80)
+    return change(scene, sh=scene.gaussians.sh * 4 - 1)
+
+
+def nothing() -> Scene:
+    return random_scene(count=0)
+
+
+def all_behind() -> Scene:
+    return replace(random_scene(count=30), near=50.0)
+
+
+def one_pixel() -> Scene:
+    return replace(
+        random_scene(count=40), width=1, height=1, Ks=torch.tensor([[[2.0, 0, 0.3], [0, 2, 0.6], [0, 0, 1]]])
+    )
+
+
+def principal_point_outside_the_image() -> Scene:
+    scene = random_scene()
+    K = scene.Ks.clone()
+    K[0, 0, 2], K[0, 1, 2] = -20, 75
+    return replace(scene, Ks=K)
+
+
+def tile_borders() -> Scene:
+    """Centres exactly on the corners of tiles and blocks, in an image that ends one pixel after a tile."""
+    grid = torch.stack(torch.meshgrid(torch.arange(0, 69, 4.0), torch.arange(0, 37, 4.0), indexing="ij"), -1).reshape(
+        -1, 2
+    )
+    scene = random_scene(count=len(grid), width=65, height=33)
+    K = torch.tensor([[[64.0, 0, 32], [0, 64, 16], [0, 0, 1]]])
+    means = torch.cat([(grid - torch.tensor([32.0, 16])) / 64 * 4, torch.full((len(grid), 1), 4.0)], 1)
+    means[:, 2] += 0.001 * torch.arange(len(grid))
+    means[:, :2] *= means[:, 2:] / 4
+    return change(replace(scene, Ks=K, viewmats=torch.eye(4)[None]), means=means)
+
+
+def larger_than_the_image() -> Scene:
+    scene = random_scene(count=30)
+    return change(scene, scales=3 + scene.gaussians.scales, opacities=0.3 * scene.gaussians.opacities)
+
+
+def quaternions_of_all_lengths() -> Scene:
+    scene = random_scene(count=80)
+    lengths = torch.logspace(-15, 12, 80)
+    return change(scene, quats=lengths[:, None] * scene.gaussians.quats)
+
+
+# Where more than rounding is lost: a needle's alpha changes by 1e-4 when its rotation changes by one float32 unit; the
+# gradient in a quaternion of length 1e-15 is 1e15 times that of its shortest neighbour, and so on.
+HARD_SPOTS: list[tuple[Callable[[], Scene], float]] = [
+    (behind_and_across_the_near_plane, TOLERANCE),
+    (centres_close_to_the_camera, 1e-4),
+    (needles, 2e-3),
+    (pancakes, 1e-4),
+    (pancakes_compensated, 1e-3),
+    (specks, TOLERANCE),
+    (opacities_zero_and_one, TOLERANCE),
+    (equal_depths, TOLERANCE),
+    (black_colours, TOLERANCE),
+    (nothing, 0.0),
+    (all_behind, 0.0),
+    (one_pixel, TOLERANCE),
+    (principal_point_outside_the_image, TOLERANCE),
+    (tile_borders, TOLERANCE),
+    (larger_than_the_image, TOLERANCE),
+    (quaternions_of_all_lengths, TOLERANCE),
+]
+
+
+@pytest.mark.parametrize(("make", "tolerance"), HARD_SPOTS, ids=lambda x: getattr(x, "__name__", ""))
+def test_hard_spot(make: Callable[[], Scene], tolerance: float) -> None:
+    results = compare(make(), tolerance)
+    assert all(bool(torch.isfinite(tensor).all()) for tensor in results.values())
+
+
+def test_more_than_100000_gaussians_on_one_tile() -> None:
+    count = 120_000
+    generator = torch.Generator().manual_seed(0)
+    scene = random_scene(count=count, coefficients=1, width=8, height=8)
+    means = torch.rand(count, 3, generator=generator) * torch.tensor([0.2, 0.2, 1.0]) - torch.tensor([0.1, 0.1, 0.0])
+    scene = change(
+        replace(scene, Ks=torch.tensor([[[120.0, 0, 4], [0, 120, 4], [0, 0, 1]]]), viewmats=torch.eye(4)[None]),
+        means=means + torch.tensor([0.0, 0.0, 3.0]),
+        scales=torch.full((count, 3), 0.012),
+        opacities=torch.full((count,), 0.006),
+    )
+    drawn = draw(splat, scene, threads=2)
+    assert (drawn.alpha > 0.97).all()
+    # A few of so many pairs lie within rounding of a threshold and fall on its other side: 0.004 of a colour each.
+    truth = draw(splat_naive, cast(scene, torch.float64))
+    assert relative_error(drawn.rgb, truth.rgb.detach()) < 1e-4
+
+
+# --- wrong input ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("drawer", [splat_naive, splat])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh", "viewmats", "Ks"])
+def test_nan_and_infinity_are_named(name: str, bad: float, drawer: Callable[..., Splatted]) -> None:
+    scene = random_scene(count=20, coefficients=16)
+    owner = scene if name in ("viewmats", "Ks") else scene.gaussians
+    tensor = getattr(owner, name).clone()
+    tensor.view(-1)[-1 if owner is scene.gaussians else 2] = bad
+    wrong = replace(scene, **{name: tensor}) if owner is scene else change(scene, **{name: tensor})
+    with pytest.raises(InputError, match=name):
+        draw(drawer, wrong)
+
+
+@pytest.mark.parametrize("drawer", [splat_naive, splat])
+def test_wrong_numbers_are_named(drawer: Callable[..., Splatted]) -> None:
+    scene = random_scene(count=20)
+    quats, opacities, scales = (getattr(scene.gaussians, name).clone() for name in ("quats", "opacities", "scales"))
+    quats[13], opacities[4], scales[7, 1] = 0.0, 1.5, -0.1
+    for tensors in ({"quats": quats}, {"opacities": opacities}, {"scales": scales}):
+        with pytest.raises(InputError, match=next(iter(tensors))):
+            draw(drawer, change(scene, **tensors))
+    with pytest.raises(InputError, match="sh"):
+        draw(drawer, change(scene, sh=torch.zeros(20, 5, 3)))
+    with pytest.raises(InputError, match="viewmats"):
+        draw(drawer, replace(scene, viewmats=2 * scene.viewmats))
+    with pytest.raises(InputError, match="skew"):
+        draw(drawer, replace(scene, Ks=scene.Ks + torch.tensor([[0.0, 1, 0], [0, 0, 0], [0, 0, 0]])))
+    with pytest.raises(InputError, match="size"):
+        draw(drawer, replace(scene, width=0))
+
+
+def test_the_first_bad_gaussian_is_named_whatever_the_threads() -> None:
+    scene = random_scene(count=5000)
+    quats = scene.gaussians.quats.clone()
+    quats[[4999, 2500, 1234]] = 0
+    for threads in (1, 2, 4):
+        with pytest.raises(InputError, match=r"zero quaternion at Gaussian 1234$"):
+            draw(splat, change(scene, quats=quats), threads=threads)
+
+
+def test_what_splat_cannot_do_is_refused() -> None:
+    scene = random_scene(count=5)
+    with pytest.raises(InputError, match=r"means: expected float32"):
+        draw(splat, cast(scene, torch.float64))
+    with pytest.raises(InputError, match="Ks: splat has no gradient"):
+        draw(splat, replace(scene, Ks=scene.Ks.clone().requires_grad_()))
+    with pytest.raises(InputError, match="background: splat has no gradient"):
+        draw(splat, replace(scene, background=torch.zeros(3, requires_grad=True)))
+    with pytest.raises(InputError, match="threads"):
+        draw(splat, scene, threads=0)
+
+
+# --- gsplat -----------------------------------------------------------------------------------------------------------
+
+
+def test_gsplat_is_called_by_its_own_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a GPU: the arguments that gsplat 1.5's `rasterization` takes, and what is made of its answer."""
+    from ash.gaussians.splatting import _splat_gsplat
+
+    def rasterization(
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        viewmats: Tensor,
+        Ks: Tensor,
+        width: int,
+        height: int,
+        near_plane: float = 0.01,
+        eps2d: float = 0.3,
+        sh_degree: int | None = None,
+        packed: bool = True,
+        backgrounds: Tensor | None = None,
+        render_mode: str = "RGB",
+        rasterize_mode: str = "classic",
+    ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        assert (sh_degree, packed, render_mode, rasterize_mode) == (2, False, "RGB+D", "antialiased")
+        assert backgrounds is not None and backgrounds.shape == (2, 3) and (near_plane, eps2d) == (0.5, 0.1)
+        image = torch.arange(4.0).expand(2, height, width, 4)
+        return image, torch.full((2, height, width, 1), 9.0), {"means2d": torch.zeros(2, len(means), 2)}
+
+    monkeypatch.setitem(sys.modules, "gsplat", types.SimpleNamespace(rasterization=rasterization))
+    scene = replace(random_scene(coefficients=9, cameras=2), compensate=True, near=0.5, dilation=0.1)
+    drawn = draw(_splat_gsplat, scene)
+    assert drawn.rgb[1, 3, 4].tolist() == [0, 1, 2] and (drawn.depth == 3).all() and (drawn.alpha == 9).all()
+
+
+def test_without_gsplat_the_message_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    from ash.gaussians.splatting import _splat_gsplat
+
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    with pytest.raises(InputError, match="pip install gsplat"):
+        draw(_splat_gsplat, random_scene(count=3))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a CUDA device, and there is none")
+def test_gsplat_is_the_definition() -> None:
+    pytest.importorskip("gsplat")
+    # Opacities below the caps of both, so that their different constants do not matter.
+    scene = random_scene(count=150, coefficients=9, cameras=2)
+    scene = change(scene, opacities=0.5 * scene.gaussians.opacities)
+    truth = values_and_gradients(splat_naive, scene, torch.float64)
+
+    def on_gpu(**arguments: Any) -> Splatted:
+        moved = {name: value.cuda() if isinstance(value, Tensor) else value for name, value in arguments.items()}
+        gaussians = Gaussians(**{name: t.cuda() for name, t in tensors_of(arguments["gaussians"]).items()})
+        drawn = splat(**(moved | {"gaussians": gaussians}))
+        return Splatted(
+            rgb=drawn.rgb.cpu(), alpha=drawn.alpha.cpu(), depth=drawn.depth.cpu(), means2d=drawn.means2d.cpu()
+        )
+
+    results = values_and_gradients(on_gpu, scene, torch.float32)
+    del results["grad_means2d"], truth["grad_means2d"]  # the copy on the CPU has none
+    assert_same(results, truth, 1e-3, {"means2d": 1.0})

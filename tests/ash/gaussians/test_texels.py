@@ -1,0 +1,131 @@
+"""The native kernels of the texels against their definitions, in value and gradient."""
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from helpers.captures import tube_model_config
+from helpers.figures import tube_mesh, tube_motion, tube_skeleton
+
+from ash.capture.dataset import Pose
+from ash.gaussians.gaussians import Gaussians, raw_channels
+from ash.gaussians.texels import place, place_naive, pose, pose_naive
+from ash.native.library import instruction_set, use_instruction_set
+from ash.rotations import RigidTransforms
+from ash.template.template import PosedTemplate, RestDeformation, Template
+from ash.textures import Conditions, TexelLattice, build_lattice
+
+LATTICE = build_lattice(tube_mesh(), 70)  # 3,969 texels: two ranges, and no multiple of any vector's width
+
+
+@pytest.fixture(params=["avx512", "avx2", "plain"], autouse=True)
+def each_instruction_set(request):
+    before = instruction_set()
+    if not use_instruction_set(request.param):
+        pytest.skip(f"this machine has no {request.param}")
+    yield
+    use_instruction_set(before)
+
+
+def posed_tube(frame: int = 4) -> PosedTemplate:
+    return Template(tube_mesh(), tube_skeleton(), RestDeformation(tube_mesh())).pose(Pose(tube_motion(), frame))
+
+
+def conditions(lattice: TexelLattice = LATTICE) -> Conditions:
+    canonical, normals, transforms = place_naive(lattice, posed_tube())
+    return Conditions(
+        trust=1.0,
+        textures=torch.zeros(0, 1, 1),
+        motion=torch.zeros(2, 9),
+        root_translation=torch.zeros(3),
+        canonical=canonical,
+        normals=normals,
+        transforms=transforms,
+    )
+
+
+def raw_and_light(sh_degree: int, count: int = len(LATTICE.texels)) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    channels = raw_channels(tube_model_config(sh_degree=sh_degree))
+    raw = torch.randn(count, channels, generator=generator)
+    raw[:, 3:6] -= 4
+    return raw, 0.3 * torch.randn(9, 3, generator=generator)
+
+
+def test_texels_are_placed_as_defined():
+    expected_canonical, expected_normals, expected = place_naive(LATTICE, posed_tube())
+    for threads in (1, 2):
+        canonical, normals, transforms = place(LATTICE, posed_tube(), threads=threads)
+        torch.testing.assert_close(canonical, expected_canonical, atol=1e-6, rtol=0)
+        torch.testing.assert_close(normals, expected_normals, atol=2e-6, rtol=0)
+        torch.testing.assert_close(transforms.quats, expected.quats, atol=1e-6, rtol=0)
+        torch.testing.assert_close(transforms.translations, expected.translations, atol=2e-6, rtol=0)
+
+
+def test_opposite_quaternions_of_neighbours_are_the_same_rotation():
+    posed = posed_tube()
+    signs = torch.where(torch.arange(len(posed.vertices)) % 3 == 0, -1.0, 1.0)[:, None]
+    flipped = RigidTransforms(quats=signs * posed.transforms.quats, translations=posed.transforms.translations)
+    _, _, transforms = place(LATTICE, replace(posed, transforms=flipped))
+    _, _, defined = place_naive(LATTICE, replace(posed, transforms=flipped))
+    torch.testing.assert_close(transforms.quats, defined.quats, atol=1e-6, rtol=0)
+    points = torch.randn(len(LATTICE.texels), 3, generator=torch.Generator().manual_seed(1))
+    _, _, unflipped = place(LATTICE, posed)
+    torch.testing.assert_close(transforms.apply(points), unflipped.apply(points), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 2])
+@pytest.mark.parametrize("lit", [False, True])
+@pytest.mark.parametrize("changes", [{}, {"offset": False}, {"quat_frame": "world"}])
+def test_gaussians_are_posed_as_defined(sh_degree, lit, changes):
+    config = tube_model_config(sh_degree=sh_degree, **changes)
+    raw, light = raw_and_light(sh_degree)
+    results = []
+    for function, dtype in ((pose, torch.float32), (pose_naive, torch.float32), (pose_naive, torch.float64)):
+        leaves = [raw.to(dtype, copy=True).requires_grad_(), light.to(dtype, copy=True).requires_grad_()]
+        here = conditions()
+        if dtype == torch.float64:
+            turned = RigidTransforms(
+                quats=here.transforms.quats.double(), translations=here.transforms.translations.double()
+            )
+            here = replace(here, canonical=here.canonical.double(), normals=here.normals.double(), transforms=turned)
+        posed = function(leaves[0], here, config, leaves[1] if lit else None)
+        values = [getattr(posed, field.name) for field in fields(Gaussians)]
+        generator = torch.Generator().manual_seed(2)
+        weights = [torch.randn(value.shape, generator=generator).to(dtype) for value in values]
+        sum((value * weight).sum() for value, weight in zip(values, weights, strict=True)).backward()
+        results.append(
+            [value.detach().double() for value in values] + [leaf.grad.double() for leaf in leaves[: 1 + lit]]
+        )
+    for native, float32, truth in zip(*results, strict=True):
+        scale = truth.abs().max()
+        assert (native - truth).abs().max() <= max(2 * (float32 - truth).abs().max(), 2e-6 * scale)
+
+
+def test_any_number_of_threads_gives_the_same_bits():
+    config, light = tube_model_config(), raw_and_light(0)[1]
+    gradients = []
+    for threads in (1, 3):
+        raw, leaf = raw_and_light(0)[0].requires_grad_(), light.clone().requires_grad_()
+        posed = pose(raw, conditions(), config, leaf, threads=threads)
+        (posed.means.sum() + posed.sh.square().sum() + posed.quats.sum()).backward()
+        gradients.append((posed.means.detach(), raw.grad, leaf.grad))
+    assert all(torch.equal(one, other) for one, other in zip(*gradients, strict=True))
+
+
+def test_gradients_of_the_surface_go_through_the_definition():
+    raw, _ = raw_and_light(0)
+    here = conditions()
+    canonical = here.canonical.clone().requires_grad_()
+    pose(raw, replace(here, canonical=canonical), tube_model_config(), None).means.sum().backward()
+    assert canonical.grad.abs().min() > 0
+
+
+@pytest.mark.parametrize("column", [0, 3, 6, 10, 11])
+def test_what_is_not_finite_stays_so(column):
+    """The splatter must see it, and the training with it."""
+    raw, light = raw_and_light(0)
+    raw[5, column] = float("nan")
+    posed = pose(raw, conditions(), tube_model_config(), light)
+    finite = [bool(torch.isfinite(getattr(posed, field.name)).all()) for field in fields(Gaussians)]
+    assert finite.count(False) == 1

@@ -1,0 +1,157 @@
+"""The differentiable mesh drawer: its gradients against finite differences, and an outline that finds its place."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.figures import front_camera, tube_mesh
+
+from ash.capture.dataset import Camera
+from ash.mesh.drawing import SUPERSAMPLING, corner_weights, draw_mesh, sample_texture, topology_of
+from ash.mesh.rasterizing import project_vertices, rasterize_mesh
+
+
+def tube() -> tuple[torch.Tensor, torch.Tensor]:
+    mesh = tube_mesh()
+    return torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)
+
+
+def smooth_shade(faces: torch.Tensor, rest: torch.Tensor):
+    """A colour that is a smooth function of the place on the rest surface, also across edges."""
+
+    def shade(triangles: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+        place = (rest[faces[triangles]] * weights[..., None]).sum(1)
+        return torch.stack([0.5 + 0.4 * torch.sin(9 * place[:, 1]), 0.5 + 2 * place[:, 0]], 1)
+
+    return shade
+
+
+def picture(vertices: torch.Tensor, camera: Camera) -> torch.Tensor:
+    rest, faces = tube()
+    return draw_mesh(
+        vertices, topology_of(faces), camera, smooth_shade(faces, rest), rest.new_tensor([0.1, 0.9]), outlines=True
+    )
+
+
+def test_neighbours_of_faces():
+    across = topology_of(torch.tensor([[0, 1, 2], [2, 1, 3]])).across
+    assert across.tolist() == [[-1, 1, -1], [0, -1, -1]]
+    _, faces = tube()
+    across = topology_of(faces).across
+    assert (across < 0).sum() == 2 * 12  # The open ends.
+
+
+def test_weights_are_those_of_the_rasteriser():
+    rest, faces = tube()
+    camera = front_camera()
+    corners = project_vertices(rest, torch.from_numpy(camera.viewmat), torch.from_numpy(camera.K))
+    drawn = rasterize_mesh(corners, faces, width=64, height=64)
+    row, column = (drawn.triangle >= 0).nonzero(as_tuple=True)
+    weights = corner_weights(*corners[faces[drawn.triangle[row, column].long()]].unbind(1), column, row)
+    torch.testing.assert_close(weights, drawn.barycentric[row, column].double(), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gradients_in_the_vertices_are_those_of_finite_differences(seed):
+    """Outlines, texture and coverage at once; a random linear function of the picture, along random directions."""
+    rest, _ = tube()
+    generator = torch.Generator().manual_seed(seed)
+    camera = front_camera(32, 32)
+
+    def random(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    vertices = rest + 0.004 * random(*rest.shape)
+    judge = random(32, 32, 3)
+    judge = torch.nn.functional.avg_pool2d(judge.permute(2, 0, 1)[None], 3, 1, 1)[0].permute(1, 2, 0)
+
+    def value(moved: torch.Tensor) -> torch.Tensor:
+        return (picture(moved.requires_grad_(), camera) * judge).sum()
+
+    at = vertices.clone()
+    (gradient,) = torch.autograd.grad(value(at), at)
+    step = 1e-7  # Small: where two outlines meet in a corner, a sample changes hands with a jump.
+    for direction in (torch.tensor([1.0, 0, 0]), torch.tensor([0, 1.0, 0]), 0.3 * random(*rest.shape)):
+        move = direction.double().expand_as(rest)
+        ahead, behind = value(vertices + step * move), value(vertices - step * move)
+        numeric = float((ahead - behind).detach() / (2 * step))
+        assert float((gradient * move).sum()) == pytest.approx(numeric, rel=0.02, abs=0.05)
+
+
+def test_coverage_is_the_area_and_grows_continuously():
+    """A tube that moves by less than a sample changes its columns by what it gains and loses, without a jump."""
+    rest, _ = tube()
+    camera = front_camera(32, 32)
+    with torch.no_grad():
+        moved = [picture(rest + torch.tensor([shift, 0, 0]), camera)[10, :, 2] for shift in torch.linspace(0, 0.05, 41)]
+    areas, steps = torch.stack(moved).sum(1), (torch.stack(moved)[1:] - torch.stack(moved)[:-1]).abs()
+    assert areas.std() < 0.02
+    pixels_per_m = 1.2 * 32 / 1.9
+    assert steps.max() < 1.3 * 0.05 / 40 * pixels_per_m
+
+
+def test_interior_edges_are_no_outlines():
+    rest, _ = tube()
+    coverage = picture(rest, front_camera(64, 64))[..., 2]
+    inside = coverage[24:40, 30:34]
+    torch.testing.assert_close(inside, torch.ones_like(inside), atol=1e-12, rtol=0)
+
+
+def test_a_silhouette_finds_its_place():
+    """The mesh starts beside the truth by half a pixel of 25 mm; coverage alone brings it back to a tenth of that."""
+    rest, faces = tube()
+    rest = rest.float()
+    topology, camera, truth = topology_of(faces), front_camera(64, 64), torch.tensor([0.012, 0.009, 0.0])
+
+    def coverage(shift: torch.Tensor) -> torch.Tensor:
+        return draw_mesh(rest + shift, topology, camera, lambda t, w: w[:, :1], torch.zeros(1), outlines=True)[..., 1]
+
+    with torch.no_grad():
+        target = coverage(truth)
+    shift = torch.zeros(3, requires_grad=True)
+    optimiser = torch.optim.Adam([shift], lr=1e-3)
+    for _ in range(80):
+        optimiser.zero_grad()
+        ((coverage(shift) - target) ** 2).sum().backward()
+        optimiser.step()
+    assert (shift - truth)[:2].abs().max() < 2e-3
+
+
+def test_a_texture_pulls_the_surface_along_itself():
+    """Nothing but colour tells how a plate lies within its own outline."""
+    corners = torch.tensor([[-2.0, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    uvs = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    y, x = torch.meshgrid(torch.linspace(0, 40, 128), torch.linspace(0, 40, 128), indexing="ij")
+    texture = (0.5 + 0.25 * torch.sin(x) + 0.25 * torch.sin(y))[None]
+    topology, camera, truth = topology_of(faces), front_camera(32, 32), torch.tensor([0.03, -0.02, 0.0])
+
+    def draw(shift: torch.Tensor) -> torch.Tensor:
+        shade = lambda t, w: sample_texture(texture, (uvs[faces[t]] * w[..., None]).sum(1))  # noqa: E731
+        return draw_mesh(corners + shift, topology, camera, shade, torch.zeros(1))[..., :1]
+
+    with torch.no_grad():
+        target = draw(truth)
+    shift = torch.zeros(3, requires_grad=True)
+    optimiser = torch.optim.Adam([shift], lr=3e-3)
+    for _ in range(80):
+        optimiser.zero_grad()
+        ((draw(shift) - target) ** 2).sum().backward()
+        optimiser.step()
+    assert (shift - truth)[:2].abs().max() < 1e-3
+
+
+def test_pictures_with_and_without_gradients_agree():
+    rest, _ = tube()
+    camera = replace(front_camera(24, 24))
+    torch.testing.assert_close(
+        picture(rest, camera), picture(rest.clone().requires_grad_(), camera).detach(), atol=1e-5, rtol=0
+    )
+
+
+def test_without_outlines_coverage_counts_samples():
+    rest, faces = tube()
+    shade = smooth_shade(faces, rest)
+    coverage = draw_mesh(rest, topology_of(faces), front_camera(24, 24), shade, rest.new_zeros(2))[..., 2]
+    steps = coverage * SUPERSAMPLING**2
+    assert torch.equal(steps, steps.round()) and ((coverage > 0) & (coverage < 1)).any()

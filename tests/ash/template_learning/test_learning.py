@@ -1,0 +1,211 @@
+"""The learned template: tracked on training frames, regressed on the pose, kept for the next method."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.captures import write_tube_capture
+from helpers.figures import tube_mesh, tube_motion, tube_skeleton
+from helpers.scenes import small_capture
+
+from ash.capture.dataset import Capture, Pose, scan_path
+from ash.capture.formats import load_capture, read_scan
+from ash.config import TemplateConfig
+from ash.files import InputError, write_arrays
+from ash.rotations import RigidTransforms
+from ash.template.skinning import SkinWeights, dual_quaternion_skinning
+from ash.template.template import RestDeformation, Template, skinned_template
+from ash.template_learning.deforming import LinearDeformation, joint_reach
+from ash.template_learning.graph_nets import GraphDeformation
+from ash.template_learning.learning import learned_template, template_key, template_of
+from ash.template_learning.regressing import fit_graph, fit_linear, held_out_folds
+from ash.template_learning.tracking import Tracked, template_error_mm, track_chamfer, track_vertices
+from benchmarks.cell.sealing import seen_by_method, watched
+
+SMALL = {"kind": "learned", "nodes": 30}
+BULGE_M = 0.012
+UNUSED = RigidTransforms(quats=torch.zeros(0, 4), translations=torch.zeros(0, 3))
+
+
+def bulged(motion, frame: int) -> np.ndarray:
+    """The tube's true canonical shape: a bulge that is always there, and one that grows as the tube bends."""
+    rest = tube_mesh().vertices
+    outward = rest * [1, 0, 1] / 0.1
+    always = np.exp(-(((rest[:, 1:2] - 0.25) / 0.2) ** 2))
+    bent = np.exp(-(((rest[:, 1:2] - 0.7) / 0.2) ** 2)) * motion.dofs[frame, 6]
+    return rest + BULGE_M * (always + bent) * outward
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Capture:
+    """The tube with a bulging surface; of the surface only the training frames have a scan."""
+    made = write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
+    motion = tube_motion(24)
+    motion.sequence[:] = np.repeat([0, 1, 2, 3], 6)
+    folder = made.folder
+    at_rest = skinned_template(made)
+    posed = np.stack(
+        [at_rest.pose(Pose(motion, f)).transforms.apply(torch.from_numpy(bulged(motion, f)).float()) for f in range(24)]
+    )
+    write_arrays(folder / "truth" / "template.npz", vertices=posed)
+    write_arrays(folder / "scans" / "faces.npz", faces=tube_mesh().faces)
+    for frame in range(18):
+        write_arrays(scan_path(folder, frame), vertices=posed[frame])
+    splits = {"train": replace(made.splits["train"], frames=tuple(range(18)))}
+    return replace(made, motion=motion, splits=splits)
+
+
+def rms_mm(template: Template, capture: Capture, frames) -> float:
+    return float(np.sqrt((template_error_mm(template, capture, tuple(frames)) ** 2).mean()))
+
+
+def test_exact_supervision_explains_what_the_pose_decides_also_on_another_motion(capture):
+    skinned = skinned_template(capture)
+    learned = template_of(TemplateConfig(supervision="vertices", **SMALL), capture, seed=0)
+    train, test = range(18), range(18, 24)
+    assert rms_mm(skinned, capture, train) > 3
+    assert rms_mm(learned, capture, train) < 0.15 * rms_mm(skinned, capture, train)
+    assert rms_mm(learned, capture, test) < 0.25 * rms_mm(skinned, capture, test)
+
+
+def test_scans_without_correspondences_do_nearly_as_well(capture):
+    skinned = skinned_template(capture)
+    learned = template_of(TemplateConfig(**SMALL), capture, seed=0)
+    train, test = range(18), range(18, 24)
+    assert rms_mm(learned, capture, train) < 0.4 * rms_mm(skinned, capture, train)
+    assert rms_mm(learned, capture, test) < 0.5 * rms_mm(skinned, capture, test)
+
+
+def test_chamfer_tracking_moves_along_normals_only_towards_the_scan(capture):
+    tracked, true = (
+        track_chamfer(capture, skinned_template(capture)),
+        track_vertices(capture, skinned_template(capture)),
+    )
+    rest = torch.from_numpy(tube_mesh().vertices).float()
+    before = (true.canonical - rest).norm(dim=-1).mean()
+    assert (tracked.canonical - true.canonical).norm(dim=-1).mean() < 0.35 * before
+
+
+def test_the_pose_is_not_believed_where_it_explains_nothing():
+    """Shifts drawn anew for every frame: left-out sequences say so, and only what all frames share is kept."""
+    motion = tube_motion(16)
+    motion.sequence[:] = np.repeat([0, 1, 2, 3], 4)
+    rest = torch.from_numpy(tube_mesh().vertices).float()
+    rng = np.random.default_rng(0)
+    shared = torch.tensor([0.01, 0.0, 0.0])
+    noise = torch.from_numpy(0.004 * rng.standard_normal((16, 1, 3))).float()
+    tracked = Tracked(frames=tuple(range(16)), canonical=rest + shared + noise.expand(16, len(rest), 3))
+    deformation = LinearDeformation(TemplateConfig(**SMALL), tube_mesh(), tube_skeleton())
+    choice = fit_linear(deformation, motion, tracked)
+    assert choice.static and choice.ridge >= 1
+    moved = deformation.canonical(Pose(motion, 3), UNUSED) - rest
+    assert (moved - tracked.canonical.mean(0) + rest).norm(dim=-1).max() < 0.002
+
+
+def test_a_shift_that_no_other_sequence_shares_is_refused():
+    motion = tube_motion(8)
+    motion.sequence[:] = np.repeat([0, 1], 4)
+    rest = torch.from_numpy(tube_mesh().vertices).float()
+    sign = torch.tensor([1.0] * 4 + [-1.0] * 4)[:, None, None]
+    shift = sign * torch.tensor([0.01, 0, 0]) + torch.tensor([0.001, 0, 0])
+    tracked = Tracked(frames=tuple(range(8)), canonical=rest + shift.expand(8, len(rest), 3))
+    deformation = LinearDeformation(TemplateConfig(**SMALL), tube_mesh(), tube_skeleton())
+    choice = fit_linear(deformation, motion, tracked)
+    assert not choice.static
+    assert torch.equal(deformation.canonical(Pose(motion, 3), UNUSED), rest)
+
+
+def test_folds_leave_out_whole_sequences_or_stretches_of_the_only_one():
+    folds = held_out_folds(np.repeat([3, 5, 7, 8, 9], 2))
+    assert len(folds) == 4 and [int(fold.sum()) for fold in folds] == [4, 2, 2, 2]
+    assert torch.equal(torch.stack(folds).sum(0), torch.ones(10, dtype=torch.long))
+    assert [int(fold.sum()) for fold in held_out_folds(np.zeros(8))] == [2, 2, 2, 2]
+    assert held_out_folds(np.zeros(1)) == []
+
+
+def test_a_node_feels_its_joint_and_half_its_neighbours():
+    reach = joint_reach(tube_mesh(), tube_skeleton())
+    weights = torch.from_numpy(tube_mesh().skin_weights).float()
+    torch.testing.assert_close(reach[:, 0], weights[:, 0] + 0.5 * weights[:, 1])
+
+
+def test_graph_networks_learn_what_they_are_shown_and_stop_where_it_no_longer_helps(capture):
+    tracked = track_vertices(capture, skinned_template(capture))
+    torch.manual_seed(0)
+    config = TemplateConfig(network="graph", width=8, blocks=1, **SMALL)
+    deformation = GraphDeformation(config, tube_mesh(), tube_skeleton())
+    kept = fit_graph(deformation, capture.motion, tracked, steps=60, seed=0)
+    learned = Template(tube_mesh(), tube_skeleton(), deformation)
+    assert rms_mm(learned, capture, range(18)) < 0.5 * rms_mm(skinned_template(capture), capture, range(18))
+    assert 0 <= kept <= 60
+
+
+def test_an_equal_template_is_read_and_not_learned_again(capture, tmp_path):
+    stored = replace(capture, store=tmp_path / "templates")
+    config = TemplateConfig(**SMALL)
+    first = learned_template(config, stored, seed=0)
+    (file,) = (tmp_path / "templates").glob("*.safetensors")
+    written = file.stat().st_mtime_ns
+    again = learned_template(config, stored, seed=0)
+    assert file.stat().st_mtime_ns == written and again.learned == first.learned
+    for frame in (0, 20):
+        a, b = first.pose(Pose(capture.motion, frame)), again.pose(Pose(capture.motion, frame))
+        assert torch.equal(a.vertices, b.vertices)
+
+
+def test_the_key_names_what_decides_a_template_and_nothing_else(capture):
+    config = TemplateConfig(**SMALL)
+    key = template_key(config, capture, seed=0)
+    assert template_key(config, capture, seed=1) == key  # Nothing in it is random.
+    assert template_key(replace(config, network="graph"), capture, seed=1) != template_key(
+        replace(config, network="graph"), capture, seed=0
+    )
+    assert template_key(replace(config, nodes=31), capture, seed=0) != key
+    fewer = replace(capture.splits["train"], frames=(0, 1, 2))
+    assert template_key(config, replace(capture, splits={"train": fewer}), seed=0) != key
+    one = replace(capture, splits={"train": replace(capture.splits["train"], cameras=("cam1",))})
+    assert template_key(config, one, seed=0) == key
+    images = replace(config, supervision="images")
+    assert template_key(images, one, seed=0) != template_key(images, capture, seed=0)
+
+
+def test_scans_are_there_for_training_frames_only(capture):
+    vertices, faces = read_scan(capture, 3)
+    assert vertices.shape[1] == faces.shape[1] == 3
+    for frame in (18, 99):
+        with pytest.raises(InputError, match=f"scan of training frame {frame}, found none"):
+            read_scan(capture, frame)
+
+
+def test_skinning_through_the_graph_blends_the_nodes_transforms(capture):
+    config = TemplateConfig(skinning="graph", **SMALL)
+    template = learned_template(replace(config, supervision="vertices"), capture, seed=0)
+    direct = Template(tube_mesh(), tube_skeleton(), RestDeformation(tube_mesh()))
+    graph = template.deformation.graph
+    posed, skinned = template.pose(Pose(capture.motion, 5)), direct.pose(Pose(capture.motion, 5))
+    joints = skinned.transforms
+    nodes = type(joints)(quats=joints.quats[graph.nodes], translations=joints.translations[graph.nodes])
+    expected = dual_quaternion_skinning(nodes, SkinWeights(joints=graph.links, weights=graph.weights))
+    torch.testing.assert_close(posed.transforms.translations, expected.translations, atol=1e-5, rtol=0)
+    assert not torch.allclose(posed.transforms.translations, joints.translations, atol=1e-4)
+    # What the blend gets wrong is learned with the rest.
+    unlearned = Template(tube_mesh(), tube_skeleton(), RestDeformation(tube_mesh()), through=graph)
+    assert rms_mm(template, capture, range(18)) < 0.8 * rms_mm(unlearned, capture, range(18))
+
+
+def test_a_method_learns_its_template_from_what_it_is_given_and_leaves_it_for_the_next(tmp_path):
+    """A rendered capture, sealed as the harness seals it: no truth, scans of training frames, a store beside it."""
+    whole = load_capture(small_capture())
+    config = TemplateConfig(kind="learned", nodes=60)
+    with seen_by_method(whole, tmp_path / "input", oracle=False, store=tmp_path / "store") as seen:
+        with watched(whole, seen):
+            learned = learned_template(config, seen, seed=0)
+        scanned = sorted(int(path.stem) for path in (seen.folder / "scans").glob("0*.npz"))
+        assert scanned == sorted(whole.splits["train"].frames)
+        assert not (seen.folder / "truth").exists()
+    with seen_by_method(whole, tmp_path / "other", oracle=False, store=tmp_path / "store") as seen:
+        assert learned_template(config, seen, seed=1).learned == learned.learned
+    assert len(list((tmp_path / "store").glob("*.safetensors"))) == 1
+    frames = whole.splits["train"].frames
+    assert rms_mm(learned, whole, frames) < rms_mm(skinned_template(whole), whole, frames)

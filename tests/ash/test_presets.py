@@ -1,0 +1,236 @@
+"""Presets, and the switches between them: each changes what it names and nothing else."""
+
+from dataclasses import asdict, replace
+
+import pytest
+import torch
+from helpers.captures import tube_model_config, write_tube_capture
+
+from ash.avatar import AshAvatar
+from ash.capture.dataset import Pose
+from ash.config import AshConfig
+from ash.decoders import ConvBlock, GlobalFeatures
+from ash.files import InputError
+from ash.gaussians.initialising import released_gaussians
+from ash.presets import PRESETS, named
+from ash.rotations import rotate, unitquat_to_rotmat
+from ash.textures import smooth_noise
+from ash.training.adam import Adam
+from ash.training.batches import draw_batch, load_training_images
+from ash.training.loop import fit, view_loss
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
+
+
+def small(config: AshConfig, **training) -> AshConfig:
+    """The same choices at the size of the tests' capture."""
+    shuffle = min(config.model.shuffle, 2)
+    model = replace(config.model, texels=16, width=4, levels=2, window=2, shuffle=shuffle, rank=2)
+    settings = {"steps": 4, "warmup_steps": 2, "views_per_step": 1} | training
+    template = replace(config.template, nodes=30, blocks=1, width=4, steps=2)
+    return replace(config, model=model, training=replace(config.training, **settings), template=template)
+
+
+def test_paper_and_release_differ_in_named_switches_alone():
+    paper, official = (asdict(named(name)) for name in ("paper", "official"))
+    differing = {
+        f"{part}.{name}"
+        for part in ("model", "training", "template")
+        for name in paper[part]
+        if paper[part][name] != official[part][name]
+    }
+    assert differing == {
+        "model.sh_degree",
+        "model.norm",
+        "model.quat_frame",
+        "model.global_mlp",
+        "training.warmup",
+        "training.l1_weight",
+        "training.ssim_weight",
+        "template.weights",
+        "template.dense",
+        "template.skinning",
+    }
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_every_preset_trains(name, capture, tmp_path, monkeypatch):
+    monkeypatch.setattr("ash.avatar.FITTED_STEPS", 3)
+    avatar = AshAvatar(small(named(name)), capture)
+    before = {key: value.clone() for key, value in avatar.module.named_parameters() if value.requires_grad}
+    avatar.fit(capture, folder=tmp_path)
+    after = dict(avatar.module.named_parameters())
+    assert all(torch.isfinite(value).all() for value in after.values())
+    assert any(not torch.equal(after[key], value) for key, value in before.items())
+
+
+def test_unknown_presets_are_refused_with_the_known_ones_named():
+    with pytest.raises(InputError, match="ci, brief, cpu, fit, thorough, budget, frugal, paper, official"):
+        named("paperr")
+
+
+def test_the_releases_norm_is_instance_norm_for_a_batch_of_one_even_after_training():
+    torch.manual_seed(0)
+    released, instance = ConvBlock(3, 4, "batch-as-released").eval(), ConvBlock(3, 4, "instance").eval()
+    instance.load_state_dict(released.state_dict())
+    for scale in (0.1, 10.0):
+        texture = scale * torch.randn(1, 3, 8, 8)
+        torch.testing.assert_close(released(texture), instance(texture), atol=2e-6, rtol=1e-5)
+
+
+def test_the_global_mlps_are_as_wide_as_stated():
+    sizes = [
+        [layer.out_features for layer in GlobalFeatures(kind).mlp if hasattr(layer, "out_features")]
+        for kind in ("paper", "released")
+    ]
+    assert sizes == [[32, 32, 16], [64, 32, 16]]
+    released = GlobalFeatures("released")
+    seen = []
+    released.mlp.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    released(torch.tensor([1.2, 0.0, -2.4]))
+    assert sum(p.numel() for p in released.parameters()) == 5168  # the release's
+    torch.testing.assert_close(seen[0][:3], torch.tensor([1.0, 0.0, -2.0]))
+
+
+def test_the_offsets_unit_scales_the_offset_alone(capture):
+    avatar = AshAvatar(AshConfig(model=tube_model_config(), training=small(named("ci")).training), capture)
+    conditions = avatar.module.conditions(Pose(capture.motion, 2))
+    raw = avatar.module.base.detach().clone()
+    raw[:, :3] = torch.randn(len(raw), 3, generator=torch.Generator().manual_seed(0))
+    fine = avatar.module.pose(raw, conditions)
+    avatar.module.config = replace(avatar.module.config, offset_unit_m=0.02)
+    coarse = avatar.module.pose(raw, conditions)
+    unmoved = conditions.transforms.apply(conditions.canonical)
+    torch.testing.assert_close(coarse.means - unmoved, 2 * (fine.means - unmoved), atol=1e-5, rtol=0)
+    assert all(torch.equal(getattr(fine, p), getattr(coarse, p)) for p in ("quats", "scales", "opacities", "sh"))
+
+
+def test_degrees_of_sh_add_coefficients_and_leave_the_others_alone(capture):
+    """What a preset of degree 3 draws without its higher coefficients is what one of degree 0 draws."""
+    images = []
+    for degree in (0, 3):
+        avatar = AshAvatar(
+            AshConfig(model=tube_model_config(sh_degree=degree), training=small(named("ci")).training), capture
+        )
+        assert avatar.module.base.shape[1] == 11 + 3 * (degree + 1) ** 2
+        with torch.no_grad():
+            images.append(avatar.module(Pose(capture.motion, 3), capture.cameras["cam1"]).rgb)
+    torch.testing.assert_close(*images, atol=1e-6, rtol=0)
+
+
+def test_the_weights_of_the_loss_weigh_its_two_parts(capture):
+    images = load_training_images(capture)
+    batch = draw_batch(images, small(named("ci")).training, 0, 0)
+    drawn = batch.targets + 0.1 * torch.randn(batch.targets.shape, generator=torch.Generator().manual_seed(0))
+    weights = {"paper": (0.1, 0.9), "official": (0.9, 0.1), "l1": (1.0, 0.0), "ssim": (0.0, 1.0)}
+    losses = {
+        name: float(view_loss(drawn, batch, replace(small(named("ci")).training, l1_weight=a, ssim_weight=b)))
+        for name, (a, b) in weights.items()
+    }
+    for name in ("paper", "official"):
+        training = named(name).training
+        assert (training.l1_weight, training.ssim_weight) == weights[name]
+        assert losses[name] == pytest.approx(
+            weights[name][0] * losses["l1"] + weights[name][1] * losses["ssim"], rel=1e-4
+        )
+    assert losses["l1"] == pytest.approx(float((drawn - batch.targets).abs().mean()), rel=1e-4)
+
+
+@pytest.mark.parametrize("quat_frame", ["world", "canonical"])
+def test_the_releases_warm_up_aims_at_round_gaussians_turned_to_the_normal(capture, quat_frame):
+    model = replace(small(named("official")).model, quat_frame=quat_frame)
+    avatar = AshAvatar(replace(small(named("official")), model=model), capture)
+    conditions = avatar.module.conditions(Pose(capture.motion, 3))
+    target = released_gaussians(model, avatar.analytic, conditions)
+    axis = unitquat_to_rotmat(target[:, 6:10])[:, :, 0]
+    if quat_frame == "canonical":
+        axis = rotate(conditions.transforms.quats, axis)
+    torch.testing.assert_close(axis, conditions.normals, atol=1e-4, rtol=0)
+    points = conditions.transforms.apply(conditions.canonical)
+    nearest = torch.cdist(points, points).sort(1).values[:, 1:4].square().mean(1).sqrt()
+    torch.testing.assert_close(target[:, 3].exp(), nearest, atol=1e-5, rtol=1e-3)
+    assert torch.equal(target[:, 3], target[:, 5])
+    torch.testing.assert_close(target[:, 10].sigmoid(), torch.full_like(target[:, 10], 0.1))
+    assert not target[:, :3].any()
+
+
+def seen_by_steps(capture, tmp_path, **training) -> list[tuple]:
+    """What the steps of a training are given: sizes of the images, and the learning rate."""
+    config = small(named("ci"), steps=6, **training)
+    avatar = AshAvatar(config, capture)
+    seen, draw = [], avatar.draw_training_views
+
+    def watch(frame, cameras, background, step):
+        seen.append((frame, [c.name for c in cameras], cameras[0].width, cameras[0].height, background.tolist()))
+        return draw(frame, cameras, background, step)
+
+    avatar.draw_training_views = watch
+    images = replace(load_training_images(capture), reserved=())
+    fit(avatar, images, config.training, seed=0, folder=tmp_path)
+    return seen
+
+
+def test_without_cropping_the_same_views_are_seen_whole(capture, tmp_path):
+    cropped = seen_by_steps(capture, tmp_path / "cropped")
+    whole = seen_by_steps(capture, tmp_path / "whole", crop=False)
+    assert [step[:2] + step[4:] for step in cropped] == [step[:2] + step[4:] for step in whole]
+    assert all(step[2:4] == (48, 48) for step in whole)
+    assert any(step[2:4] != (48, 48) for step in cropped)
+
+
+def test_a_constant_schedule_keeps_the_learning_rates(capture, tmp_path, monkeypatch):
+    rates, step = [], Adam.step
+    monkeypatch.setattr(Adam, "step", lambda self: (rates.append(self.groups[0]["lr"]), step(self))[1])
+    for schedule in ("constant", "open"):
+        seen_by_steps(capture, tmp_path / schedule, schedule=schedule)
+    assert rates[:6] == [2e-3] * 6
+    assert rates[6:11] == pytest.approx([2e-3 * step / 20 for step in range(1, 6)])
+
+
+def test_bfloat16_is_a_matter_of_the_decoders_alone(capture):
+    avatar = AshAvatar(small(named("ci")), capture)
+    for net in avatar.module.decoders.nets:
+        torch.nn.init.normal_(net.head.weight, std=0.1)
+    conditions = avatar._conditions_of(1)
+    exact = avatar._decode(conditions).detach()
+    avatar.config = replace(avatar.config, training=replace(avatar.config.training, precision="bfloat16"))
+    rough = avatar._decode(conditions).detach()
+    assert rough.dtype == torch.float32
+    assert 0 < float((rough - exact).abs().max()) < 0.05 * float((exact - avatar.module.base.detach()).abs().max())
+    assert torch.equal(avatar._decode(conditions, static=True), avatar.module.base)
+
+
+def test_noise_in_the_textures_is_for_learning_alone_and_another_one_in_every_step(capture):
+    noisy = AshAvatar(small(named("ci"), texture_noise=0.5), capture)
+    plain = AshAvatar(small(named("ci")), capture)
+    seen = []
+    for avatar in (noisy, plain):
+        torch.nn.init.normal_(avatar.module.decoders.nets[0].head.weight, std=0.1, generator=torch.manual_seed(1))
+        camera = [capture.cameras["cam1"]]
+        draw = [avatar.draw_training_views(0, camera, torch.zeros(3), step).detach() for step in (2, 2, 3, 1)]
+        with torch.no_grad():
+            draw.append(avatar.draw_training_views(0, camera, torch.zeros(3), 2))
+        seen.append(draw)
+    (first, again, later, warm_up, still), (clean, _, _, clean_warm_up, _) = seen
+    assert torch.equal(first, again) and not torch.equal(first, later)
+    assert not torch.equal(first, clean)
+    assert torch.equal(still, clean) and torch.equal(warm_up, clean_warm_up)
+
+
+def test_noise_is_smooth_standard_and_a_function_of_its_seed():
+    noise = smooth_noise(torch.Size((6, 32, 32)), (0, 3, 1))
+    assert torch.equal(noise, smooth_noise(torch.Size((6, 32, 32)), (0, 3, 1)))
+    assert not torch.equal(noise, smooth_noise(torch.Size((6, 32, 32)), (0, 3, 2)))
+    corners = torch.stack([smooth_noise(torch.Size((6, 32, 32)), (s, 3, 1))[:, 0, 0] for s in range(200)])
+    assert abs(corners.std() - 1) < 0.1 and abs(corners.mean()) < 0.1
+    assert noise.diff(dim=2).abs().max() < 0.5
+
+
+@pytest.mark.parametrize("model", [{"head": "blendshapes", "shuffle": 1}, {"standardise": False}, {"motion": False}])
+def test_noise_without_standardised_textures_is_refused(model):
+    base = named("ci")
+    with pytest.raises(InputError, match="texture_noise"):
+        replace(base, model=replace(base.model, fade=0.0, **model), training=replace(base.training, texture_noise=0.5))

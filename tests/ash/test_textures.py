@@ -1,0 +1,189 @@
+import numpy as np
+import pytest
+import torch
+from helpers.figures import tube_mesh, tube_motion, tube_skeleton
+from scipy.spatial.transform import Rotation
+
+from ash.capture.dataset import Motion, Pose
+from ash.rotations import RigidTransforms, rotvec_to_unitquat
+from ash.template.motion import normalised_motion
+from ash.template.template import RestDeformation, Template
+from ash.textures import BOUND, TexelLattice, TextureDrawer, build_lattice, motion_aware_textures, texture_statistics
+
+RESOLUTION = 16
+
+
+@pytest.fixture(scope="module")
+def template() -> Template:
+    return Template(tube_mesh(), tube_skeleton(), RestDeformation(tube_mesh()))
+
+
+def covered(lattice: TexelLattice, texture: torch.Tensor) -> torch.Tensor:
+    return texture.flatten(1).T[lattice.texels]
+
+
+def test_texels_lie_where_the_atlas_says():
+    """The tube's atlas is its unrolling, so a texel's row gives its height and its column its angle."""
+    mesh, lattice = tube_mesh(), build_lattice(tube_mesh(), RESOLUTION)
+    points = lattice.interpolate(torch.from_numpy(mesh.vertices).float()).numpy()
+    rows, columns = np.divmod(lattice.texels.numpy(), RESOLUTION)
+    u, v = (columns + 0.5) / RESOLUTION, 1 - (rows + 0.5) / RESOLUTION
+    np.testing.assert_allclose(points[:, 1], (v - 0.05) / 0.9, atol=1e-5)
+    angle = np.arctan2(points[:, 0], points[:, 2])
+    expected = (u - 0.05) / 0.9 * 2 * np.pi
+    assert np.abs((angle - expected + np.pi) % (2 * np.pi) - np.pi).max() < 0.05  # A chord of 30 degrees, not an arc.
+
+
+def test_every_texel_inside_the_atlas_is_covered_once():
+    lattice = build_lattice(tube_mesh(), RESOLUTION)
+    inside = (np.arange(RESOLUTION) + 0.5) / RESOLUTION
+    covered = ((inside > 0.05) & (inside < 0.95)).sum()
+    assert len(lattice.texels) == covered**2
+    assert len(torch.unique(lattice.texels)) == len(lattice.texels)
+    torch.testing.assert_close(lattice.barycentric.sum(1), torch.ones(len(lattice.texels)))
+    assert (lattice.barycentric >= 0).all()
+
+
+def test_texture_and_texels_are_inverse():
+    lattice = build_lattice(tube_mesh(), RESOLUTION)
+    values = torch.randn(len(lattice.texels), 5)
+    texture = lattice.to_texture(values)
+    assert texture.shape == (5, RESOLUTION, RESOLUTION)
+    assert torch.equal(covered(lattice, texture), values)
+    row, column = divmod(int(lattice.texels[7]), RESOLUTION)
+    assert torch.equal(texture[:, row, column], values[7])
+    assert int((texture.abs().sum(0) > 0).sum()) == len(values)
+
+
+def test_texel_transforms_of_a_rigid_motion_are_that_motion():
+    lattice = build_lattice(tube_mesh(), RESOLUTION)
+    quat, shift = rotvec_to_unitquat(torch.tensor([0.4, 2.0, -1.0])), torch.tensor([1.0, 2.0, 3.0])
+    signs = torch.where(torch.arange(len(tube_mesh().vertices)) % 3 == 0, -1.0, 1.0)[:, None]
+    rigid = RigidTransforms(quats=signs * quat, translations=shift.expand(len(signs), 3))
+    texel = lattice.interpolate_transforms(rigid)
+    points = torch.randn(len(lattice.texels), 3)
+    expected = RigidTransforms(quats=quat.expand(len(points), 4), translations=shift.expand(len(points), 3)).apply(
+        points
+    )
+    torch.testing.assert_close(texel.apply(points), expected, atol=2e-5, rtol=0)
+
+
+def test_posed_texels_are_close_to_the_posed_surface(template):
+    """Carrying a texel (Eq. 5) and interpolating posed vertices agree up to the bend of one triangle."""
+    lattice, posed = build_lattice(tube_mesh(), RESOLUTION), template.pose(Pose(tube_motion(), 5))
+    carried = lattice.interpolate_transforms(posed.transforms).apply(lattice.interpolate(posed.canonical))
+    assert float((carried - lattice.interpolate(posed.vertices)).norm(dim=1).max()) < 0.01
+
+
+def moved(motion: Motion, shift, yaw: float) -> Motion:
+    turn = Rotation.from_rotvec([0, yaw, 0])
+    dofs = motion.dofs.copy()
+    dofs[:, :3] = turn.apply(dofs[:, :3]) + shift
+    dofs[:, 3:6] = (turn * Rotation.from_rotvec(dofs[:, 3:6])).as_rotvec()
+    return Motion(dofs=dofs, sequence=motion.sequence, fps=motion.fps)
+
+
+def textures(template, motion, *, yaw_normalise: bool) -> torch.Tensor:
+    return motion_aware_textures(
+        template, build_lattice(tube_mesh(), RESOLUTION), Pose(motion, 4), window=3, yaw_normalise=yaw_normalise
+    )
+
+
+def test_textures_ignore_where_the_person_stands_and_on_request_where_it_faces(template):
+    motion = tube_motion()
+    for yaw_normalise in (True, False):
+        here = textures(template, motion, yaw_normalise=yaw_normalise)
+        there = textures(template, moved(motion, [5.0, 0, -2.0], 0.0), yaw_normalise=yaw_normalise)
+        torch.testing.assert_close(there, here, atol=1e-5, rtol=0)
+    turned = moved(motion, [0, 0, 0], 1.1)
+    straight = textures(template, motion, yaw_normalise=True)
+    torch.testing.assert_close(textures(template, turned, yaw_normalise=True), straight, atol=1e-5, rtol=0)
+    unturned = textures(template, motion, yaw_normalise=False)
+    assert not torch.allclose(textures(template, turned, yaw_normalise=False), unturned, atol=0.1)
+
+
+def test_textures_hold_normals_then_positions_newest_frame_first(template):
+    motion = tube_motion()
+    lattice, posed = build_lattice(tube_mesh(), RESOLUTION), template.pose(Pose(motion, 4))
+    stacked = covered(lattice, textures(template, motion, yaw_normalise=False))
+    assert stacked.shape[1] == 18
+    torch.testing.assert_close(stacked[:, :3], lattice.interpolate(posed.normals))
+    root = torch.from_numpy(motion.dofs[4, :3]).float()
+    torch.testing.assert_close(stacked[:, 3:6], lattice.interpolate(posed.vertices) - root, atol=1e-6, rtol=0)
+    before = template.pose(Pose(motion, 3))
+    torch.testing.assert_close(stacked[:, 9:12], lattice.interpolate(before.vertices) - root, atol=1e-6, rtol=0)
+
+
+def test_normalised_motion_ignores_where_the_person_stands_and_faces():
+    motion = tube_motion()
+    here = normalised_motion(Pose(motion, 4), window=3)
+    there = normalised_motion(Pose(moved(motion, [5.0, 0, -2.0], 1.1), 4), window=3)
+    torch.testing.assert_close(there, here, atol=1e-5, rtol=0)
+    assert not here[0, :3].any()
+    unchanged = torch.from_numpy(motion.dofs[[4, 3, 2], 6:]).float()
+    assert torch.equal(here[:, 6:], unchanged)
+
+
+def test_statistics_are_of_the_motion_not_of_the_body(template):
+    motion, lattice = tube_motion(), build_lattice(tube_mesh(), RESOLUTION)
+    drawn = [
+        motion_aware_textures(template, lattice, Pose(motion, frame), window=2, yaw_normalise=True)
+        for frame in range(6)
+    ]
+    mean, deviation = texture_statistics(drawn)
+    standardised = torch.stack([covered(lattice, (texture - mean) / deviation) for texture in drawn])
+    torch.testing.assert_close(standardised.mean(0), torch.zeros_like(standardised[0]), atol=1e-4, rtol=0)
+    torch.testing.assert_close(standardised.square().mean((0, 1)).sqrt(), torch.ones(12), atol=1e-3, rtol=0)
+
+
+def test_a_standardised_drawer_is_restored_by_its_checkpoint(template):
+    motion, lattice = tube_motion(), build_lattice(tube_mesh(), RESOLUTION)
+    plain, seen, restored = (
+        TextureDrawer(lattice, window=2, yaw_normalise=True, standardise=standardise)
+        for standardise in (False, True, True)
+    )
+    seen.observe(template, motion, (0, 1, 2, 3))
+    restored.load_state_dict(seen.state_dict())
+    assert torch.equal(restored(template, Pose(motion, 5)), seen(template, Pose(motion, 5)))
+    mean, spread = texture_statistics([plain(template, Pose(motion, frame)) for frame in (0, 1, 2, 3)])
+    expected = ((plain(template, Pose(motion, 5)) - mean) / spread).clamp(-BOUND, BOUND)
+    assert torch.equal(seen(template, Pose(motion, 5)), expected)
+    assert not plain.state_dict()
+
+
+def test_what_was_never_seen_is_not_far_from_what_was(template):
+    motion, lattice = tube_motion(), build_lattice(tube_mesh(), RESOLUTION)
+    drawer = TextureDrawer(lattice, window=2, yaw_normalise=True, standardise=True)
+    drawer.observe(template, motion, (0, 0))  # One pose: every other one is infinitely unusual.
+    assert not drawer(template, Pose(motion, 0)).any()
+    assert drawer(template, Pose(motion, 5)).abs().max() == BOUND
+
+
+def test_trust_is_whole_in_training_frames_and_fades_with_novelty(template):
+    """Novelty is a distance in spreads: a motion that is moved away little by little is trusted less and less."""
+    motion, frames = tube_motion(6), (0, 1, 2, 3)
+    drawer = TextureDrawer(
+        build_lattice(template.mesh, RESOLUTION), window=1, yaw_normalise=True, standardise=True, fade=0.5
+    )
+    drawer.observe(template, motion, frames)
+    assert [drawer.trust(drawer(template, Pose(motion, frame))) for frame in frames] == [1.0] * 4
+    bends = []
+    for bend in (0.0, 0.05, 0.2, 0.8):
+        dofs = motion.dofs.copy()
+        dofs[3, 6:] += bend
+        textures = drawer(template, Pose(Motion(dofs=dofs, sequence=motion.sequence, fps=motion.fps), 3))
+        novelty = drawer.novelty(textures)
+        assert drawer.trust(textures) == pytest.approx(np.exp(-((novelty / 0.5) ** 2)))
+        bends.append(novelty)
+    assert bends[0] == 0 and sorted(bends) == bends and bends[-1] > 0.5
+    always = TextureDrawer(build_lattice(template.mesh, RESOLUTION), window=1, yaw_normalise=True, standardise=True)
+    always.observe(template, motion, frames)
+    assert always.trust(textures) == 1.0
+
+
+def test_novelty_is_the_distance_to_the_nearest_training_frame_over_the_body(template):
+    lattice = build_lattice(template.mesh, RESOLUTION)
+    drawer = TextureDrawer(lattice, window=1, yaw_normalise=True, standardise=True, fade=1.0)
+    drawer.observe(template, tube_motion(4), (0, 1))
+    shifted = drawer(template, Pose(tube_motion(4), 1)) + 0.7 * lattice.to_texture(torch.ones(len(lattice.texels), 6))
+    assert 0.55 < drawer.novelty(shifted) <= 0.7  # Texels at the atlas' border are averaged with empty ones.

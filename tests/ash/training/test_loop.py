@@ -1,0 +1,338 @@
+import json
+import os
+import signal
+import time
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.captures import tube_model_config, write_tube_capture
+
+from ash.avatar import AshAvatar
+from ash.capture.dataset import Pose
+from ash.config import AshConfig, TrainingConfig
+from ash.files import InputError
+from ash.protocol import StageClock
+from ash.training import loop, stopping
+from ash.training.adam import Adam
+from ash.training.batches import composite, composite_naive, cut_batch, draw_batch, load_training_images
+from ash.training.loop import Diverged, Interrupted
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
+
+
+def config(**changes) -> AshConfig:
+    training = TrainingConfig(
+        steps=12,
+        views_per_step=2,
+        warmup="static",
+        warmup_steps=4,
+        l1_weight=0.8,
+        ssim_weight=0.2,
+        learning_rate=2e-3,
+    )
+    return AshConfig(model=tube_model_config(), training=replace(training, **changes))
+
+
+def weights(avatar: AshAvatar) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in avatar.module.state_dict().items()}
+
+
+def psnr(avatar, capture, split: str) -> float:
+    errors = []
+    for camera, frame in capture.splits[split].views:
+        truth = capture.image(camera, frame).astype(np.float64) / 255
+        drawn = avatar.render(Pose(capture.motion, frame), capture.cameras[camera], clock=StageClock())
+        errors.append((((drawn[..., :3] - truth[..., :3] * truth[..., 3:])[truth[..., 3] > 0.5]) ** 2).mean())
+    return -10 * np.log10(np.mean(errors))
+
+
+def test_known_gaussians_are_recovered_from_their_images(capture, tmp_path):
+    avatar = AshAvatar(config(steps=300, warmup_steps=200, base_learning_rate=5e-2), capture)
+    before = psnr(avatar, capture, "novel_view")
+    avatar.fit(capture, folder=tmp_path)
+    assert psnr(avatar, capture, "novel_view") > before + 12
+    assert psnr(avatar, capture, "novel_pose") > before + 12
+    rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert rows[-2]["step"] == 300
+    assert rows[-2]["loss"] < 0.5 * rows[0]["loss"]
+    curve = [row["train_psnr"] for row in rows if "train_psnr" in row]
+    assert len(curve) == 9
+    assert curve[-1] > before + 8
+    outcome = avatar.outcome()
+    assert (outcome.steps, outcome.ended_by, outcome.reserved_psnr) == (300, "steps", curve[-1])
+    assert rows[-1]["outcome"] == asdict(outcome)
+
+
+def stop_before_end_of(avatar: AshAvatar, step: int) -> None:
+    """Send SIGTERM while the given step is drawn."""
+    draw = avatar.draw_training_views
+
+    def draw_then_signal(frame, cameras, background, at):
+        if at == step:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return draw(frame, cameras, background, at)
+
+    avatar.draw_training_views = draw_then_signal
+
+
+def test_a_run_stopped_at_ten_random_steps_ends_with_the_same_bits(capture, tmp_path):
+    settings = config(steps=24, ema=0.9)
+    undisturbed = AshAvatar(settings, capture)
+    undisturbed.fit(capture, folder=tmp_path / "whole")
+    stops = sorted(np.random.default_rng(5).choice(24, 10, replace=False))
+    for stop in stops:
+        avatar = AshAvatar(settings, capture)
+        stop_before_end_of(avatar, int(stop))
+        with pytest.raises(Interrupted, match=f"stopped at step {stop}|{stop + 1} of 24"):
+            avatar.fit(capture, folder=tmp_path / "stopped")
+    again = AshAvatar(settings, capture)
+    again.fit(capture, folder=tmp_path / "stopped")
+    for name, value in weights(undisturbed).items():
+        assert torch.equal(weights(again)[name], value), name
+    once_more = AshAvatar(settings, capture)
+    once_more.fit(capture, folder=tmp_path / "stopped")
+    assert torch.equal(weights(once_more)["base"], weights(undisturbed)["base"])
+
+
+def test_a_run_stopped_before_and_in_its_decay_decides_nothing_anew(capture, tmp_path, monkeypatch):
+    """Its end is found by scores: a run that is stopped at any step finds the same end, and ends with the same bits."""
+    monkeypatch.setattr(stopping, "FIRST_MARK", 8)
+    monkeypatch.setattr(stopping, "GAIN_DB", 99.0)
+    settings = config(steps=200, warmup="none", warmup_steps=0)
+    undisturbed = AshAvatar(settings, capture)
+    undisturbed.fit(capture, folder=tmp_path / "whole")
+    assert (undisturbed.outcome().ended_by, undisturbed.outcome().steps) == ("plateau", 15)
+    for stop in (3, 9, 11, 13):
+        avatar = AshAvatar(settings, capture)
+        stop_before_end_of(avatar, stop)
+        with pytest.raises(Interrupted):
+            avatar.fit(capture, folder=tmp_path / "stopped")
+    again = AshAvatar(settings, capture)
+    again.fit(capture, folder=tmp_path / "stopped")
+    for name, value in weights(undisturbed).items():
+        assert torch.equal(weights(again)[name], value), name
+    assert replace(again.outcome(), seconds=0.0) == replace(undisturbed.outcome(), seconds=0.0)
+
+
+def test_a_limit_in_seconds_is_met(capture, tmp_path):
+    avatar = AshAvatar(config(steps=100_000, seconds=2.0), capture)
+    before = time.process_time()
+    avatar.fit(capture, folder=tmp_path)
+    assert avatar.outcome().ended_by == "seconds"
+    assert 1.4 < avatar.outcome().seconds < 3
+    assert time.process_time() - before < 4
+
+
+def test_snapshots_are_what_would_be_used(capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, "SNAPSHOT_SECONDS", (0, 10_000))
+    avatar = AshAvatar(config(snapshots=True, ema=0.5, steps=1, warmup_steps=0), capture)
+    avatar.fit(capture, folder=tmp_path)
+    assert [path.name for path in (tmp_path / "snapshots").iterdir()] == ["000000.safetensors"]
+    other = AshAvatar(config(), capture)
+    other.load(tmp_path / "snapshots" / "000000.safetensors")
+    for name, value in weights(avatar).items():
+        assert torch.equal(weights(other)[name], value), name
+
+
+@pytest.mark.parametrize(("rate", "dead"), [(2e-3, False), (0.0, True)])
+def test_decoders_that_carry_nothing_are_found(capture, tmp_path, rate, dead):
+    """A head that never leaves zero adds the same in every frame; one that learns does not."""
+    avatar = AshAvatar(config(learning_rate=rate, steps=24), capture)
+    avatar.fit(capture, folder=tmp_path)
+    assert avatar.outcome().carries_nothing == dead
+    assert (avatar.outcome().correction_spread == 0) == dead
+
+
+def test_without_decoders_there_is_nothing_to_carry(capture, tmp_path):
+    settings = config(warmup="none", warmup_steps=0)
+    avatar = AshAvatar(replace(settings, model=replace(settings.model, motion=False)), capture)
+    avatar.fit(capture, folder=tmp_path)
+    assert avatar.outcome().correction_spread is None
+    assert not avatar.outcome().carries_nothing
+
+
+def test_far_from_training_the_mean_correction_is_what_counts(capture, tmp_path):
+    """Where trust is 0 the decoders' word is their mean over training frames; in training frames it is their own."""
+    settings = config(steps=24)
+    model = replace(settings.model, standardise=True, fade=0.5)
+    avatar = AshAvatar(replace(settings, model=model), capture)
+    avatar.fit(capture, folder=tmp_path)
+    with torch.no_grad():
+        added = [avatar.corrections(frame) for frame in range(4)]
+        mean = torch.stack(added).mean(0)
+        for frame in range(4):
+            near = avatar.module.conditions(Pose(capture.motion, frame))
+            assert near.trust == 1
+            torch.testing.assert_close(avatar.module.decode(near), avatar.module.base + added[frame])
+            far, between = (avatar.module.decode(replace(near, trust=trust)) for trust in (0.0, 0.25))
+            torch.testing.assert_close(far, avatar.module.base + mean)
+            torch.testing.assert_close(between, avatar.module.base + 0.75 * mean + 0.25 * added[frame])
+    assert not torch.equal(added[0], added[2])
+    avatar.save(tmp_path / "weights.safetensors")
+    other = AshAvatar(replace(settings, model=model), capture)
+    other.load(tmp_path / "weights.safetensors")
+    assert torch.equal(other.module.mean_correction, avatar.module.mean_correction)
+
+
+def test_the_average_of_the_weights_is_the_result_and_nothing_else_changes(capture, tmp_path):
+    last, averaged = AshAvatar(config(), capture), AshAvatar(config(ema=0.5), capture)
+    passed = []
+    draw = last.draw_training_views
+
+    def draw_and_keep(*arguments):
+        if arguments[-1] == len(passed):  # The curve's views are drawn besides.
+            passed.append(last.module.base.detach().clone())
+        return draw(*arguments)
+
+    last.draw_training_views = draw_and_keep
+    last.fit(capture, folder=tmp_path / "last")
+    averaged.fit(capture, folder=tmp_path / "averaged")
+    expected = passed[0]
+    for step, base in enumerate([*passed[1:12], last.module.base.detach()]):
+        decay = min(0.5, (1 + step) / (10 + step))
+        expected = decay * expected + (1 - decay) * base
+    torch.testing.assert_close(averaged.module.base.detach(), expected, atol=1e-5, rtol=1e-5)
+    assert not torch.equal(averaged.module.base, last.module.base)
+
+
+def test_reserved_views_are_never_trained_on(capture):
+    images = load_training_images(capture.training_only())
+    assert len(images.reserved) == 2
+    for step in range(64):
+        batch = draw_batch(images, replace(config().training, views_per_step=4), 0, step)
+        seen = {(camera.name, batch.frame) for camera in batch.cameras}
+        assert not seen & set(images.reserved)
+        assert len(seen) == 4 - sum(frame == batch.frame for _, frame in images.reserved)
+
+
+def test_a_window_over_a_background_is_its_definition():
+    rgba = np.random.default_rng(0).integers(0, 256, (30, 40, 4), np.uint8)
+    rgba[:4, :, 3], rgba[4:8, :, 3] = 0, 255
+    for window in (rgba, rgba[3:20, 5:38]):
+        for background in (torch.zeros(3), torch.tensor([0.2, 0.5, 0.9])):
+            rgb, alpha = composite(window, background)
+            expected_rgb, expected_alpha = composite_naive(window, background)
+            torch.testing.assert_close(rgb, expected_rgb, rtol=0, atol=2e-7)
+            assert torch.equal(alpha, expected_alpha)
+
+
+def test_equal_seeds_give_equal_bits_and_other_seeds_do_not(capture, tmp_path):
+    results = []
+    for run, seed in enumerate((0, 0, 1)):
+        avatar = AshAvatar(replace(config(), seed=seed), capture)
+        avatar.fit(capture, folder=tmp_path / str(run))
+        results.append(weights(avatar)["base"])
+    assert torch.equal(results[0], results[1])
+    assert not torch.equal(results[0], results[2])
+
+
+def test_nan_rolls_back_once_and_then_ends_the_run(capture, tmp_path):
+    avatar = AshAvatar(config(), capture)
+    draw, spoiled = avatar.draw_training_views, []
+
+    def spoil(frame, cameras, background, step):
+        image = draw(frame, cameras, background, step)
+        spoiled.append(step == 6)
+        return image * float("nan") if step == 6 and sum(spoiled) <= times else image
+
+    avatar.draw_training_views = spoil
+    times = 1
+    avatar.fit(capture, folder=tmp_path / "once")
+    assert all(torch.isfinite(value).all() for value in weights(avatar).values())
+    times = 99
+    spoiled.clear()
+    with pytest.raises(Diverged, match="step 6"):
+        avatar.fit(capture, folder=tmp_path / "always")
+
+
+def poison(avatar: AshAvatar, *, at: set[int], times: int) -> None:
+    """Spoil a weight before the given steps are drawn, `times` times in all."""
+    draw, left = avatar.draw_training_views, [times]
+
+    def draw_poisoned(frame, cameras, background, step):
+        if step in at and left[0] > 0:
+            left[0] -= 1
+            with torch.no_grad():
+                avatar.module.base[0, 3] = float("nan")
+        return draw(frame, cameras, background, step)
+
+    avatar.draw_training_views = draw_poisoned
+
+
+def test_a_weight_that_is_nan_rolls_back_once_and_then_ends_the_run_as_diverged(capture, tmp_path):
+    """The splatter refuses such Gaussians as wrong input; the run must not end as that."""
+    avatar = AshAvatar(config(), capture)
+    poison(avatar, at={7}, times=1)
+    avatar.fit(capture, folder=tmp_path / "once")
+    assert all(torch.isfinite(value).all() for value in weights(avatar).values())
+    avatar = AshAvatar(config(), capture)
+    poison(avatar, at={7}, times=2)
+    with pytest.raises(Diverged, match=r"Gaussians that cannot be drawn \(scales.*at step 7, again"):
+        avatar.fit(capture, folder=tmp_path / "always")
+
+
+@pytest.mark.parametrize("spoiled", [{12}, {12, 24}])
+def test_weights_that_the_last_step_spoiled_are_never_the_result(capture, tmp_path, monkeypatch, spoiled):
+    avatar, made, step = AshAvatar(config(), capture), [0], Adam.step
+
+    def spoil(optimiser, *arguments):
+        finite = step(optimiser, *arguments)
+        made[0] += 1
+        if made[0] in spoiled:
+            with torch.no_grad():
+                avatar.module.base[0, 3] = float("nan")
+        return finite
+
+    monkeypatch.setattr(Adam, "step", spoil)
+    if len(spoiled) == 2:
+        with pytest.raises(Diverged, match="weights not finite at step 12, again"):
+            avatar.fit(capture, folder=tmp_path)
+    else:
+        avatar.fit(capture, folder=tmp_path)
+        assert made[0] == 24
+        assert all(torch.isfinite(value).all() for value in weights(avatar).values())
+
+
+def test_a_damaged_checkpoint_is_named(capture, tmp_path):
+    avatar = AshAvatar(config(), capture)
+    avatar.save(tmp_path / "weights.safetensors")
+    content = (tmp_path / "weights.safetensors").read_bytes()
+    (tmp_path / "weights.safetensors").write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match=r"weights\.safetensors: expected a safetensors checkpoint"):
+        avatar.load(tmp_path / "weights.safetensors")
+
+
+def test_saved_weights_render_the_same_image(capture, tmp_path):
+    avatar = AshAvatar(config(), capture)
+    avatar.fit(capture, folder=tmp_path)
+    avatar.save(tmp_path / "weights.safetensors")
+    other = AshAvatar(config(), capture)
+    other.load(tmp_path / "weights.safetensors")
+    camera = capture.cameras["cam0"]
+    drawn = [a.render(Pose(capture.motion, 5), camera, clock=StageClock()) for a in (avatar, other)]
+    np.testing.assert_array_equal(*drawn)
+
+
+def test_a_crop_draws_what_the_full_image_shows_there(capture):
+    images = load_training_images(capture.training_only())
+    batch = cut_batch(images, 1, ["cam1", "cam2"], torch.tensor([0.2, 0.4, 0.6]))
+    avatar = AshAvatar(config(), capture)
+    background = torch.tensor([0.2, 0.4, 0.6])
+    cropped = avatar.draw_training_views(1, batch.cameras, background, 0)
+    for view, (name, camera) in enumerate(zip(["cam1", "cam2"], batch.cameras, strict=True)):
+        full = avatar.draw_training_views(1, [capture.cameras[name]], background, 0)[0]
+        left, top = (capture.cameras[name].K[:2, 2] - camera.K[:2, 2]).astype(int)
+        window = full[top : top + camera.height, left : left + camera.width]
+        torch.testing.assert_close(cropped[view], window, atol=2e-5, rtol=0)
+
+
+def test_every_epoch_shows_every_frame_once(capture):
+    images = load_training_images(capture.training_only())
+    for epoch in range(3):
+        frames = [draw_batch(images, config().training, 7, 4 * epoch + k).frame for k in range(4)]
+        assert sorted(frames) == [0, 1, 2, 3]

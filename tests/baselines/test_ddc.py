@@ -1,0 +1,102 @@
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.captures import write_tube_capture
+from helpers.figures import front_camera, tube_motion
+
+from ash.capture.dataset import Pose, image_path
+from ash.capture.formats import load_capture
+from ash.config import TemplateConfig
+from ash.files import write_image
+from ash.mesh.drawing import SUPERSAMPLING, sample_texture
+from ash.presets import named
+from ash.protocol import StageClock
+from baselines.ddc import DdcAvatar, ddc_config
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
+
+
+def avatar(capture, *, steps: int = 120) -> DdcAvatar:
+    ash = named("ci")
+    small = replace(ash.model, texels=16, width=4, levels=2, window=2)
+    training = replace(ash.training, steps=steps, warmup_steps=steps // 2)
+    return DdcAvatar(
+        ddc_config(replace(ash, model=small, training=training), seed=0, template=TemplateConfig()), capture
+    )
+
+
+def test_samples_hit_texture_pixels_where_the_atlas_says():
+    texture = torch.arange(12.0).reshape(1, 3, 4)  # Three rows, the first on top.
+    centres = torch.tensor([[0.125, 1 - 1 / 6], [0.875, 1 - 1 / 6], [0.375, 1 / 6]])
+    torch.testing.assert_close(sample_texture(texture, centres)[:, 0], torch.tensor([0.0, 3.0, 9.0]))
+    between = torch.tensor([[0.25, 1 - 1 / 6]])
+    torch.testing.assert_close(sample_texture(texture, between), torch.tensor([[0.5]]))
+
+
+def test_a_constant_texture_draws_a_flat_silhouette_over_the_background(capture):
+    model = avatar(capture).module
+    posed = model.template.pose(Pose(tube_motion(), 0))
+    colour, background = torch.tensor([0.2, 0.5, 0.8]), torch.tensor([1.0, 0.0, 0.0])
+    texture = colour[:, None, None].expand(3, 32, 32)
+    with torch.no_grad():
+        image = model.draw(texture, posed, front_camera(), background)
+    coverage = image[..., 3:]
+    torch.testing.assert_close(image[..., :3], colour * coverage + background * (1 - coverage), atol=1e-6, rtol=0)
+    steps = coverage * SUPERSAMPLING**2
+    assert torch.equal(steps, steps.round())
+    assert ((coverage > 0) & (coverage < 1)).any()
+
+
+def test_gradients_reach_exactly_the_texture_pixels_that_are_seen(capture):
+    model = avatar(capture).module
+    posed = model.template.pose(Pose(tube_motion(), 0))
+    texture = torch.full((3, 32, 32), 0.5, requires_grad=True)
+    model.draw(texture, posed, front_camera(), torch.zeros(3))[..., 1].sum().backward()
+    assert texture.grad is not None
+    assert not texture.grad[[0, 2]].any()
+    lit = texture.grad[1] != 0
+    assert 0.3 < lit.float().mean() < 0.7  # The camera sees one half of the tube's unrolled surface.
+
+
+def test_a_known_texture_is_recovered_from_its_images(capture, tmp_path):
+    known = avatar(capture)
+    known.module.texture.data = torch.rand(3, 8, 8).repeat_interleave(4, 1).repeat_interleave(4, 2)
+    folder = shutil.copytree(capture.folder, tmp_path / "capture")
+    for split in capture.splits.values():
+        for camera, frame in split.views:
+            drawn = known.render(Pose(capture.motion, frame), capture.cameras[camera], clock=StageClock())
+            straight = np.concatenate([drawn[..., :3] / np.maximum(drawn[..., 3:], 0.25), drawn[..., 3:]], -1)
+            write_image(image_path(folder, camera, frame), (255 * straight).round().astype(np.uint8))
+    redrawn = load_capture(folder)
+    learner = avatar(redrawn)
+    before = _psnr(learner, redrawn)
+    learner.fit(redrawn, folder=tmp_path / "run")
+    assert _psnr(learner, redrawn) > before + 4
+
+
+def _psnr(made, capture) -> float:
+    errors = []
+    for camera, frame in capture.splits["novel_view"].views:
+        truth = capture.image(camera, frame).astype(np.float64) / 255
+        drawn = made.render(Pose(capture.motion, frame), capture.cameras[camera], clock=StageClock())
+        errors.append(((drawn[..., :3] - truth[..., :3])[truth[..., 3] > 0.95] ** 2).mean())
+    return float(-10 * np.log10(np.mean(errors)))
+
+
+def test_noise_in_the_textures_is_for_learning_alone(capture):
+    config = named("ci")
+    config = replace(config, training=replace(config.training, texture_noise=0.5, warmup_steps=2))
+    avatar = DdcAvatar(ddc_config(config, seed=0, template=TemplateConfig(kind="exact")), capture)
+    for parameter in avatar.module.network.parameters():
+        parameter.data += 0.05 * torch.randn(parameter.shape, generator=torch.manual_seed(0))
+    cameras = [capture.cameras["cam1"]]
+    learned = [avatar.draw_training_views(0, cameras, torch.zeros(3), step).detach() for step in (2, 3)]
+    with torch.no_grad():
+        still = [avatar.draw_training_views(0, cameras, torch.zeros(3), step) for step in (2, 3)]
+    assert not torch.equal(*learned) and torch.equal(*still)

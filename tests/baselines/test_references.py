@@ -1,0 +1,166 @@
+"""The references: what a method must beat, and the bounds it is measured against."""
+
+import shutil
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from helpers.captures import tiny_preset, write_tube_capture
+from helpers.figures import tube_mesh
+
+from ash import presets
+from ash.capture.dataset import Camera, Capture, Motion, Pose, image_path
+from ash.capture.formats import load_capture, write_template
+from ash.files import InputError, write_image
+from ash.protocol import Avatar, StageClock
+from baselines.mlp import ASH_STEPS_PER_STEP, mlp, mlp_time
+from baselines.nearest import central_frame, move_image, nearest, pose_distances, see_root
+from baselines.oracle_texture import oracle_texture
+from baselines.static import of_one_frame, static
+from baselines.switches import smpl
+from benchmarks.cell.methods import WRONG_BY_MM, find_method
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Capture:
+    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
+
+
+@pytest.fixture(autouse=True)
+def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(presets.PRESETS, "ci", partial(tiny_preset, steps=40, warmup_steps=10))
+
+
+def draw(avatar: Avatar, capture: Capture, camera: str, frame: int) -> np.ndarray:
+    return avatar.render(Pose(capture.motion, frame), capture.cameras[camera], clock=StageClock())
+
+
+def foreground_psnr(avatar: Avatar, capture: Capture, views: list[tuple[str, int]]) -> float:
+    errors = []
+    for camera, frame in views:
+        truth = capture.image(camera, frame).astype(np.float64) / 255
+        error = draw(avatar, capture, camera, frame)[..., :3] - truth[..., :3] * truth[..., 3:]
+        errors.append((error[truth[..., 3] > 0.5] ** 2).mean())
+    return float(-10 * np.log10(np.mean(errors)))
+
+
+def test_nearest_gives_a_training_image_back(capture):
+    made = nearest(capture.training_only(), seed=0, preset="ci")
+    assert isinstance(made, Avatar)
+    for camera, frame in capture.splits["train"].views:
+        truth = capture.image(camera, frame).astype(np.float32) / 255
+        drawn = draw(made, capture, camera, frame)
+        np.testing.assert_allclose(drawn[..., :3], truth[..., :3] * truth[..., 3:], atol=1e-4)
+        np.testing.assert_allclose(drawn[..., 3], truth[..., 3], atol=1e-4)
+
+
+def test_nearest_takes_the_neighbouring_camera_and_the_most_alike_pose(capture):
+    made = nearest(capture.training_only(), seed=0, preset="ci")
+    turned = capture.motion.dofs.copy()
+    turned[:, 6:] += 0.01  # A little different from training, most alike its own frame.
+    motion = Motion(dofs=turned, sequence=capture.motion.sequence, fps=capture.motion.fps)
+    for frame in capture.splits["train"].frames:
+        drawn = made.render(Pose(motion, frame), capture.cameras["cam0"], clock=StageClock())
+        expected = [draw(made, capture, side, frame) for side in ("cam1", "cam4")]
+        assert min(np.abs(drawn[..., 3].mean() - image[..., 3].mean()) for image in expected) < 0.03
+
+
+def test_an_image_is_moved_and_scaled_to_where_the_root_is_seen(capture):
+    camera, frame = capture.cameras["cam1"], 0
+    closer = replace(camera, viewmat=camera.viewmat.copy(), K=camera.K * np.array([[2.0], [2.0], [1.0]]))
+    wide = Camera(name="wide", width=96, height=96, K=closer.K, viewmat=camera.viewmat)
+    seen, wanted = (see_root(capture.skeleton, Pose(capture.motion, frame), c) for c in (camera, wide))
+    image = capture.image("cam1", frame)
+    moved = move_image(image, seen, wanted, wide)
+    assert moved.shape == (96, 96, 4)
+    assert moved[..., 3].sum() == pytest.approx(4 * (image[..., 3] / 255).sum(), rel=0.03)
+
+
+def test_pose_distance_is_the_angle_of_the_joints_without_the_root():
+    pose = np.zeros(12)
+    poses = np.tile(pose, (3, 1))
+    poses[0, 3:6] = (0.0, 1.0, 0.0)  # the root's heading
+    poses[1, 6:9] = (0.5, 0.0, 0.0)
+    poses[2, 6:9], poses[2, 9:12] = (0.0, 0.3, 0.0), (0.0, 0.0, 0.4)
+    expected = [0.0, 0.5 / np.sqrt(2), np.sqrt((0.3**2 + 0.4**2) / 2)]
+    np.testing.assert_allclose(pose_distances(pose, poses), expected, atol=1e-6)
+    motion = Motion(dofs=np.stack([poses[2], poses[1], pose]), sequence=np.zeros(3, dtype=np.int64), fps=1.0)
+    assert central_frame(motion, (0, 1, 2)) == 2
+
+
+def test_static_learns_its_one_frame_and_reads_no_other(capture, tmp_path):
+    seen = capture.training_only()
+    (frame,) = of_one_frame(seen).splits["train"].frames
+    assert frame in seen.splits["train"].frames
+    alone = replace(seen, folder=tmp_path / "alone")
+    for camera in seen.splits["train"].cameras:
+        there = image_path(alone.folder, camera, frame)
+        there.parent.mkdir(parents=True)
+        shutil.copy(image_path(capture.folder, camera, frame), there)
+    made = static(alone, seed=0, preset="ci")
+    views = [(camera, frame) for camera in seen.splits["train"].cameras]
+    before = foreground_psnr(made, capture, views)
+    made.fit(alone, folder=tmp_path / "run")
+    assert foreground_psnr(made, capture, views) > before + 2
+    assert not made.config.model.motion
+
+
+def test_oracle_texture_recovers_a_texture_on_the_exact_surface(capture, tmp_path):
+    known = oracle_texture(capture, seed=0, preset="ci")
+    assert known.parameter_count() == known.module.texture.numel() + 27
+    known.module.texture.data = torch.rand(3, 8, 8).repeat_interleave(4, 1).repeat_interleave(4, 2)
+    folder = shutil.copytree(capture.folder, tmp_path / "capture")
+    for camera, frame in {view for split in capture.splits.values() for view in split.views}:
+        drawn = draw(known, capture, camera, frame)
+        straight = np.concatenate([drawn[..., :3] / np.maximum(drawn[..., 3:], 0.25), drawn[..., 3:]], -1)
+        write_image(image_path(folder, camera, frame), (255 * straight).round().astype(np.uint8))
+    redrawn = load_capture(folder)
+    made = oracle_texture(redrawn, seed=0, preset="ci")
+    views = redrawn.splits["novel_view"].views
+    before = foreground_psnr(made, redrawn, views)
+    made.fit(redrawn, folder=tmp_path / "run")
+    assert foreground_psnr(made, redrawn, views) > before + 3
+    made.save(tmp_path / "model.safetensors")
+    again = oracle_texture(redrawn, seed=1, preset="ci")
+    again.load(tmp_path / "model.safetensors")
+    np.testing.assert_array_equal(draw(again, redrawn, "cam0", 1), draw(made, redrawn, "cam0", 1))
+
+
+def test_what_is_wrong_by_so_much_is_wrong_by_so_much_whoever_draws_it(capture):
+    for error_mm, row in WRONG_BY_MM.items():
+        for method in row:
+            avatar = find_method(method).load()(capture, seed=0, preset="ci")
+            assert (avatar.config.template.kind, avatar.config.template.error_mm) == ("exact", error_mm), method
+
+
+def test_the_bare_body_is_the_template_and_a_capture_without_one_is_refused(capture, tmp_path):
+    with pytest.raises(InputError, match="no bare body"):
+        smpl(capture.training_only(), seed=0, preset="ci")
+    mesh = tube_mesh()
+    thin = replace(mesh, vertices=mesh.vertices * [0.5, 1.0, 0.5])
+    write_template(tmp_path / "body.npz", thin)
+    for name in ("frames", "manifest.json"):
+        (tmp_path / name).symlink_to(capture.folder / name)
+    dressed = replace(capture.training_only(), folder=tmp_path)
+    made = smpl(dressed, seed=0, preset="ci")
+    posed = made.template.pose(Pose(capture.motion, 0)).vertices.numpy()
+    radius = np.linalg.norm(posed[:12, [0, 2]] - posed[:12, [0, 2]].mean(0), axis=1)
+    assert radius.mean() == pytest.approx(0.05, rel=0.2)
+    assert made.template_vertices(Pose(capture.motion, 0)).shape == (0, 3), "as many vertices, but others"
+
+
+def test_mlp_at_equal_time_takes_fewer_steps_of_the_same_network(capture):
+    seen = capture.training_only()
+    steps, time = (make(seen, seed=0, preset="ci") for make in (mlp, mlp_time))
+    assert steps.config.training.steps == 40
+    assert time.config.training.steps == round(40 / ASH_STEPS_PER_STEP["ci"])
+    assert time.config.training.warmup_steps < time.config.training.steps
+    assert torch.equal(*(torch.cat([p.flatten() for p in m.module.parameters()]) for m in (steps, time)))
+    with pytest.raises(InputError, match="equal time"):
+        presets.PRESETS["huge"] = presets.ci
+        try:
+            mlp_time(seen, seed=0, preset="huge")
+        finally:
+            del presets.PRESETS["huge"]

@@ -1,0 +1,85 @@
+"""Every switch of the suite `switches` builds, learns and draws, and differs from ASH as it stands."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.captures import tiny_preset, write_tube_capture
+
+from ash import presets
+from ash.avatar import AshAvatar
+from ash.capture.dataset import Capture, Pose
+from ash.config import TemplateConfig
+from ash.protocol import StageClock
+from baselines import switches
+from benchmarks.cell.methods import ORACLES, configured, find_method
+from benchmarks.suites.files import find_suite
+from benchmarks.suites.suites import MethodSpec
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
+
+
+@pytest.fixture(autouse=True)
+def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(presets.PRESETS, "ci", partial(tiny_preset, steps=4, warmup_steps=2))
+
+
+@pytest.fixture(scope="module")
+def plain_images() -> dict[str, np.ndarray]:
+    """What ASH as it stands draws; filled by the first test."""
+    return {}
+
+
+SWITCHES = [row for row in find_suite("switches").methods if row.changes]
+LEARNED = [row for row in find_suite("template").methods if row.changes]
+
+
+def made(row: MethodSpec, capture: Capture) -> AshAvatar:
+    factory = find_method(row.of or row.name).load()
+    return factory(capture, seed=0, preset="ci", config=configured(row.of, "ci", row.changes))
+
+
+def drawn(avatar: AshAvatar, capture: Capture, folder: Path) -> np.ndarray:
+    avatar.fit(capture.training_only(), folder=folder)
+    return avatar.render(Pose(capture.motion, 3), next(iter(capture.cameras.values())), clock=StageClock())
+
+
+@pytest.mark.parametrize("row", SWITCHES, ids=lambda row: row.name)
+def test_a_switch_learns_draws_and_matters(
+    row: MethodSpec, capture: Capture, tmp_path: Path, plain_images: dict[str, np.ndarray]
+) -> None:
+    if not plain_images:
+        plain = presets.ash(capture.training_only(), seed=0, preset="ci")
+        plain_images["ash"] = drawn(plain, capture, tmp_path / "ash")
+    image = drawn(made(row, capture.training_only()), capture, tmp_path / row.name)
+    assert np.isfinite(image).all()
+    # The tube's template is exact: there is nothing that a learned one could add.
+    assert np.array_equal(image, plain_images["ash"]) == row.name.endswith("_template")
+
+
+@pytest.mark.parametrize("row", LEARNED, ids=lambda row: row.name)
+def test_a_way_to_the_template_is_learned_and_draws(row: MethodSpec, capture: Capture, tmp_path: Path) -> None:
+    require_a_way(made(row, capture), row.name == "unlearned", capture, tmp_path)
+
+
+def test_the_template_may_be_learned_from_what_only_an_oracle_sees(capture: Capture, tmp_path: Path) -> None:
+    require_a_way(switches.by_vertices(capture, seed=0, preset="ci"), False, capture, tmp_path)
+
+
+def require_a_way(avatar: AshAvatar, unlearned: bool, capture: Capture, folder: Path) -> None:
+    assert (avatar.template.learned is None) == unlearned
+    avatar.fit(capture, folder=folder)
+    assert np.isfinite(avatar.render(Pose(capture.motion, 3), capture.cameras["cam0"], clock=StageClock())).all()
+    assert (avatar.config.template, avatar.config.model.refine) != (TemplateConfig(kind="learned"), False)
+
+
+def test_the_suites_have_them_as_rows() -> None:
+    assert len(SWITCHES) == 22 and len(LEARNED) == 4
+    methods = [row.of or row.name for suite in ("switches", "template") for row in find_suite(suite).methods]
+    assert all(find_method(method).is_ours and callable(find_method(method).load()) for method in methods)
+    assert [method for method in methods if ":" in method] == ["baselines.switches:by_vertices"]
+    assert "baselines.switches:by_vertices" in ORACLES

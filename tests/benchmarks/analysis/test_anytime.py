@@ -1,0 +1,92 @@
+"""Accuracy against training seconds and against footage: who leads when, on numbers that are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.cells import cell
+
+from ash.protocol import TrainingOutcome
+from benchmarks.analysis import anytime, footage
+from benchmarks.cell.cells import CellResult, CurvePoint, Snapshot
+from benchmarks.cell.curves import seconds_to_settle
+from benchmarks.report.content import Bullets, Chart
+from benchmarks.report.sections import spent
+
+
+def trained(method: str, course: dict[int, float], *, seed: int = 0) -> CellResult:
+    """A cell whose snapshots scored as told; the last is its end."""
+    *early, end = course.items()
+    snapshots = tuple(
+        Snapshot(seconds=float(s), split=split, psnr=p) for s, p in early for split in ("novel_view", "novel_pose")
+    )
+    outcome = TrainingOutcome(steps=100, seconds=float(end[0]), ended_by="plateau")
+    return replace(cell(method, end[1], seed=seed), snapshots=snapshots, training=outcome)
+
+
+STATIC = {30: 23.0, 60: 24.0, 120: 24.0}
+LEARNED = {30: 22.0, 60: 23.5, 120: 25.0, 240: 26.0}
+
+
+def test_methods_cross_where_their_scores_are_equal():
+    """ASH is 0.5 dB behind after a minute and 1 dB ahead after two: a third of the way, in the logarithm."""
+    table = anytime.curves([trained("wo_mot", STATIC), trained("ash", LEARNED)])
+    views = table[table.split == "novel_view"]
+    assert views[views.method == "ash"].psnr.tolist() == [22.0, 23.5, 25.0, 26.0]
+    assert views[views.method == "wo_mot"].psnr.tolist() == [23.0, 24.0, 24.0, 24.0]  # It had ended: kept.
+    found = anytime.crossings(views)
+    assert (found.leader.tolist(), found.other.tolist()) == (["ash"], ["wo_mot"])
+    assert found.seconds.item() == pytest.approx(60 * 2 ** (1 / 3))
+    said = anytime.sentences(views)
+    assert said == ["On loose, held-out views, ASH is ahead of w/o mot. from 76 s of training on."]
+
+
+def test_a_pair_that_never_crosses_is_said_to():
+    table = anytime.curves([trained("wo_mot", STATIC), trained("ash", {s: p + 1 for s, p in STATIC.items()})])
+    assert anytime.sentences(table)[0].endswith("ASH is ahead of w/o mot. at every time, by 1.0 to 1.0 dB.")
+
+
+def test_seeds_give_intervals():
+    cells = [
+        trained("ash", {s: p + shift for s, p in LEARNED.items()}, seed=i) for i, shift in enumerate((-0.2, 0, 0.2))
+    ]
+    table = anytime.curves(cells)
+    assert (table.high > table.psnr).all() and (table.low < table.psnr).all()
+    assert np.isnan(anytime.curves(cells[:1]).low).all()
+
+
+def test_motion_pays_from_the_frames_on_after_which_it_never_loses():
+    frames = {20: 22.0, 40: 23.1, 80: 22.9, 160: 23.5, 320: 24.0}
+
+    def made(method: str, score: float, count: int) -> CellResult:
+        missing = 320 - count
+        return cell(method, score, axis="footage" if missing else "", severity=float(missing))
+
+    results = [made("ash", score, count) for count, score in frames.items()]
+    results += [made("wo_mot", 23.0, count) for count in frames]
+    table = footage.curves(results)
+    assert table[(table.method == "ash") & (table.split == "novel_pose")].frames.tolist() == [20, 40, 80, 160, 320]
+    assert footage.pays_from(table, "ash").frames.tolist() == [160.0]
+    assert footage.sentences(table) == [
+        "On loose, ASH is above w/o mot. on held-out motion from 160 training frames on."
+    ]
+    worse = footage.curves([made("ash", 20.0, count) for count in frames] + results[5:])
+    assert footage.sentences(worse)[0].endswith("at no number of training frames that was tried.")
+
+
+def test_the_sections_draw_what_was_run():
+    results = [trained("wo_mot", STATIC), trained("ash", LEARNED)]
+    (section,) = spent(results)
+    chart, said = section.blocks
+    assert isinstance(chart, Chart) and chart.figure.file == "chart_budget.svg" and len(chart.figure.panels) == 2
+    assert chart.figure.svg().count("ahead") == 0 and chart.figure.svg().count("ASH") >= 1
+    assert isinstance(said, Bullets) and any("ahead" in sentence for sentence in said.items)
+    assert spent([cell("ash", 20.0)]) == []
+
+
+def test_a_curve_settles_where_it_never_leaves_the_last_three_tenths_again():
+    scores = {10: 20.0, 20: 24.8, 30: 24.5, 40: 24.75, 80: 25.0}
+    curve = tuple(CurvePoint(seconds=float(s), loss=None, psnr=p) for s, p in scores.items())
+    assert seconds_to_settle(curve) == 40
+    assert seconds_to_settle(curve[-1:]) == 80
+    assert seconds_to_settle((CurvePoint(seconds=1.0, loss=0.1, psnr=None),)) is None

@@ -1,0 +1,40 @@
+import numpy as np
+import pytest
+
+from benchmarks.analysis.pareto import Candidate, front, hypervolume, hypervolume_interval, smallest_sufficient
+
+
+def candidate(name: str, quality: float, cost: float, spread: float = 0.05) -> Candidate:
+    return Candidate(name=name, qualities=(quality - spread, quality, quality + spread), cost=cost)
+
+
+FIELD = [candidate("best", 30.0, 100.0), candidate("near", 29.8, 40.0), candidate("fast", 25.0, 5.0)]
+
+
+def test_the_front_holds_whom_nobody_beats_in_both() -> None:
+    dominated = candidate("slow and poor", 24.0, 50.0)
+    assert front([*FIELD, dominated]) == ("fast", "near", "best")
+    assert front([]) == ()
+    assert set(front([candidate("a", 20.0, 5.0), candidate("b", 20.0, 5.0)])) == {"a", "b"}
+
+
+def test_hypervolume_by_hand() -> None:
+    alone = [candidate("a", 20.0, 10.0)]
+    assert hypervolume(alone) == pytest.approx(10 * 2)  # 10 dB above the corner, two decades before it
+    two = [*alone, candidate("b", 25.0, 100.0)]
+    assert hypervolume(two) == pytest.approx(10 * 2 + 5 * 1)
+    assert hypervolume([*two, candidate("dominated", 19.0, 50.0)]) == pytest.approx(25)
+    assert hypervolume([candidate("too slow", 30.0, 2000.0)]) == 0
+    low, high = hypervolume_interval(two, rng=np.random.default_rng(0), resamples=300)
+    assert low < 25 < high < low + 1
+
+
+def test_the_smallest_sufficient_is_the_cheapest_that_is_not_inferior() -> None:
+    found = smallest_sufficient(FIELD)
+    assert found is not None and (found.name, found.best) == ("near", "best")
+    assert 0.2 < found.loss_bound_db < 0.5
+    strict = smallest_sufficient(FIELD, margin=0.1)
+    assert strict is not None and strict.name == "best"
+    noisy = [FIELD[0], candidate("near", 29.8, 40.0, spread=1.0), FIELD[2]]
+    assert smallest_sufficient(noisy).name == "best", "what is not known not to be inferior does not suffice"
+    assert smallest_sufficient([Candidate(name="a", qualities=(20.0,), cost=1.0)]) is None

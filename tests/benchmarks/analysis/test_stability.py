@@ -1,0 +1,157 @@
+"""Stress axes, breakdown points and the margin against the template's error."""
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from helpers.cells import cell
+from helpers.fakes import write_capture
+
+from ash.capture.dataset import Split
+from ash.capture.formats import load_capture
+from ash.capture.manifest import verify_capture
+from ash.files import InputError
+from benchmarks.analysis import margin, stability
+from benchmarks.analysis.scores import scores_of
+from benchmarks.cell.cells import CellResult, failed_result
+from benchmarks.report import charts, sections
+from benchmarks.report.content import Chart, Table
+from benchmarks.suites import captures
+from benchmarks.suites.files import find_suite
+from benchmarks.suites.stress import AXES, Stress
+from benchmarks.suites.suites import CaptureSpec
+
+
+def severities_of(axis: str) -> list[float]:
+    """The steps that the suite `stability` takes along an axis."""
+    return [stress.severity for stress in find_suite("stability").stresses if stress.axis == axis]
+
+
+def course(levels: tuple[float, ...]) -> list[CellResult]:
+    """Three seeds of a method along the camera axis, a tenth of a decibel apart, and the trivial baseline at 10 dB."""
+    severities = (0.0, *severities_of("cameras"))
+    found = [cell("nearest", 10.0)]
+    for severity, level in zip(severities, levels, strict=True):
+        axis = "cameras" if severity else ""
+        found += [cell("ash", level + 0.1 * seed, seed=seed, axis=axis, severity=severity) for seed in range(3)]
+    return found
+
+
+def test_a_method_breaks_where_it_is_surely_below_half_way_to_the_trivial_baseline() -> None:
+    (ash,) = [c for c in stability.curves(scores_of(course((30.0, 26.0, 19.9, 12.0))))[0].courses if c.method == "ash"]
+    assert ash.midpoint == pytest.approx((30.1 + 10.0) / 2)
+    assert ash.breakdown == 75.0  # at 50 % the mean, 20.0, lies below the midpoint, 20.05, but not its interval
+    assert ash.loss == pytest.approx(18.0)
+    (firm,) = [c for c in stability.curves(scores_of(course((30.0, 26.0, 25.0, 24.0))))[0].courses if c.method == "ash"]
+    assert firm.breakdown is None
+
+
+def test_without_the_trivial_baseline_there_is_no_breakdown_point() -> None:
+    curve = stability.curves(scores_of(course((30.0, 26.0, 19.0, 12.0))[1:]))[0]
+    assert curve.trivial is None
+    assert curve.courses[0].midpoint is None and curve.courses[0].breakdown is None
+
+
+def test_a_failed_cell_is_the_worst_score_and_counts_in_the_rate() -> None:
+    results = course((30.0, 26.0, 25.0, 24.0))
+    last = next(i for i, r in enumerate(results) if r.config.severity == 75.0)
+    results[last] = failed_result(results[last].config, "diverged", "NaN")
+    (ash,) = [c for c in stability.curves(scores_of(results))[0].courses if c.method == "ash"]
+    assert ash.steps[-1].failures == 1
+    assert ash.steps[-1].quality.mean == pytest.approx((24.1 + 24.2) / 3)
+    row = next(r for r in stability.reliability(scores_of(results), "loose") if r.method == "ash")
+    assert (row.failures, row.cells, row.diverged) == (1, 12, 1)
+    assert row.rate[0] < 1 / 12 < row.rate[1]
+    assert row.spread_db == pytest.approx(0.1)
+
+
+def test_spoilt_captures_do_not_reach_the_tables() -> None:
+    assert set(scores_of(course((30.0, 26.0, 19.9, 12.0))).clean["axis"]) == {""}
+
+
+def test_the_margin_is_read_off_templates_of_known_error() -> None:
+    pairs = {"ash_truth": 30.0, "ddc_truth": 31.0, "ash_4mm": 27.0, "ddc_4mm": 26.0, "ash_16mm": 24.0, "ddc_16mm": 16.0}
+    results = [cell(method, psnr, seed=seed) for method, psnr in pairs.items() for seed in range(3)]
+    results += [cell("ash", 26.0), cell("ddc", 24.5)]
+    view = margin.margin_curves(scores_of(results))[0]
+    assert [(m.error_mm, m.mean) for m in view.known] == [(0.0, -1.0), (4.0, 1.0), (16.0, 8.0)]
+    assert view.crossing_mm == pytest.approx(2.0)
+    assert view.paper_db == 7.4
+    assert view.error_at(7.4) == pytest.approx(4 + 12 * 6.4 / 7)
+    assert view.honest is not None and (view.honest.error_mm, view.honest.mean) == (5.0, 1.5)
+    assert "the two are equal at 2.0 mm" in margin.sentence(view)
+    assert margin.margin_curves(scores_of(results[:6])) == ()
+
+
+def test_quality_on_templates_of_known_error_has_a_curve_per_method_and_shows_no_failed_one() -> None:
+    known = {"ash_truth": 30.0, "ddc_truth": 31.0, "oracle_texture": 29.0, "ash_4mm": 27.0, "ddc_4mm": 26.0}
+    results = [cell(method, psnr, seed=seed) for method, psnr in known.items() for seed in range(3)]
+    results += [failed_result(cell("texture_4mm", 20.0).config, "diverged", "NaN")]
+    scores = scores_of(results)
+    view = margin.margin_curves(scores)[0]
+    found = {level.method: [(mm, quality.mean) for mm, quality in level.qualities] for level in view.levels}
+    expected = {"ash_truth": [(0.0, 30.0), (4.0, 27.0)], "ddc_truth": [(0.0, 31.0), (4.0, 26.0)]}
+    assert found == {**expected, "oracle_texture": [(0.0, 29.0)]}
+    (section,) = sections.margins(scores)
+    levels = next(block.figure for block in section.blocks if isinstance(block, Chart))
+    assert levels.file == "chart_levels.svg"
+    assert "fixed mesh, best texture" in "".join(ElementTree.fromstring(levels.svg()).itertext())
+
+
+def test_charts_are_svg_with_a_mark_where_a_method_breaks() -> None:
+    (section,) = sections.stabilities(scores_of(course((30.0, 26.0, 12.0, 11.0))))
+    figures = [block.figure for block in section.blocks if isinstance(block, Chart)]
+    assert [figure.file for figure in figures] == ["chart_stability_loose_0.svg", "chart_stability_loose_1.svg"]
+    for figure in figures:
+        drawn = ElementTree.fromstring(figure.svg())
+        crosses = [path for path in drawn.iter("{http://www.w3.org/2000/svg}path") if path.get("stroke") == charts.INK]
+        assert drawn.tag.endswith("svg") and len(crosses) == 1
+    breakdowns = next(block for block in section.blocks if isinstance(block, Table))
+    assert breakdowns.rows[0].entries[0].text == "50 (19.0 dB lost at worst)"
+
+
+@pytest.mark.parametrize("stress", [("cameras", 0.0), ("weather", 1.0), ("frames", float("inf"))])
+def test_a_stress_without_meaning_is_refused(stress: tuple[str, float]) -> None:
+    with pytest.raises(InputError):
+        Stress(axis=stress[0], severity=stress[1])
+
+
+def test_every_axis_changes_what_a_method_learns_from_more_and_more(tmp_path: Path) -> None:
+    capture = load_capture(write_capture(tmp_path))
+    train = Split(cameras=tuple(f"cam{i}" for i in range(4)), frames=tuple(range(20)))
+    capture = replace(capture, splits={**capture.splits, "train": train})
+    for name, axis in AXES.items():
+        found = [axis.perturbation(capture, severity) for severity in severities_of(name)]
+        assert len({repr(p) for p in found}) == len(found) == 3, name
+        assert severities_of(name) == sorted(severities_of(name))
+
+
+def test_a_stressed_suite_has_its_clean_captures_first_and_one_per_stress() -> None:
+    suite = find_suite("stability")
+    steps = 3 * len(AXES)
+    assert [spec.stress for spec in suite.captures] == [None, *suite.stresses] and len(suite.stresses) == steps
+    assert len(list(suite.cells)) == suite.seeds * len(suite.methods) * (1 + steps)
+    assert len({spec.name for spec in suite.captures}) == 1 + steps
+
+
+def test_a_spoilt_capture_is_made_once_whole_and_again_after_an_accident(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clean = write_capture(tmp_path / "clean")
+    original = captures.make_capture
+
+    def make(spec: CaptureSpec, data: Path, *, workers: int) -> Path:
+        return clean if spec.stress is None else original(spec, data, workers=workers)
+
+    monkeypatch.setattr(captures, "make_capture", make)
+    spec = CaptureSpec(scene="boxes", size="ci", stress=Stress(axis="frames", severity=50.0))
+    folder = make(spec, tmp_path, workers=1)
+    whole, spoilt = load_capture(clean), load_capture(folder)
+    assert len(spoilt.splits["train"].frames) == round(len(whole.splits["train"].frames) / 2)
+    assert spoilt.identity != whole.identity and not verify_capture(folder)
+    stamp = (folder / "manifest.json").stat().st_mtime_ns
+    assert make(spec, tmp_path, workers=1) == folder
+    assert (folder / "manifest.json").stat().st_mtime_ns == stamp
+    (folder / "manifest.json").unlink()
+    assert load_capture(make(spec, tmp_path, workers=1)).identity == spoilt.identity

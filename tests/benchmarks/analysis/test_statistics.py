@@ -1,0 +1,117 @@
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from benchmarks.analysis.statistics import (
+    hierarchical_bootstrap,
+    holm,
+    kendall,
+    mean_interval,
+    noncentrality,
+    paired,
+    welch,
+    wilson,
+)
+
+
+@pytest.fixture
+def samples() -> tuple[list[float], list[float]]:
+    rng = np.random.default_rng(0)
+    return list(rng.normal(27.3, 0.2, 5)), list(rng.normal(27.0, 0.5, 4))
+
+
+def test_welch_agrees_with_scipy(samples) -> None:
+    expected = stats.ttest_ind(*samples, equal_var=False)
+    interval = expected.confidence_interval()
+    found = welch(*samples)
+    assert found.p == pytest.approx(expected.pvalue, rel=1e-10)
+    assert (found.low, found.high) == pytest.approx((interval.low, interval.high), rel=1e-10)
+    assert welch(*samples[::-1]).mean == -found.mean
+
+
+def test_paired_agrees_with_scipy(samples) -> None:
+    a, b = samples[0][:4], samples[1]
+    expected = stats.ttest_rel(a, b)
+    interval = expected.confidence_interval()
+    found = paired(a, b)
+    assert found.p == pytest.approx(expected.pvalue, rel=1e-10)
+    assert (found.low, found.high) == pytest.approx((interval.low, interval.high), rel=1e-10)
+
+
+def test_mean_interval_agrees_with_scipy(samples) -> None:
+    a = samples[0]
+    expected = stats.t.interval(0.95, len(a) - 1, loc=np.mean(a), scale=stats.sem(a))
+    found = mean_interval(a)
+    assert (found.low, found.high) == pytest.approx(expected, rel=1e-10)
+    assert mean_interval([3.0]).low is None
+
+
+def test_kendall_is_scipys_without_ties_and_counts_ties_as_neither() -> None:
+    a, b = [1.0, 4.0, 2.0, 3.0], [2.0, 3.0, 1.0, 4.0]
+    assert kendall(a, b) == pytest.approx(stats.kendalltau(a, b).statistic)
+    assert kendall([1.0, 1.0, 2.0], [1.0, 2.0, 3.0]) == pytest.approx(2 / 3)
+
+
+def test_holms_correction_by_hand() -> None:
+    p = [0.01, 0.04, 0.03, 0.005, 0.8]
+    assert holm(p) == pytest.approx([0.04, 0.09, 0.09, 0.025, 0.8])
+
+
+def test_wilson_agrees_with_scipy() -> None:
+    for failures, trials in ((0, 5), (3, 7), (10, 10)):
+        expected = stats.binomtest(failures, trials).proportion_ci(method="wilson")
+        assert wilson(failures, trials) == pytest.approx((expected.low, expected.high), abs=1e-6)
+
+
+def test_false_alarms_and_power_on_our_design() -> None:
+    """Images on three seeds each: the test on seed means keeps its level, and finds what it says it can find."""
+    rng = np.random.default_rng(1)
+    alarms = found = 0
+    rounds, seed_db, image_db = 2000, 0.15, 0.3
+    for _ in range(rounds):
+        a, b = (rng.normal(0, seed_db, (3, 1)) + rng.normal(0, image_db, (3, 40)) for _ in range(2))
+        test = welch(list(a.mean(1)), list(b.mean(1)))
+        alarms += test.p < 0.05
+    assert alarms / rounds == pytest.approx(0.05, abs=0.02)
+    sigma = np.hypot(seed_db, image_db / np.sqrt(40))
+    effect = noncentrality(4.0, float(stats.t.ppf(0.975, 4))) * sigma * np.sqrt(2 / 3)
+    assert effect == pytest.approx(power_of_80_percent(4) * sigma * np.sqrt(2 / 3), rel=1e-6)
+    for _ in range(rounds):
+        test = welch(list(rng.normal(effect, sigma, 3)), list(rng.normal(0, sigma, 3)))
+        found += test.p < 0.05
+    assert 0.65 < found / rounds < 0.88
+
+
+def power_of_80_percent(freedom: int) -> float:
+    critical = stats.t.ppf(0.975, freedom)
+    return float(optimize.brentq(lambda d: stats.nct.sf(critical, freedom, d) - 0.8, 0.1, 20))
+
+
+def test_a_test_over_images_alone_would_cry_wolf() -> None:
+    rng = np.random.default_rng(2)
+    alarms = 0
+    for _ in range(500):
+        a, b = (rng.normal(0, 0.15) + rng.normal(0, 0.3, 40) for _ in range(2))
+        alarms += welch(list(a), list(b)).p < 0.05
+    assert alarms / 500 > 0.2
+
+
+def test_hierarchical_bootstrap_covers_and_is_wider_than_images_alone() -> None:
+    rng = np.random.default_rng(3)
+    covered = 0
+    for _ in range(150):
+        a, b = (rng.normal(0, 0.15, (5, 1)) + rng.normal(0, 0.3, (5, 40)) for _ in range(2))
+        low, high = hierarchical_bootstrap(a, b, rng=rng, resamples=200)
+        covered += low <= 0 <= high
+    assert 0.84 < covered / 150 <= 1
+    a = np.tile([[1.0], [2.0], [3.0]], 4)
+    assert hierarchical_bootstrap(a, np.zeros((3, 4)), rng=np.random.default_rng(0)) == (1.0, 3.0)
+
+
+def test_no_spread_and_too_few() -> None:
+    assert welch([1.0, 1.0], [1.0, 1.0]).p == 1
+    assert welch([2.0, 2.0], [1.0, 1.0]).p == 0
+    assert paired([2.0, 3.0], [1.0, 2.0]).low == 1
+    for wrong in (lambda: welch([1.0], [1.0, 2.0]), lambda: paired([1.0, 2.0], [1.0, 2.0, 3.0]), lambda: wilson(3, 2)):
+        with pytest.raises(ValueError, match="expected"):
+            wrong()

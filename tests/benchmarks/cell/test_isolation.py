@@ -1,0 +1,142 @@
+"""Nothing that a method does reaches truth, scores, times or other cells; however it ends, its cell has a result."""
+
+import io
+import json
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from helpers import fakes, thieves
+
+from ash.files import InputError, sha256_of
+from benchmarks.cell import host
+from benchmarks.cell.cells import Cell, failed_result, read_result, result_of, write_result
+from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells
+from benchmarks.suites.progress import Progress
+from benchmarks.suites.runs import cell_for
+from benchmarks.suites.suites import CaptureSpec, CellSpec
+
+LIMITS = Limits(seconds=300.0, memory_mb=4096)
+METHODS = ("thief", "clock", *thieves.HOW)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fakes.write_capture(tmp_path_factory.mktemp("capture") / "boxes")
+
+
+@pytest.fixture(autouse=True)
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fakes.use(tmp_path / "plugins", monkeypatch)
+    info = tmp_path / "plugins" / "ash_bench_thieves-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: ash-bench-thieves\nVersion: 1.0\n")
+    lines = ["[ash_bench.methods]", *(f"{name} = helpers.thieves:{name}" for name in METHODS)]
+    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+
+
+def cell(method: str, capture: Path, out: Path) -> Cell:
+    spec = CaptureSpec(scene="boxes", size="ci")
+    return cell_for(CellSpec(capture=spec, method=method, preset="ci", seed=0), capture, out)
+
+
+def run(cells: list[Cell]) -> None:
+    plan = plan_cells(cells)
+    with make_executor("local", workers=2) as executor:
+        run_cells(plan, executor, LIMITS, Progress("", len(cells), expected_s=1.0, workers=2, stream=io.StringIO()))
+
+
+def _left_behind() -> list[psutil.Process]:
+    return [p for p in psutil.process_iter(["cmdline"]) if "left-behind-by-a-method" in (p.info["cmdline"] or ())]
+
+
+def test_a_thief_finds_nothing_and_scores_what_it_draws(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    honest = cell("fake_good", capture, tmp_path)
+    run([honest])
+    truth, other = capture / "frames" / "cam4" / "000000.png", honest.folder / "result.json"
+    before = {path: sha256_of(path) for path in (truth, other)}
+    monkeypatch.setenv("ASH_BENCH_TEST_TRUTH", str(truth))
+    monkeypatch.setenv("ASH_BENCH_TEST_OTHER", str(other))
+    cheat = cell("thief", capture, tmp_path)
+    run([cheat])
+    result, expected = read_result(cheat.folder), read_result(honest.folder)
+    assert result is not None and expected is not None and result.status == "done", result.reason
+    if not result.isolated:
+        pytest.skip("this kernel gives no namespaces: only what Python opens is watched")
+    loot = json.loads((cheat.folder / host.WORK / "loot.json").read_text())
+    assert len(loot["fit"]) == len(loot["import"]) == 9
+    assert not [name for attempts in loot.values() for name, found in attempts.items() if found not in ("", "''")]
+    assert {path: sha256_of(path) for path in before} == before
+    assert [view.scores for view in result.views] == [view.scores for view in expected.views]
+
+
+def test_a_clock_that_contradicts_ours_is_told(capture: Path, tmp_path: Path) -> None:
+    cheat = cell("clock", capture, tmp_path)
+    run([cheat])
+    result = read_result(cheat.folder)
+    assert result is not None and result.status == "crashed" and "its clock says" in result.reason
+
+
+@pytest.mark.parametrize(
+    ("how", "status", "reason"),
+    [
+        ("exit_2", "crashed", "exit code 2"), ("exit_0", "crashed", "exit code 0"),
+        ("os_error", "crashed", "No space left"), ("input_error", "crashed", "own refusal"),
+        ("keyboard", "crashed", "KeyboardInterrupt"), ("exit_130", "crashed", "SystemExit"),
+        ("killed", "crashed", "killed from outside in each of 2"), ("bytes", "crashed", "expected an image float32"),
+        ("units", "crashed", "expected 0 to 1"), ("negative", "crashed", "expected a whole number"),
+    ],
+)  # fmt: skip
+def test_however_a_method_ends_its_cell_has_a_result(
+    how: str, status: str, reason: str, capture: Path, tmp_path: Path
+) -> None:
+    bad = cell(how, capture, tmp_path)
+    run([bad])
+    result = result_of(bad)
+    assert result is not None and result.status == status and reason in result.reason, result.reason
+
+
+def test_printing_is_bounded_and_processes_end_with_their_cell(capture: Path, tmp_path: Path) -> None:
+    loud, leaves = cell("loud", capture, tmp_path), cell("leaves", capture, tmp_path)
+    run([loud, leaves])
+    log = loud.folder / "output.log"
+    assert log.stat().st_size < 2 << 20 and "last words" in log.read_text() and "bytes left out" in log.read_text()
+    deadline = time.monotonic() + 10
+    while left := [
+        p for p in psutil.process_iter(["cmdline"]) if "left-behind-by-a-method" in (p.info["cmdline"] or [])
+    ]:
+        assert time.monotonic() < deadline, left
+        time.sleep(0.1)
+    for each in (loud, leaves):
+        result = read_result(each.folder)
+        assert result is not None and result.status == "done"
+
+
+def test_without_namespaces_the_row_says_so(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(host.ISOLATION, "off")
+    plain = cell("fake_good", capture, tmp_path)
+    run([plain])
+    result = read_result(plain.folder)
+    assert result is not None and result.status == "done" and result.isolated is False
+
+
+def test_results_belong_to_their_cell(capture: Path, tmp_path: Path) -> None:
+    one, other = cell("fake_good", capture, tmp_path), cell("fake_bad", capture, tmp_path)
+    run([one, other])
+    (other.folder / "result.json").write_bytes((one.folder / "result.json").read_bytes())
+    with pytest.raises(InputError, match=r"expected the result of boxes · fake_bad"):
+        plan_cells([one, other])
+
+
+def test_names_in_results_are_no_paths(capture: Path, tmp_path: Path) -> None:
+    target = cell("fake_good", capture, tmp_path)
+    write_result(target.folder, failed_result(target.config, "crashed", "as an example"))
+    path = target.folder / "result.json"
+    content = json.loads(path.read_text())
+    for name in ("x/../../../ESC", "..", "/etc", "a\nb", "", "a" * 1000):
+        path.write_text(json.dumps(content | {"config": content["config"] | {"scene": name}}))
+        with pytest.raises(InputError, match="plain name for the scene"):
+            read_result(target.folder)

@@ -1,0 +1,88 @@
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from ash.files import InputError
+from benchmarks.cell import lpips, weights
+
+
+def alexnet() -> nn.Sequential:
+    """AlexNet's convolutions as torchvision numbers them."""
+    layers = [nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2), nn.Conv2d(64, 192, 5, padding=2), nn.ReLU()]
+    layers += [nn.MaxPool2d(3, 2), nn.Conv2d(192, 384, 3, padding=1), nn.ReLU(), nn.Conv2d(384, 256, 3, padding=1)]
+    return nn.Sequential(*layers, nn.ReLU(), nn.Conv2d(256, 256, 3, padding=1), nn.ReLU(), nn.MaxPool2d(3, 2))
+
+
+@pytest.fixture(scope="module")
+def backbone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Random weights in the form of torchvision's file, its classifier included."""
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / weights.HUB_FILE
+    tensors = {f"features.{name}": tensor for name, tensor in alexnet().state_dict().items()}
+    torch.save({**tensors, "classifier.1.bias": torch.zeros(4096)}, path)
+    return path
+
+
+@pytest.fixture
+def pair() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    truth = rng.integers(0, 256, (96, 80, 3)).astype(np.uint8)
+    return np.clip(truth + rng.normal(0, 25, truth.shape), 0, 255).astype(np.uint8), truth
+
+
+def test_it_is_a_distance(backbone: Path, pair) -> None:
+    distance = lpips.Lpips(backbone)
+    assert distance(pair[1], pair[1]) == 0
+    assert distance(*pair) == pytest.approx(distance(*pair[::-1]), rel=1e-6)
+    halfway = ((pair[0].astype(int) + pair[1]) // 2).astype(np.uint8)
+    assert 0 < distance(halfway, pair[1]) < distance(*pair)
+
+
+def test_it_agrees_with_the_package(backbone: Path, pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lpips package itself, with a stand-in for torchvision that knows AlexNet's layers and nothing else."""
+    net = alexnet()
+    net.load_state_dict({n[9:]: t for n, t in torch.load(backbone).items() if n.startswith("features.")})
+    torchvision, models = ModuleType("torchvision"), ModuleType("torchvision.models")
+    models.alexnet = lambda **_: SimpleNamespace(features=net)
+    torchvision.models = models
+    monkeypatch.setitem(sys.modules, "torchvision", torchvision)
+    monkeypatch.setitem(sys.modules, "torchvision.models", models)
+    if "tqdm" not in sys.modules:
+        tqdm = ModuleType("tqdm")
+        tqdm.tqdm = iter
+        monkeypatch.setitem(sys.modules, "tqdm", tqdm)
+    package = pytest.importorskip("lpips")
+    reference = package.LPIPS(net="alex", pnet_rand=True, verbose=False).eval()
+    images = [torch.from_numpy(image.astype(np.float32) / 127.5 - 1).permute(2, 0, 1)[None] for image in pair]
+    with torch.no_grad():
+        expected = 1000 * float(reference(*images))
+    assert lpips.Lpips(backbone)(*pair) == pytest.approx(expected, rel=1e-4)
+
+
+def test_without_weights_there_is_none(tmp_path: Path, backbone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(weights.ENVIRONMENT, raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    assert weights.weights_file() is None
+    monkeypatch.setenv(weights.ENVIRONMENT, str(backbone))
+    assert weights.weights_file() == backbone
+    monkeypatch.setenv(weights.ENVIRONMENT, str(tmp_path / "none"))
+    with pytest.raises(InputError, match="expected AlexNet's weights"):
+        weights.weights_file()
+
+
+def test_files_that_are_no_alexnet(tmp_path: Path) -> None:
+    path = tmp_path / "x.pth"
+    path.write_bytes(b"not a file of tensors")
+    with pytest.raises(InputError, match="expected a file of tensors"):
+        lpips.Lpips(path)
+    torch.save({"features.0.weight": torch.zeros(3)}, path)
+    with pytest.raises(InputError, match="expected torchvision's AlexNet weights"):
+        lpips.Lpips(path)
+    torch.save([1, 2], path)
+    with pytest.raises(InputError, match="expected a dictionary"):
+        lpips.Lpips(path)

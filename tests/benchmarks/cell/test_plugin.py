@@ -1,0 +1,77 @@
+"""A stranger's method: the example package is installed as a user would, and judged like ours."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from helpers import fakes
+
+from benchmarks.cell.cells import read_result
+
+PACKAGE = Path(__file__).parents[2] / "helpers" / "plugin"
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return fakes.write_capture(tmp_path_factory.mktemp("boxes") / "capture")
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory) -> dict[str, str]:
+    """The example package, installed offline into a folder on the path."""
+    pytest.importorskip("setuptools", reason="building the example package needs setuptools")
+    folder = tmp_path_factory.mktemp("plugin")
+    source, target = folder / "source", folder / "site"
+    source.mkdir()
+    for path in PACKAGE.glob("p*.*"):
+        (source / path.name).write_bytes(path.read_bytes())
+    options = [
+        "--no-index",
+        "--no-deps",
+        "--no-build-isolation",
+        "--disable-pip-version-check",
+        "--target",
+        str(target),
+    ]
+    command = [sys.executable, "-m", "pip", "install", *options, str(source)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    paths = [str(target), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
+
+
+def ash_bench(*arguments: str, environment: dict[str, str], folder: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "benchmarks.cli", *arguments]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_the_example_is_short_enough_to_be_an_example() -> None:
+    lines = (PACKAGE / "painted_mesh.py").read_text().splitlines()
+    method = lines[lines.index("class PaintedMesh:") :]
+    assert len([line for line in method if line.strip()]) <= 50
+
+
+def test_the_example_keeps_all_rules(capture: Path, environment: dict[str, str], tmp_path: Path) -> None:
+    done = ash_bench("check-method", "painted", "--capture", str(capture), environment=environment, folder=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "all rules kept" in done.stdout
+
+
+def test_the_example_is_trained_and_scored_like_ours(
+    capture: Path, environment: dict[str, str], tmp_path: Path
+) -> None:
+    train = ["train", "painted", str(capture), "--preset", "ci", "--out", "runs"]
+    done = ash_bench(*train, environment=environment, folder=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (cell,) = (tmp_path / "runs" / "cells").iterdir()
+    result = read_result(cell)
+    assert result is not None and result.status == "done"
+    for split in ("novel_view", "novel_pose"):
+        assert result.value(split, "full", "iou") > 0.9
+        assert result.value(split, "foreground", "psnr") > 9
+    assert result.value("memory", "", "params") == 3 * 72
+    again = ash_bench("eval", str(cell), environment=environment, folder=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert [view.prediction for view in read_result(cell).views] == [view.prediction for view in result.views]

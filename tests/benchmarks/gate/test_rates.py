@@ -1,0 +1,98 @@
+"""The gate's own rates: planted defects do what they say, and the verdicts on them are counted right."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import fakes
+from helpers.captures import tiny_preset, write_tube_capture
+
+from ash.capture.dataset import Capture, Pose
+from ash.files import InputError, read_json
+from ash.protocol import Avatar, StageClock
+from benchmarks.cell.methods import code_version, find_method
+from benchmarks.gate import defects, rates
+
+
+@pytest.fixture(scope="module")
+def tube(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return write_tube_capture(tmp_path_factory.mktemp("tube"))
+
+
+def in_a_process_of_its_own(work: Callable[[], object]) -> int:
+    """Exit code of `work`, whose changes to modules die with it."""
+    child = os.fork()
+    if child == 0:
+        code = 1
+        try:
+            work()
+            code = 0
+        finally:
+            os._exit(code)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def trained_image(
+    factory: Callable[..., Avatar], capture: Capture, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> np.ndarray:
+    """What a method draws after a few steps of training on a tiny model."""
+    monkeypatch.setattr(defects, "named", lambda _: tiny_preset(steps=6, warmup_steps=2))
+    avatar = factory(capture.training_only(), seed=0, preset="ci")
+    avatar.fit(capture.training_only(), folder=folder)
+    camera = next(iter(capture.cameras.values()))
+    return avatar.render(Pose(capture.motion, 2), camera, clock=StageClock())
+
+
+def none(capture: Capture, *, seed: int, preset: str) -> Avatar:
+    return defects._ash(capture, seed, preset)
+
+
+@pytest.mark.parametrize("defect", defects.DEFECTS, ids=lambda defect: defect.__name__)
+def test_a_defect_changes_what_is_drawn_or_what_it_costs(
+    defect: Callable[..., Avatar], tube: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sound = defects.sound_sh if defect is defects.sh_frame else none
+    before = trained_image(sound, tube, tmp_path / "sound", monkeypatch)
+
+    def draw() -> None:
+        np.save(tmp_path / "defect.npy", trained_image(defect, tube, tmp_path / "defect", monkeypatch))
+
+    assert in_a_process_of_its_own(draw) == 0
+    after = np.load(tmp_path / "defect.npy")
+    assert np.isfinite(after).all()
+    assert np.array_equal(before, after) == (defect in (defects.slow_splatter, defects.more_memory))
+
+
+def test_unchanged_code_and_defects_are_judged_and_written_down(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture = fakes.write_capture(tmp_path / "capture")
+    fakes.use(tmp_path / "plugins", monkeypatch)
+    monkeypatch.setattr(rates, "make_capture", lambda *_, **__: capture)
+    monkeypatch.setattr(rates, "SOUND", "fake_good")
+    monkeypatch.setattr(rates, "SOUND_FOR", {})
+    monkeypatch.setattr(rates, "DEFECTS", (fake_bad,))
+    monkeypatch.setattr(rates, "_target", lambda name: name)
+    found = rates.measure(tmp_path / "out", tmp_path, reruns=2, workers=2)
+    assert [trial.name for trial in found.unchanged] == ["seeds 3 to 5", "seeds 6 to 8"]
+    (defect,) = found.defects
+    assert defect.alarm and any("psnr" in check.what for check in defect.flagged)
+    text = (tmp_path / "out" / "rates.md").read_text()
+    assert "Planted defects caught: 1 of 1" in text and "of 2 (95 % interval" in text
+    assert len(read_json(tmp_path / "out" / "rates.json")["defects"]) == 1
+
+
+def fake_bad() -> None:
+    """A worse method under a better one's name."""
+
+
+def test_a_method_may_be_named_by_its_path_and_is_known_by_its_source() -> None:
+    method = find_method("benchmarks.gate.gate.defects:holes")
+    assert method.load() is defects.holes
+    assert not method.is_ours
+    assert code_version("benchmarks.gate.gate.defects:holes") != code_version("ash")
+    for wrong in ("benchmarks.nothing:holes", "nothing.at.all:f"):
+        with pytest.raises(InputError, match="unknown method"):
+            find_method(wrong)

@@ -1,0 +1,242 @@
+"""Each door of the player's server: what comes in, and that nothing else does."""
+
+import contextlib
+import http.client
+import math
+import socket
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import viser
+import viser._messages as messages
+from helpers.viewers import FakeBrowser, address_of, browsers, cookie_of, enter, get, message
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from ash.files import InputError
+from benchmarks import cli
+from benchmarks.play.doors import HEARD, DoorOptions, close_server, open_server, require_safe
+
+
+@pytest.fixture(scope="module")
+def url():
+    """A server with nothing in it."""
+    server, url, _ = open_server(DoorOptions(clients=3, allow_origins=("http://my.host:9000",)), label="doors")
+    yield url
+    close_server(server)
+
+
+@pytest.fixture()
+def served():
+    """A server of one's own, and its address."""
+    server, url, doors = open_server(DoorOptions(clients=3), label="doors")
+    yield server, url, doors
+    close_server(server)
+
+
+def test_it_listens_on_the_loopback_address_alone(url: str) -> None:
+    host, _, port = address_of(url).partition(":")
+    assert host == "127.0.0.1"
+    others = {info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)} - {"127.0.0.1"}
+    for other in others:
+        with pytest.raises(OSError):
+            socket.create_connection((other, int(port)), timeout=2)
+
+
+def test_the_printed_address_opens_the_page_and_the_token_leaves_the_address_bar(url: str) -> None:
+    address = address_of(url)
+    status, headers, _ = get(url, url.partition(address)[2], Host=address)
+    assert status == 303 and headers["Location"] == "/" and "token" not in headers["Location"]
+    assert "HttpOnly" in headers["Set-Cookie"] and "SameSite=Lax" in headers["Set-Cookie"]
+    status, headers, content = get(url, "/", Host=address, Cookie=cookie_of(url))
+    assert status == 200 and b"<html" in content[:500].lower()
+    assert "frame-ancestors 'none'" in headers["Content-Security-Policy"] and headers["Cache-Control"] == "no-store"
+
+
+@pytest.mark.parametrize("path", ["/", "/?token=", "/?token=wrong", "/?token=%00", "/index.html"])
+def test_a_wrong_token_is_refused(url: str, path: str) -> None:
+    for cookie in ("", "ash_bench=1", cookie_of(url)[:-1], cookie_of(url).partition("=")[0] + "=x"):
+        status, _, content = get(url, path, Host=address_of(url), **({"Cookie": cookie} if cookie else {}))
+        assert status == 403 and b"wrong token" in content
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1", "localhost:1", "evil.example:{port}", "[::1]", ""])
+def test_a_wrong_host_is_refused_whatever_the_token(url: str, host: str) -> None:
+    host = host.format(port=address_of(url).rpartition(":")[2])
+    status, _, content = get(url, "/", Host=host, Cookie=cookie_of(url))
+    assert status == 403 and b"wrong Host" in content
+
+
+def test_two_hosts_are_no_host(url: str) -> None:
+    address = address_of(url)
+    connection = http.client.HTTPConnection(address, timeout=10)
+    connection.putrequest("GET", "/", skip_host=True)
+    for host in (address, "evil.example"):
+        connection.putheader("Host", host)
+    connection.putheader("Cookie", cookie_of(url))
+    connection.endheaders()
+    answer = connection.getresponse()
+    assert answer.status in (400, 403)
+    answer.close()
+    connection.close()
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "null", "https://{address}", "http://{address}.evil.example"]
+)
+def test_a_wrong_origin_is_refused(url: str, origin: str) -> None:
+    with pytest.raises(InvalidStatus) as refused:
+        enter(url, origin=origin.format(address=address_of(url)))
+    assert refused.value.response.status_code == 403 and b"wrong Origin" in refused.value.response.body
+
+
+def test_a_websocket_without_origin_or_token_is_refused(url: str) -> None:
+    with pytest.raises(InvalidStatus) as refused:
+        connect(f"ws://{address_of(url)}", additional_headers={"Cookie": cookie_of(url)}, compression=None)
+    assert refused.value.response.status_code == 403
+    with pytest.raises(InvalidStatus) as refused:
+        enter(url, cookie="nothing=1")
+    assert refused.value.response.status_code == 403 and b"wrong token" in refused.value.response.body
+
+
+def test_an_allowed_origin_of_a_forwarded_port_comes_in(url: str) -> None:
+    status, _, _ = get(url, "/", Host="my.host:9000", Cookie=cookie_of(url))
+    assert status == 200
+    enter(url, origin="http://my.host:9000").close()
+
+
+@pytest.mark.parametrize(
+    "path", ["/index.html", "/etc/passwd", "/../../x", "/%2e%2e/%2e%2e/etc/passwd", "/assets/", "//"]
+)
+def test_there_is_one_page_and_no_path(url: str, path: str) -> None:
+    status, _, content = get(url, path, Host=address_of(url), Cookie=cookie_of(url))
+    assert status == 404 and content == b"there is one page: /"
+
+
+def test_a_share_request_is_not_heard(served, monkeypatch: pytest.MonkeyPatch) -> None:
+    server, url, _ = served
+    asked: list[str] = []
+    monkeypatch.setattr(server, "request_share_url", lambda *_, **__: asked.append("share"))
+    monkeypatch.setattr(server, "disconnect_share_url", lambda *_, **__: asked.append("end"))
+    for kind in (messages.ShareUrlRequest, messages.ShareUrlDisconnect):
+        assert kind not in server._websock_server._incoming_handlers, "and no handler is left to hear it"
+    with browsers(url, 1) as (browser,):
+        for _ in range(3):  # Replayed, too.
+            browser.send("ShareUrlRequest")
+            browser.send("ShareUrlDisconnect")
+        _settle(server, browser)
+    assert asked == [] and server._share_tunnel is None
+
+
+def test_files_are_not_taken(served) -> None:
+    server, url, _ = served
+    button = server.gui.add_upload_button("upload")  # Even if somebody put one there.
+    with browsers(url, 1) as (browser,):
+        browser.send(
+            "FileTransferStartUpload", source_component_uuid=button._impl.uuid, transfer_uuid="a", filename="x",
+            mime_type="text/plain", part_count=1, size_bytes=1,
+        )  # fmt: skip
+        browser.send(
+            "FileTransferPart", source_component_uuid=button._impl.uuid, transfer_uuid="a", part_index=0, content=b"x"
+        )
+        _settle(server, browser)
+    assert button.value.content == b"" and server.gui._current_file_upload_states == {}
+
+
+def test_four_kinds_of_messages_are_heard_and_all_others_dropped(served) -> None:
+    server, url, _ = served
+    heard: list[str] = []
+    kinds = [kind for kind in messages.Message.get_subclasses() if kind not in HEARD]
+    assert len(kinds) > 80 and len(HEARD) == 4
+    for kind in (messages.LocalStorageGetItemResponseMessage, messages.GetRenderResponseMessage):
+        server._websock_server.register_handler(kind, lambda _, m: heard.append(type(m).__name__))
+    with browsers(url, 1) as (browser,):
+        browser.send("LocalStorageGetItemResponseMessage", value="x", error=None, request_uuid="x")
+        browser.send("GetRenderResponseMessage", payload=b"x", render_uuid="x")
+        _settle(server, browser)
+    assert heard == []
+
+
+def test_large_and_broken_messages_end_their_connection_and_nothing_else(served) -> None:
+    server, url, doors = served
+    with browsers(url, 1) as (kept,):
+        for bad in (b"\xff" * 100, b"", message("NoSuchMessage"), message("ViewerCameraMessage"), b"\x90" * 70_000):
+            with enter(url) as other:
+                other.send(bad)
+                with pytest.raises(ConnectionClosed):
+                    for _ in range(200):
+                        other.recv(timeout=10)
+        _until(lambda: doors.inside == 1)
+        _settle(server, kept)
+
+
+def test_so_many_viewers_and_no_more(served) -> None:
+    _, url, doors = served
+    with browsers(url, 3):
+        _until(lambda: doors.inside == 3)
+        with pytest.raises(InvalidStatus) as refused:
+            enter(url)
+        assert refused.value.response.status_code == 503
+    _until(lambda: doors.inside == 0)
+    enter(url).close()
+
+
+def test_a_rush_lets_no_more_in_than_there_are_places(served) -> None:
+    _, url, doors = served
+    cookie, inside, most = cookie_of(url), [], []
+
+    def rush() -> None:
+        with contextlib.suppress(InvalidStatus, ConnectionClosed, TimeoutError, EOFError):
+            inside.append(enter(url, cookie=cookie))
+        most.append(doors.inside)
+
+    threads = [threading.Thread(target=rush) for _ in range(16)]
+    [thread.start() for thread in threads]
+    [thread.join() for thread in threads]
+    assert max(most) == 3 and doors.inside <= 3
+    for each in inside:
+        each.close()
+
+
+def test_other_machines_are_let_in_only_when_that_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for host in ("0.0.0.0", "::", "192.168.1.5", "my.host"):
+        with pytest.raises(InputError, match="--expose"):
+            require_safe(DoorOptions(host=host))
+        require_safe(DoorOptions(host=host, expose=True))
+    for host in ("127.0.0.1", "localhost", "::1", "127.0.0.2"):
+        require_safe(DoorOptions(host=host))
+    assert cli.main(["play", str(tmp_path), "--host", "0.0.0.0"]) == cli.WRONG_INPUT
+    assert "nothing is encrypted" in capsys.readouterr().err
+    for origin in ("localhost:9000", "http://", "ftp://x:1", "http://x:1/", "http://x:1/path"):
+        with pytest.raises(InputError, match="http://HOST:PORT"):
+            require_safe(DoorOptions(allow_origins=(origin,)))
+
+
+def test_a_taken_port_is_refused_and_not_replaced(url: str) -> None:
+    port = int(address_of(url).rpartition(":")[2])
+    with pytest.raises(InputError, match=f"port: {port}"):
+        open_server(DoorOptions(port=port), label="doors")
+
+
+def test_tokens_are_long_and_differ(url: str, served) -> None:
+    _, other, doors = served
+    assert url.partition("token=")[2] != other.partition("token=")[2] and len(doors.token) >= 32
+
+
+def _settle(server: viser.ViserServer, browser: FakeBrowser) -> None:
+    """Until everything that was sent before has been heard: messages of one connection are handled in order."""
+    _until(lambda: len(server.get_clients()) == 1)
+    (client,) = server.get_clients().values()
+    angle = browser.angle + 0.5
+    browser.look(angle)
+    browser.angle = angle
+    _until(lambda: abs(float(client.camera.position[0]) - 2.5 * math.sin(angle)) < 1e-6)
+
+
+def _until(what, seconds: float = 10.0) -> None:
+    end = time.perf_counter() + seconds
+    while not what():
+        assert time.perf_counter() < end
+        time.sleep(0.01)

@@ -1,0 +1,105 @@
+"""`share`: the page in a real browser, from a file, beside our own picture."""
+
+import base64
+import io
+import json
+import re
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.chromium import chromium
+from PIL import Image
+
+from ash.capture.dataset import Pose
+from ash.inference import psnr
+from ash.protocol import StageClock
+from benchmarks import cli
+from benchmarks.play.actors import open_cast
+from benchmarks.play.share import COLUMNS
+
+pytestmark = pytest.mark.slow  # Trains, and drives a browser: a minute and more.
+
+PAPER = (236, 236, 236)
+PATIENCE = 120_000  # milliseconds: software graphics on a busy machine
+
+
+@pytest.fixture(scope="module")
+def page(tube_cells: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("shared") / "avatar.html"
+    assert cli.main(["share", str(tube_cells["ash"]), "--motion", "train", "--out", str(out)]) == cli.DONE
+    return out
+
+
+def test_the_page_draws_in_a_browser_what_we_draw(page: Path, tube_cells: dict[str, Path]) -> None:
+    problems: list[str] = []
+    asked: list[str] = []
+    with chromium() as browser, open_cast(tube_cells["ash"]) as cast:
+        tab = browser.new_page(viewport={"width": 200, "height": 200})
+        tab.on("pageerror", lambda error: problems.append(str(error)))
+        tab.on("request", lambda request: asked.append(request.url))
+        tab.goto(page.as_uri())
+        tab.wait_for_function("window.avatar", timeout=PATIENCE)
+        tab.keyboard.press(" ")
+        assert not tab.evaluate("window.avatar.playing")
+        actor, capture = cast.actor(cast.titles[0]), cast.capture
+        for frame, name in ((0, "cam1"), (3, "cam3")):
+            camera = capture.cameras[name]
+            matrix = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1, -1, 1])
+            fov = float(np.rad2deg(2 * np.arctan2(camera.height / 2, camera.K[1, 1])))
+            look = [frame, matrix.T.ravel().tolist(), fov, camera.width, camera.height]
+            tab.evaluate("([f, m, v, w, h]) => window.avatar.look(f, m, v, w, h)", look)
+            tab.wait_for_function("window.avatar.resting", timeout=PATIENCE)
+            encoded = tab.evaluate("window.avatar.picture()").partition(",")[2]
+            theirs = np.asarray(Image.open(io.BytesIO(base64.b64decode(encoded))).convert("RGB")) / 255
+            ours = actor.view(Pose(capture.motion, frame), camera, StageClock(), PAPER) / 255
+            alpha = actor.picture(Pose(capture.motion, frame), camera, StageClock())[..., 3]
+            assert theirs.shape == ours.shape and (alpha > 0.5).mean() > 0.05
+            assert psnr(theirs, ours, alpha) > 25 and psnr(theirs, ours, np.ones_like(alpha)) > 25
+        tab.keyboard.press("ArrowRight")
+        assert tab.evaluate("window.avatar.shown") == 0, "after the last frame comes the first"
+    assert problems == []
+    assert [url for url in asked if not url.startswith(("file:", "blob:", "data:"))] == [], "it needs no network"
+
+
+def test_the_page_holds_every_frame_to_its_bytes(page: Path, tube_cells: dict[str, Path]) -> None:
+    text = page.read_text()
+    clip = json.loads(re.search(r'id="clip">(.*?)</script>', text)[1])
+    packed = zlib.decompress(base64.b64decode(re.search(r'id="frames">(.*?)</script>', text)[1]))
+    size = clip["count"] * COLUMNS
+    steps = np.frombuffer(packed, dtype=np.uint8).reshape(clip["frames"], size)
+    bytes_of = np.cumsum(steps, axis=0, dtype=np.uint64).astype(np.uint8).reshape(clip["frames"], COLUMNS, -1)
+    high, low = np.array(clip["high"])[:, None], np.array(clip["low"])[:, None]
+    with open_cast(tube_cells["ash"]) as cast:
+        actor, capture = cast.actor(cast.titles[0]), cast.capture
+        for frame, columns in enumerate(bytes_of):
+            wanted = actor.gaussians(Pose(capture.motion, frame), StageClock())
+            place = low + (high - low) * (256.0 * columns[:3] + columns[3:6]) / 65535
+            np.testing.assert_allclose(place.T, wanted.means, atol=1e-4)
+            turns = columns[9:13].astype(np.int8).T / 127
+            unit = torch.nn.functional.normalize(wanted.quats, dim=-1).numpy()
+            assert np.abs((turns * unit).sum(1)).min() > 0.985
+            np.testing.assert_allclose(columns[16] / 255, wanted.opacities, atol=0.51 / 255)
+
+
+def test_the_page_names_its_libraries_licences_and_loads_nothing(page: Path) -> None:
+    text = page.read_text()
+    assert text.count("MIT License") + text.count("The MIT License") >= 2 and "three.js" in text
+    assert "@@" not in text.partition('<script type="text/plain"')[0]
+    assert not re.search(r'(src|href)="(?!#)', text)
+    assert "default-src 'none'" in text
+
+
+def test_what_cannot_be_shared_is_refused(tube_run: Path, tube_cells, tmp_path: Path, capsys) -> None:
+    for arguments, words in (
+        ([str(tube_cells["ash"]), "--out", str(tmp_path / "a.txt")], "ends with .html"),
+        ([str(tube_cells["ddc"]), "--out", str(tmp_path / "a.html")], "has no Gaussians"),
+        ([str(tube_run), "--out", str(tmp_path / "a.html")], "expected one avatar"),
+        ([str(tube_cells["ash"]), "--motion", "fly", "--out", str(tmp_path / "a.html")], "expected train, test, walk"),
+        ([str(tube_cells["ash"]), "--motion", "walk", "--out", str(tmp_path / "a.html")], "a person's skeleton"),
+    ):
+        assert cli.main(["share", *arguments]) == cli.WRONG_INPUT
+        assert words in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

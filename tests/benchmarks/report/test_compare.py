@@ -1,0 +1,110 @@
+"""Before and after: what is told of two runs."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from helpers import fakes
+from helpers.cells import cell
+
+from ash.files import InputError
+from benchmarks import cli
+from benchmarks.cell.cells import Cell, CellResult
+from benchmarks.report.compare import Change, changes, verdict_of
+from benchmarks.suites.runs import gathered
+
+Rows = dict[tuple[str, str], list[tuple[Cell, CellResult]]]
+
+
+def row(*psnr: float, method: str = "ash") -> Rows:
+    results = [cell(method, value, seed=seed) for seed, value in enumerate(psnr)]
+    return {("loose", method): [(Cell(config=r.config, folder=Path()), r) for r in results]}
+
+
+def views(before: Rows, after: Rows) -> Change:
+    return next(change for change in changes(before, after) if change.what == "PSNR, held-out views")
+
+
+def test_a_change_is_sure_where_its_interval_leaves_out_zero() -> None:
+    better = views(row(30.0, 30.1, 30.2), row(31.0, 31.1, 31.2))
+    assert better.verdict == "better" and better.change == pytest.approx(1.0)
+    assert better.low is not None and better.high is not None and 0 < better.low < 1.0 < better.high
+    assert views(row(31.0, 31.1, 31.2), row(30.0, 30.1, 30.2)).verdict == "worse"
+    assert views(row(30.0, 30.1, 30.2), row(30.1, 30.0, 30.25)).verdict == "no change seen"
+
+
+def test_one_seed_and_a_missing_row_tell_nothing_else() -> None:
+    assert views(row(30.0), row(35.0)).verdict == "one seed"
+    assert {change.verdict for change in changes(row(30.0), row(30.0, method="ddc"))} == {"only before", "only after"}
+
+
+def test_less_error_is_better() -> None:
+    before, after = row(1.0, 1.0), row(1.0, 1.0)
+    for rows, error in ((before, 0.2), (after, 0.1)):
+        (seeds,) = rows.values()
+        for index, (kept, result) in enumerate(seeds):
+            summary = [replace(s, metric="flip", value=error + 0.001 * index) for s in result.summary[:1]]
+            seeds[index] = kept, replace(result, summary=tuple(summary))
+    assert [change.verdict for change in changes(before, after)] == ["better"]
+    assert verdict_of(changes(before, after)) == "Of 1 quantities 1 is better (ash on loose)."
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two runs: the second has a worse method under the same name."""
+    folder = tmp_path_factory.mktemp("runs")
+    capture = fakes.write_capture(folder / "capture")
+    made = []
+    with pytest.MonkeyPatch.context() as patch:
+        fakes.use(folder / "plugins", patch)
+        for name, method in (("before", "good"), ("after", "bad")):
+            suite = fakes.write_suite(folder / name, capture, f"fake_{method}")
+            text = suite.read_text().replace(f"'fake_{method}'", f"{{ of = 'fake_{method}', name = 'mine' }}")
+            suite.write_text(text)
+            assert cli.main(["run", str(suite), "--seeds", "2", "--out", str(folder / name / "run")]) == 0
+            made.append(folder / name / "run")
+    return made[0], made[1]
+
+
+def test_compare_tells_rows_and_shows_the_worst_frames(
+    runs: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    before, after = runs
+    assert cli.main(["compare", str(before), str(after), "--out", str(tmp_path)]) == 0
+    told = capsys.readouterr().out
+    assert told.startswith("Of ") and "worse (mine on boxes)" in told.splitlines()[0]
+    page = (tmp_path / "compare.html").read_text()
+    assert "among the worst before" in page and page.count("data:image/png") >= 3 * 3
+    assert 'boxes,mine,"PSNR, held-out views",dB,' in (tmp_path / "compare.csv").read_text()
+    assert cli.main(["compare", str(before), str(before), "--out", str(tmp_path)]) == 0
+    assert "identical" in capsys.readouterr().out
+
+
+def test_a_report_over_runs_and_cells(runs: tuple[Path, Path], tmp_path: Path) -> None:
+    cells = [next((run / "cells").iterdir()) for run in runs]
+    assert cli.main(["report", *map(str, cells), "--out", str(tmp_path / "both")]) == 0
+    assert "boxes" in (tmp_path / "both" / "report.md").read_text()
+    run = gathered([*runs, cells[0]], tmp_path, command="")
+    assert len(run.cells) == 4 and len({each.config.key for each in run.cells}) == 4
+
+
+def test_captures_of_one_name_are_told_apart(runs: tuple[Path, Path], tmp_path: Path) -> None:
+    other = fakes.write_capture(tmp_path / "other")
+    manifest = other / "manifest.json"
+    manifest.write_text(manifest.read_text().replace("{", '{"identity": "another",', 1))
+    out = tmp_path / "train"
+    with pytest.MonkeyPatch.context() as patch:
+        fakes.use(tmp_path / "plugins", patch)
+        assert cli.main(["train", "fake_good", str(other), "--preset", "ci", "--out", str(out)]) == 0
+    run = gathered([runs[0], next((out / "cells").iterdir())], tmp_path, command="")
+    assert {each.config.scene for each in run.cells} == {"capture", "other"}
+
+
+def test_runs_without_a_common_row_are_refused(runs: tuple[Path, Path], tmp_path: Path) -> None:
+    from benchmarks.report.compare import write_comparison
+    from benchmarks.suites.runs import read_run
+
+    run = read_run(runs[0])
+    renamed = replace(run, cells=tuple(replace(c, config=replace(c.config, scene="other")) for c in run.cells))
+    with pytest.raises(InputError, match="no scene and method in common"):
+        write_comparison(run, renamed, tmp_path)

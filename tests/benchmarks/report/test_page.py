@@ -1,0 +1,339 @@
+import io
+import re
+import shutil
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from helpers import fakes
+from helpers.browser import DESKTOP, PHONE, Visit, Visitor
+from helpers.cells import config
+
+from ash.files import InputError
+from ash.protocol import TrainingOutcome
+from benchmarks import cli
+from benchmarks.analysis.scores import Quantity, scores_of
+from benchmarks.cell.cells import CellResult, Summary, failed_result
+from benchmarks.report import sentences, tables
+from benchmarks.report.page import publish, write_report
+from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells
+from benchmarks.suites.progress import Progress
+from benchmarks.suites.runs import Run, cell_for, read_run, write_run
+from benchmarks.suites.suites import CaptureSpec, CellSpec
+from benchmarks.verbs import arguments
+
+
+def scored(method: str, *, view: float, pose: float, frame_ms: float = 10.0, seed: int = 0) -> CellResult:
+    rows = (
+        Summary(split="novel_view", region="foreground", metric="psnr", value=view),
+        Summary(split="novel_pose", region="foreground", metric="psnr", value=pose),
+        Summary(split="novel_view", region="foreground", metric="flip", value=1 / view),
+        Summary(split="speed", region="", metric="frame_ms", value=frame_ms),
+    )
+    return CellResult(config=config(method, seed), status="done", summary=rows)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A finished run of fake methods, one of which fails."""
+    folder = tmp_path_factory.mktemp("report")
+    capture = fakes.write_capture(folder / "capture")
+    out, spec = folder / "run", CaptureSpec(scene="boxes", size="ci")
+    with pytest.MonkeyPatch.context() as patch:
+        fakes.use(folder / "plugins", patch)
+        names = ("fake_good", "fake_bad", "fake_nan")
+        specs = [CellSpec(capture=spec, method=name, preset="ci", seed=0) for name in names]
+        cells = tuple(cell_for(cell, capture, out) for cell in specs)
+        found = Run(folder=out, suite="fakes", about="boxes", command="ash-bench run fakes", cells=cells)
+        write_run(found)
+        plan = plan_cells(cells)
+        progress = Progress("cells", 3, expected_s=1.0, workers=2, stream=io.StringIO())
+        with make_executor("local", workers=2) as executor:
+            run_cells(plan, executor, Limits(seconds=60.0, memory_mb=4096), progress)
+        write_report(found)
+    return found
+
+
+class Page(HTMLParser):
+    """Collects what a page refers to, and whether its tags are balanced."""
+
+    VOID = frozenset({"meta", "img", "input", "br", "link"})
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.references: list[str] = []
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.references += [value or "" for name, value in attrs if name in ("src", "href", "action")]
+        if tag not in self.VOID and tag not in ("option",):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in self.VOID and tag != "option":
+            assert self.open.pop() == tag
+
+
+def test_the_page_is_whole_and_needs_nothing_else(run: Run) -> None:
+    text = (run.folder / "report.html").read_text()
+    page = Page(text)
+    assert page.open == []
+    assert page.references and all(reference.startswith("#term-") for reference in page.references)
+    assert all(f'id="{reference[1:]}"' in text for reference in page.references), "every term is in the glossary"
+    assert "default-src 'none'" in text
+    assert text.count("data-chart>") == 4, "accuracy against speed, PSNR per frame, training curves, stages"
+    for words in (
+        "fake_good is best on held-out views",
+        "1 of 1 failed",
+        "diverged",
+        "Protocol 1",
+        "noise ceiling 39.9",
+        "This is a smoke test",
+        "2 cameras, 4 frames",
+    ):
+        assert words in text
+
+
+def test_the_charts_are_valid_svg_and_adapt_to_dark_pages(run: Run) -> None:
+    text = (run.folder / "chart_boxes.svg").read_text()
+    assert ElementTree.fromstring(text).tag == "{http://www.w3.org/2000/svg}svg"
+    assert "prefers-color-scheme:dark" in text
+    assert "fake_good" in text and "nan" not in text.replace("fake_nan", "").lower()
+
+
+def test_markdown_and_latex_say_the_same_as_the_page(run: Run) -> None:
+    page, plain = (run.folder / "report.html").read_text(), (run.folder / "report.md").read_text()
+    tex = (run.folder / "tables.tex").read_text()
+    best = re.findall(r"\*\*([\d.]+)\*\*", plain.partition("by the conventions of others")[0])
+    assert best and all(f">{number}<" in page for number in best)
+    assert all(rf"\cellcolor{{yellow}}{number}" in tex for number in best)
+    assert tex.count(r"\begin{tabular}") == tex.count(r"\end{tabular}") == tex.count(r"\toprule") > 2
+    assert "fake\\_good" in tex
+
+
+def test_the_report_does_without_the_capture(run: Run, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(run.folder, tmp_path / "copy"))
+    for path in copy.rglob("config.json"):
+        path.write_text(re.sub(r'"capture_folder": "[^"]*"', '"capture_folder": "/gone"', path.read_text()))
+    write_report(read_run(copy))
+    assert "No pictures: /gone/manifest.json" in (copy / "report.html").read_text()
+    before, after = ((folder / "results.csv").read_text() for folder in (run.folder, copy))
+    assert after == before.replace(",capture\n", ",gone\n").replace(",gone\n", ",capture\n", 1), "but for its folder"
+
+
+def test_headline_of_the_duel() -> None:
+    duel = [scored("ash", view=27.9, pose=22.3), scored("ddc", view=24.8, pose=22.25)]
+    ahead = scores_of(duel)
+    assert sentences.headline(ahead, "loose") == (
+        "On loose, ASH is 3.1 dB ahead of DDC on held-out views (27.9 against 24.8 dB) "
+        "and level with DDC on held-out motion (22.3 against 22.2 dB)."
+    )
+    behind = scores_of([scored("ash", view=24.0, pose=20.0), scored("ddc", view=25.0, pose=19.0)])
+    assert "1.0 dB behind DDC on held-out views" in sentences.headline(behind, "loose")
+    exact = scores_of([*duel, scored("ash_truth", view=30.0, pose=29.0), scored("ddc_truth", view=32.0, pose=31.0)])
+    assert any("the mesh leads by 2.0 dB" in remark for remark in sentences.remarks(exact, "loose"))
+
+
+def test_best_and_second_are_marked_as_printed_and_oracles_are_not_ranked() -> None:
+    results = [
+        scored("ash", view=27.904, pose=20.0, frame_ms=40.0),
+        scored("wo_disp", view=27.901, pose=19.0, frame_ms=30.0),
+        scored("ddc", view=24.0, pose=21.0, frame_ms=6.0),
+        scored("ash_truth", view=33.0, pose=33.0, frame_ms=1.0),
+        failed_result(config("mlp", 0), "crashed", "boom"),
+    ]
+    columns = [*tables.quality_columns(("psnr", "flip")), *tables.cost_columns(("frame_ms",))]
+    table = tables.build(scores_of(results), "loose", columns, title="t")
+    marks = {row.name: [entry.mark for entry in row.entries] for row in table.rows}
+    assert [c.title for c in table.columns] == ["PSNR", "FLIP", "PSNR", "FLIP", "frame"]
+    assert marks["ASH"][:1] == marks["w/o disp."][:1] == ["best"], "equal as printed"
+    assert marks["DDC"] == ["second", "second", "best", "", "best"]
+    assert set(marks["ASH, exact surface"]) == {""} and table.rows[-1].apart
+    crashed = next(row for row in table.rows if row.name == "w/ MLP")
+    assert {entry.text for entry in crashed.entries} == {"failed"} and crashed.note == "1 of 1 failed"
+
+
+def test_several_seeds_give_intervals() -> None:
+    results = [scored("ash", view=27.0 + seed, pose=20.0, seed=seed) for seed in range(3)]
+    table = tables.build(scores_of(results), "loose", tables.quality_columns(("psnr",)), title="t")
+    assert table.rows[0].entries[0].whole == "28.00 ± 2.48"
+    assert not any("One seed" in remark for remark in sentences.remarks(scores_of(results), "loose"))
+
+
+def test_conventions_move_the_ranking_and_say_how_far() -> None:
+    from benchmarks.analysis.conventions import CONVENTIONS, compare
+
+    def scored_so(method: str, values: tuple[float, ...]) -> CellResult:
+        rows = [
+            Summary(split="novel_view", region=region, metric="psnr", value=value)
+            for region, value in zip(CONVENTIONS, values, strict=True)
+        ]
+        return CellResult(config=config(method, 0), status="done", summary=tuple(rows))
+
+    results = [
+        scored_so("ash", (27.0, 30.0, 25.0, 36.0)),
+        scored_so("ddc", (25.0, 31.0, 24.0, 37.0)),
+        scored_so("mlp", (24.0, 28.0, 26.0, 35.0)),
+        scored_so("ash_truth", (40.0, 40.0, 40.0, 40.0)),
+    ]
+    found = compare(scores_of(results), "loose", "novel_view", "psnr")
+    assert found is not None and list(found.values.index) == ["ash", "ddc", "mlp"]
+    order = list(CONVENTIONS)
+    assert found.ranks[order].to_numpy().tolist() == [[1, 2, 2, 2], [2, 1, 3, 1], [3, 3, 1, 3]]
+    assert found.agreement == pytest.approx((1, 1 / 3, -1 / 3, 1 / 3))
+    assert compare(scores_of(results[:1]), "loose", "novel_view", "psnr") is None
+
+
+def test_the_necessity_matrix_says_what_its_intervals_allow() -> None:
+    from benchmarks.analysis.necessity import matrix, verdict
+
+    def scene(name: str, method: str, values: list[float]) -> list[CellResult]:
+        found = [scored(method, view=value, pose=20.0, seed=seed) for seed, value in enumerate(values)]
+        return [replace(result, config=replace(result.config, scene=name)) for result in found]
+
+    results = scene("still", "ash", [27.0, 27.02, 26.98]) + scene("still", "wo_mot", [27.01, 27.0, 27.02])
+    results += scene("swing", "ash", [27.0, 27.1, 26.9]) + scene("swing", "wo_mot", [24.0, 24.1, 23.9])
+    results += scene("lit", "ash", [27.0, 27.1, 26.9]) + scene("lit", "wo_mot", [25.0, 28.0, 26.0])
+    found = matrix(scores_of(results), "novel_view")
+    assert found is not None and found.parts == ("w/o mot.",)
+    assert {row.scene: verdict(row.losses[0]) for row in found.rows} == {
+        "still": "not needed",
+        "swing": "needed",
+        "lit": "unclear",
+    }
+    assert matrix(scores_of(scene("still", "ash", [1.0])), "novel_view") is None
+
+
+def test_a_failed_method_is_compared_with_nobody() -> None:
+    from benchmarks.analysis.contrasts import contrasts
+
+    whole = [scored("ash", view=27.0 + seed, pose=20.0, seed=seed) for seed in range(2)]
+    whole += [scored("ash_truth", view=30.0, pose=29.0), failed_result(config("ddc_truth", 0), "timeout", "slow")]
+    fallen = scores_of([*whole, *(failed_result(config("ddc", seed), "crashed", "boom") for seed in range(2))])
+    assert sentences.headline(fallen, "loose") == "On loose, DDC failed, so ASH and DDC cannot be compared."
+    assert not any("exact surface, " in remark and "leads" in remark for remark in sentences.remarks(fallen, "loose"))
+    assert contrasts(fallen, "loose") == ()
+
+
+def test_a_published_report_replaces_the_one_before_and_leaves_the_rest_alone(run: Run, tmp_path: Path) -> None:
+    place = tmp_path / "reports" / "fakes"
+    place.mkdir(parents=True)
+    for name in ("chart_gone.svg", "findings.md"):
+        (place / name).write_text("before")
+    command = ["report", str(run.folder), "--publish", str(place)]
+    assert cli.main(command) == arguments.FAILED, "one method failed, and the report says so"
+    there = {path.name for path in place.iterdir()}
+    assert {"report.md", "results.csv", "tables.tex", "chart_boxes.svg", "findings.md"} <= there
+    assert "chart_gone.svg" not in there and "report.html" not in there
+    assert (place / "report.md").read_bytes() == (run.folder / "report.md").read_bytes()
+    with pytest.raises(InputError, match=r"expected report\.md"):
+        publish(tmp_path, place)
+    assert (place / "report.md").exists()
+
+
+def test_an_interval_that_reaches_below_zero_gives_way_to_the_range() -> None:
+    results = [scored("ash", view=27.0, pose=20.0, frame_ms=ms, seed=i) for i, ms in enumerate((6.1, 14.3))]
+    table = tables.build(scores_of(results), "loose", tables.cost_columns(("frame_ms",)), title="t")
+    assert table.rows[0].entries[0].whole == "6.1 to 14.3"
+
+
+def test_no_count_of_gaussians_is_the_best_and_columns_have_names_of_their_own() -> None:
+    regions = ("foreground", "full", "release_crop", "white_frame")
+    results = []
+    for method, count in (("ash", 3000.0), ("ddc", 0.0)):
+        rows = [Summary(split="novel_view", region=region, metric="psnr", value=20.0) for region in regions]
+        rows += [Summary(split="memory", region="", metric=metric, value=count) for metric in ("gaussians", "params")]
+        results.append(CellResult(config=config(method, 0), status="done", summary=tuple(rows)))
+    quantities = [Quantity("novel_view", region, "psnr") for region in regions]
+    quantities += tables.cost_columns(("gaussians", "params"))
+    table = tables.build(scores_of(results), "loose", quantities, title="")
+    assert len({column.in_group for column in table.columns}) == len(table.columns) == 6
+    assert [entry.mark for entry in table.rows[1].entries] == ["", "", "", "", "", "best"]
+    assert (table.columns[4].arrow, table.columns[5].arrow) == ("", "↓")
+
+
+def test_a_training_cut_short_and_dead_decoders_are_told_of() -> None:
+    short = TrainingOutcome(steps=9, seconds=1.0, ended_by="steps", correction_spread=0.0)
+    results = [replace(scored("ash", view=27.0, pose=20.0), training=short), scored("ddc", view=25.0, pose=19.0)]
+    scores = scores_of(results)
+    assert sentences.headline(scores, "loose").endswith("Not at their plateau when training ended: ASH.")
+    assert any("Decoders carry nothing" in remark and "ASH" in remark for remark in sentences.remarks(scores, "loose"))
+
+
+@pytest.fixture(params=[(DESKTOP, "light"), (DESKTOP, "dark"), (PHONE, "light"), (PHONE, "dark")], ids=str)
+def seen(request: pytest.FixtureRequest, run: Run, visit: Visitor) -> Visit:
+    """The page in a window, everything unfolded and walked through, so that whatever is lazy has come."""
+    size, scheme = request.param
+    found = visit(run.folder / "report.html", size=size, scheme=scheme)
+    found.page.evaluate("document.querySelectorAll('details').forEach((fold) => (fold.open = true))")
+    for _ in range(40):
+        found.page.evaluate("scrollBy(0, 500)")
+        found.page.wait_for_timeout(20)
+    found.page.wait_for_function("[...document.querySelectorAll('.panels > .vega')].every((box) => box.dataset.drawn)")
+    found.page.wait_for_function("[...document.images].every((image) => image.naturalWidth > 0)")
+    return found
+
+
+def test_nothing_is_wrong_with_the_page_in_a_browser(seen: Visit) -> None:
+    assert (seen.errors, seen.requests) == ([], [])
+    assert seen.too_wide() == [] and seen.poor_contrast() == []
+    pictures, broken = seen.page.evaluate("""async () => {
+      const album = JSON.parse(document.getElementById("album").textContent);
+      const loads = (text) => new Promise((done) => {
+        const image = new Image();
+        image.onload = () => done(0); image.onerror = () => done(1); image.src = "data:image/webp;base64," + text;
+      });
+      return [album.length, (await Promise.all(album.map(loads))).reduce((sum, each) => sum + each, 0)];
+    }""")
+    assert pictures > 20 and broken == 0
+    heights = "(strip) => [...strip.querySelectorAll('img:not(.reference)')].map((image) => image.height)"
+    for strip in seen.page.locator(".strip").all():
+        found = strip.evaluate(heights)
+        assert len(found) > 2 and len(set(found)) == 1, "truth and predictions stand at one height"
+
+
+def test_the_controls_of_the_page_work(seen: Visit) -> None:
+    page = seen.page
+    table = page.locator("table", has_text="PSNR").first
+    values = (
+        "(table) => [...table.tBodies[0].rows].map((row) => row.cells[1].dataset.value).filter(Boolean).map(Number)"
+    )
+    table.locator("thead button").nth(1).click()
+    assert table.evaluate(values) == sorted(table.evaluate(values)) and len(table.evaluate(values)) == 3
+    player = page.locator("[data-player]")
+    frame, number, under = (player.locator(f"[data-{name}]") for name in ("frame", "number", "under"))
+    player.locator("[data-edge]").focus()
+    page.keyboard.press("End")
+    assert player.locator(".slider").evaluate("(box) => box.style.getPropertyValue('--cut')") == "100%"
+    before, shown = number.text_content(), under.get_attribute("src")
+    frame.focus()
+    page.keyboard.press("ArrowRight")
+    assert number.text_content() != before and under.get_attribute("src") != shown, "a key steps through time"
+    player.locator("[data-step='-1']").click()
+    assert number.text_content() == before
+    player.locator("[data-zoom]").select_option("4")
+    wide, natural = player.locator("[data-over]").evaluate("(image) => [image.width, image.naturalWidth]")
+    assert wide == 4 * natural, "pixels stay whole"
+    tile = player.locator(".strip figure").nth(2)
+    tile.locator("button").click()
+    chosen = player.locator("[data-right]").evaluate("(list) => list.selectedOptions[0].textContent")
+    assert tile.locator("figcaption").text_content().startswith(chosen) and chosen == "fake_bad"
+    lines = player.locator("[data-frames] .vega svg")
+    lines.click(position={"x": lines.bounding_box()["width"] - 12, "y": 40})
+    page.wait_for_timeout(100)
+    domain = lines.evaluate("(svg) => [...svg.querySelectorAll('.role-axis-label text')].map((t) => t.textContent)")
+    last = fakes.TRAIN_FRAMES + fakes.TEST_FRAMES - 1
+    assert int(number.text_content()) == last, f"a click on the chart goes there, {domain}"
+    chart = page.locator("[data-chart]").first
+    marks = "(chart) => chart.querySelectorAll('.panels .mark-symbol path').length"
+    count, entry = chart.evaluate(marks), chart.locator(".legend button").first
+    entry.click()
+    page.wait_for_timeout(200)
+    assert entry.get_attribute("aria-pressed") == "false"
+    assert chart.evaluate(marks) < count, "an entry of the legend hides its series"
+    assert seen.errors == []

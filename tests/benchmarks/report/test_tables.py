@@ -1,0 +1,133 @@
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from ash.files import InputError
+from benchmarks.analysis.scores import COLUMNS, csv_of, foreground, read_csv, scores_of, tidy
+from benchmarks.cell.cells import (
+    Cell,
+    CellConfig,
+    CellResult,
+    CurvePoint,
+    Provenance,
+    Summary,
+    Timing,
+    ViewScore,
+    failed_result,
+    read_cell,
+    read_result,
+    write_config,
+    write_result,
+)
+from benchmarks.cell.curves import read_curve
+from benchmarks.cell.metrics import METRICS
+
+
+def config(method: str = "ash", seed: int = 0) -> CellConfig:
+    return CellConfig(
+        scene="boxes", size="ci", capture_seed=0, capture="c" * 64, method=method, preset="ci", seed=seed, code="0"
+    )
+
+
+def result(method: str = "ash", seed: int = 0, psnr: float = 25.0) -> CellResult:
+    rows = (
+        Summary(split="novel_view", region="foreground", metric="psnr", value=psnr),
+        Summary(split="speed", region="", metric="frame_ms", value=12.5),
+    )
+    view = ViewScore(
+        split="novel_view", camera="a", frame=3, prediction="d" * 64, scores={("foreground", "psnr"): psnr}
+    )
+    return CellResult(
+        config=config(method, seed),
+        status="done",
+        summary=rows,
+        views=(view,),
+        timing=Timing(frame_ms=(12.5,), stage_ms={"stg1": (2.0,)}, reference_ms=(5.0,)),
+        curve=(CurvePoint(seconds=1.0, loss=0.5, psnr=None),),
+        provenance=Provenance(commit="abc", machine={"cores": "2"}, versions={"numpy": "2"}, wall_s=3.0),
+    )
+
+
+def test_a_result_survives_the_disk(tmp_path: Path) -> None:
+    write_result(tmp_path, result())
+    assert read_result(tmp_path) == result()
+    failed = failed_result(config(), "timeout", "too slow")
+    write_result(tmp_path, failed)
+    assert read_result(tmp_path) == failed
+    assert read_result(tmp_path / "elsewhere") is None
+
+
+def test_not_a_number_is_never_written(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="JSON compliant"):
+        write_result(tmp_path, result(psnr=math.nan))
+    assert not (tmp_path / "result.json").exists()
+
+
+def test_a_cell_survives_the_disk_and_its_key_is_checked(tmp_path: Path) -> None:
+    cell = Cell(config=config(), folder=tmp_path / "cell", capture_folder=tmp_path)
+    write_config(cell)
+    assert read_cell(cell.folder) == cell
+    path = cell.folder / "config.json"
+    path.write_text(path.read_text().replace('"seed": 0', '"seed": 1'))
+    with pytest.raises(InputError, match="key does not fit"):
+        read_cell(cell.folder)
+
+
+def test_every_input_changes_the_key() -> None:
+    base = config()
+    changed = [config("ddc"), config(seed=1)]
+    assert len({c.key for c in (base, *changed)}) == 3
+    assert config().key == base.key
+
+
+def test_results_csv_has_the_stable_columns_and_all_digits(tmp_path: Path) -> None:
+    made = tidy([result(psnr=1 / 3), failed_result(config("ddc"), "crashed", "")])
+    (tmp_path / "results.csv").write_text(csv_of(made))
+    table = pd.read_csv(tmp_path / "results.csv", keep_default_na=False)
+    header = "scene,method,seed,split,region,metric,value,unit,direction,protocol,subject,capture"
+    assert ",".join(table.columns) == header == ",".join(COLUMNS)
+    row = table[(table.method == "ash") & (table.metric == "psnr")].iloc[0]
+    assert (row["value"], row["unit"], row["direction"], str(row["protocol"])) == (1 / 3, "dB", "up", "1")
+    assert set(table.metric) <= set(METRICS)
+    failed = table[table.method == "ddc"]
+    assert failed[failed.metric == "failed"]["value"].item() == 1
+    assert failed[failed.metric == "psnr"]["value"].max() == 0
+    pd.testing.assert_frame_equal(read_csv(tmp_path / "results.csv"), made, check_dtype=False)
+
+
+def test_several_captures_of_a_scene_are_the_unit_and_their_seeds_are_averaged() -> None:
+    values = {0: (24.0, 26.0), 1: (27.0, 29.0)}
+    results = [
+        replace(result(seed=seed, psnr=psnr), config=replace(config(seed=seed), capture_seed=subject))
+        for subject, scores in values.items()
+        for seed, psnr in enumerate(scores)
+    ]
+    scores = scores_of(results)
+    assert scores.values("boxes", "ash", foreground()) == [25.0, 28.0] and scores.captures("boxes") == 2
+    assert scores.get("boxes", "ash", foreground()).seeds == 2
+
+
+def test_scores_are_means_with_students_interval() -> None:
+    scores = scores_of([result(seed=seed, psnr=psnr) for seed, psnr in enumerate((24.0, 25.0, 27.0))])
+    score = scores.get("boxes", "ash", foreground())
+    assert score is not None and score.seeds == 3
+    assert score.mean == pytest.approx(76 / 3)
+    assert score.half_width == pytest.approx(4.302653 * math.sqrt(7 / 3 / 3), rel=1e-5)  # t of 2 degrees of freedom
+    assert scores_of([result()]).get("boxes", "ash", foreground()).half_width is None
+    assert scores.get("boxes", "ddc", foreground()) is None
+
+
+def test_a_curve_passes_over_what_is_no_point(tmp_path: Path) -> None:
+    log = tmp_path / "log.jsonl"
+    rows = ['{"seconds": 2, "train_psnr": 20.5, "loss": 0.1}', "not json", "[1]", '{"event": "warm-up"}']
+    rows += ['{"seconds": 1, "loss": 0.2}', '{"seconds": NaN, "loss": 1}', '{"seconds": 3, "lo']
+    log.write_text("\n".join(rows))
+    first, second = CurvePoint(seconds=1.0, loss=0.2, psnr=None), CurvePoint(seconds=2.0, loss=0.1, psnr=20.5)
+    assert read_curve(log) == (first, second)
+    log.write_text("\n".join(f'{{"seconds": {i}, "loss": 1}}' for i in range(5000)))
+    curve = read_curve(log)
+    assert len(curve) <= 201 and curve[-1].seconds == 4999
+    assert read_curve(tmp_path / "none") == ()

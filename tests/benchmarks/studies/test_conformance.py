@@ -1,0 +1,124 @@
+"""The conformance checker tells planted cheats from an honest method, and a real run is sealed in the same way."""
+
+from pathlib import Path
+
+import pytest
+from helpers import cheats, fakes
+
+from ash.capture.formats import load_capture
+from ash.capture.manifest import verify_capture
+from ash.files import sha256_of
+from benchmarks import cli
+from benchmarks.cell.cells import Cell, CellConfig, read_result
+from benchmarks.cell.sealing import Tampering, Trespass, seen_by_method, training_copy, watched
+from benchmarks.studies.conformance import check_method
+from benchmarks.suites.engine import Limits, run_in_process, write_config
+from benchmarks.verbs import arguments
+
+LIMITS = Limits(seconds=60.0, memory_mb=700)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return fakes.write_capture(tmp_path_factory.mktemp("boxes") / "capture")
+
+
+@pytest.fixture(autouse=True)
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cheats.use(tmp_path / "site", monkeypatch)
+    monkeypatch.chdir(tmp_path)
+
+
+BREAKS = {
+    "peeking": {"leaves held-out views alone"},
+    "linking": {"leaves held-out views alone"},
+    "unseeded": {"same seed, same bits", "training again in its folder ends the same"},
+    "one_seed": {"the seed is what is random"},
+    "not_a_number": {"draws as the protocol says"},
+    "hoarding": {"keeps to its memory"},
+    "mutating": {"leaves its input as it was"},
+    "overwriting": {"leaves its input as it was"},
+    "careless": {"refuses bad poses"},
+}
+
+
+@pytest.mark.parametrize("name", BREAKS)
+def test_a_cheat_is_caught_for_what_it_does_and_for_nothing_else(name: str, capture: Path, tmp_path: Path) -> None:
+    checks = check_method(name, capture, tmp_path / "trials", preset="ci", limits=LIMITS, workers=2)
+    assert {check.rule for check in checks if check.kept is False} == BREAKS[name]
+    assert not verify_capture(capture)
+
+
+def test_a_method_that_takes_too_long_is_ended(capture: Path, tmp_path: Path) -> None:
+    short = Limits(seconds=4.0, memory_mb=700)
+    checks = check_method("sleeping", capture, tmp_path / "trials", preset="ci", limits=short, workers=3)
+    assert {check.rule for check in checks if check.kept is False} == {"keeps to its time"}
+    assert sum(check.kept is None for check in checks) > 5, "what was not seen is not called kept"
+
+
+def test_an_honest_method_keeps_all_rules(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["check-method", "honest", "--capture", str(capture), "--memory-mb", "700", "--workers", "2"]
+    assert cli.main(command) == arguments.DONE
+    out = capsys.readouterr().out
+    assert "all rules kept" in out and "BROKEN" not in out
+    assert cli.main(["check-method", "nobody", "--capture", str(capture)]) == arguments.WRONG_INPUT
+
+
+def test_a_training_copy_holds_the_training_part_and_nothing_else(capture: Path, tmp_path: Path) -> None:
+    whole = load_capture(capture)
+    before = sha256_of(capture / "manifest.json")
+    seen = training_copy(whole, tmp_path / "copy")
+    assert not verify_capture(seen.folder)
+    train = whole.splits["train"]
+    assert seen.splits == {"train": train} and set(seen.cameras) == set(train.cameras)
+    assert len(seen.motion.dofs) == len(train.frames) < len(whole.motion.dofs)
+    images = {path.relative_to(seen.folder).as_posix() for path in seen.folder.rglob("*.png")}
+    assert images == {f"frames/{camera}/{frame:06d}.png" for camera, frame in train.views}
+    assert not (seen.folder / "truth").exists()
+    assert training_copy(whole, tmp_path / "copy").identity == seen.identity
+    assert sha256_of(capture / "manifest.json") == before
+
+
+def test_what_is_closed_cannot_be_opened_listed_or_changed(capture: Path, tmp_path: Path) -> None:
+    whole = load_capture(capture)
+    image = capture / "frames" / "cam4" / "000000.png"
+    with seen_by_method(whole, tmp_path / "copy", oracle=False) as seen:
+        for forbidden in (
+            lambda: image.read_bytes(),
+            lambda: list((capture / "truth").iterdir()),
+            lambda: (capture / "frames" / "cam0" / ".." / "cam4" / image.name).read_bytes(),
+        ):
+            with pytest.raises(Trespass, match="held-out"), watched(whole, seen):
+                forbidden()
+        own = seen.folder / "frames" / "cam0" / "000000.png"
+        with watched(whole, seen):
+            assert own.read_bytes() and (tmp_path / "elsewhere").write_bytes(b"fine")
+        for change in (lambda: own.write_bytes(b""), own.unlink, lambda: own.rename(tmp_path / "x")):
+            with pytest.raises(Tampering), watched(whole, seen):
+                change()
+        assert image.read_bytes(), "the harness itself may read"
+    assert not (tmp_path / "copy").exists()
+
+
+def test_an_oracle_sees_everything(capture: Path, tmp_path: Path) -> None:
+    whole = load_capture(capture)
+    with seen_by_method(whole, tmp_path / "copy", oracle=True) as seen, watched(whole, seen):
+        assert set(seen.splits) == {"train", "novel_view", "novel_pose"}
+        assert (capture / "truth" / "template.npz").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["peeking", "hoarding"])
+def test_a_real_run_is_sealed_too(name: str, capture: Path, tmp_path: Path) -> None:
+    config = CellConfig(
+        scene="boxes", size="ci", capture_seed=0, capture=load_capture(capture).identity, method=name, preset="ci",
+        seed=0, code="test",
+    )  # fmt: skip
+    cell = Cell(config=config, folder=tmp_path / "cell", capture_folder=capture)
+    write_config(cell)
+    run_in_process(str(cell.folder), LIMITS)
+    result = read_result(cell.folder)
+    assert result is not None
+    status, reason = {"peeking": ("done", ""), "hoarding": ("out of memory", "700 MB")}[name]
+    assert result.status == status and reason in result.reason
+    assert not (cell.folder / "input").exists()
+    assert not verify_capture(capture)

@@ -1,0 +1,237 @@
+import io
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import psutil
+import pytest
+from helpers import fakes
+
+from ash.files import InputError
+from benchmarks.cell.cells import Cell, read_result
+from benchmarks.suites import engine
+from benchmarks.suites.engine import CellPlan, Limits, make_executor, plan_cells, run_cells, run_in_process, shard_of
+from benchmarks.suites.progress import Progress
+from benchmarks.suites.runs import cell_for
+from benchmarks.suites.suites import CaptureSpec, CellSpec
+
+LIMITS = Limits(seconds=300.0, memory_mb=4096)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fakes.write_capture(tmp_path_factory.mktemp("capture"))
+
+
+@pytest.fixture(autouse=True)
+def installed_fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fakes.use(tmp_path / "plugins", monkeypatch)
+
+
+def cell(method: str, capture: Path, out: Path, *, seed: int = 0) -> Cell:
+    spec = CaptureSpec(scene="boxes", size="ci")
+    return cell_for(CellSpec(capture=spec, method=f"fake_{method}", preset="ci", seed=seed), capture, out)
+
+
+def quiet(total: int) -> Progress:
+    return Progress("cells", total, expected_s=1.0, workers=1, stream=io.StringIO())
+
+
+def run(cells: list[Cell], *, limits: Limits = LIMITS, workers: int = 2) -> CellPlan:
+    plan = plan_cells(cells)
+    with make_executor("local", workers=workers) as executor:
+        run_cells(plan, executor, limits, quiet(len(plan.todo)))
+    return plan
+
+
+def test_cells_run_side_by_side_and_failures_are_results(capture: Path, tmp_path: Path) -> None:
+    expected = {"good": "done", "nan": "diverged", "raising": "crashed", "dying": "crashed"}
+    cells = [cell(method, capture, tmp_path) for method in expected]
+    run(cells)
+    results = [read_result(c.folder) for c in cells]
+    assert [r.status for r in results if r] == list(expected.values())
+    assert "the method's own mistake" in results[2].reason
+    assert "SIGABRT" in results[3].reason
+    for failed in results[1:]:
+        assert failed.value("novel_view", "foreground", "psnr") == 0
+        assert failed.value("novel_pose", "full", "iou") == 0
+        assert failed.value("novel_view", "foreground", "flip") == 1
+    assert not plan_cells(cells).todo, "failed cells count as done: they are data"
+    assert len(plan_cells(cells, retry_failed=True).todo) == 3
+
+
+def test_a_cell_beyond_its_time_or_memory_is_ended_and_recorded(capture: Path, tmp_path: Path) -> None:
+    slow, large = cell("sleeping", capture, tmp_path), cell("growing", capture, tmp_path)
+    with make_executor("local", workers=1) as executor:
+        run_cells(plan_cells([slow]), executor, Limits(seconds=4.0, memory_mb=4096), quiet(1))
+        run_cells(plan_cells([large]), executor, Limits(seconds=60.0, memory_mb=700), quiet(1))
+    assert read_result(slow.folder).status == "timeout"
+    assert read_result(large.folder).status == "out of memory"
+
+
+def test_a_second_run_repeats_nothing(capture: Path, tmp_path: Path) -> None:
+    cells = [cell("good", capture, tmp_path)]
+    assert len(run(cells).todo) == 1
+    stamp = (cells[0].folder / "result.json").stat().st_mtime_ns
+    plan = run(cells)
+    assert (len(plan.todo), len(plan.done)) == (0, 1)
+    assert (cells[0].folder / "result.json").stat().st_mtime_ns == stamp
+
+
+def test_a_changed_input_runs_again_and_says_why(capture: Path, tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    old = cell("good", capture, tmp_path)
+    run([old])
+    config = replace(old.config, code="other")
+    fresh = replace(old, config=config, folder=tmp_path / "cells" / config.key)
+    plan = plan_cells([fresh])
+    assert [c.config.key for c in plan.todo] == [config.key]
+    assert "the code changed" in plan.reasons[0]
+
+
+def test_a_damaged_result_is_an_error_and_stays_as_it_is(capture: Path, tmp_path: Path) -> None:
+    broken = cell("good", capture, tmp_path)
+    run([broken])
+    path = broken.folder / "result.json"
+    whole = path.read_bytes()
+    for content in (b"", whole[: len(whole) // 2], b"[]", b'{"status": "done"}', whole.replace(b'"done"', b'"fine"')):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=r"result\.json.*remove"):
+            plan_cells([broken])
+        assert path.read_bytes() == content
+    path.write_bytes(whole.replace(b'"protocol": "1"', b'"protocol": "0"'))
+    with pytest.raises(InputError, match="protocol 1, got 0"):
+        plan_cells([broken])
+
+
+def test_wrong_input_ends_the_run_with_its_line(capture: Path, tmp_path: Path) -> None:
+    import shutil
+
+    damaged = Path(shutil.copytree(capture, tmp_path / "damaged"))
+    image = damaged / "frames" / "cam3" / "000000.png"
+    image.write_bytes(image.read_bytes()[:100])
+    with pytest.raises(InputError, match=r"cam3/000000\.png.*PNG"):
+        run([cell("good", damaged, tmp_path)])
+
+
+def test_shards_cover_all_cells_once() -> None:
+    cells = list(range(11))
+    parts = [shard_of(cells, f"{i}/4") for i in range(1, 5)]
+    assert sorted(sum(parts, ())) == cells
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+    for wrong in ("0/4", "5/4", "x", "1", "1/0", "1/2/3"):
+        with pytest.raises(InputError, match="shard"):
+            shard_of(cells, wrong)
+
+
+def test_interrupting_ends_the_children_and_the_cell_can_be_resumed(capture: Path, tmp_path: Path) -> None:
+    target = cell("sleeping", capture, tmp_path)
+    code = (
+        "import io; from pathlib import Path; from benchmarks.cell.cells import read_cell\n"
+        "from benchmarks.suites.engine import *\n"
+        "from benchmarks.suites.progress import Progress\n"
+        f"cell = read_cell(Path({str(target.folder)!r}))\n"
+        "with make_executor('local', workers=1) as executor:\n"
+        "    run_cells(plan_cells([cell]), executor, Limits(seconds=60.0, memory_mb=4096),"
+        " Progress('', 1, expected_s=1.0, workers=1, stream=io.StringIO()))\n"
+    )
+    for signal_number in (signal.SIGINT, signal.SIGKILL):
+        engine.write_config(target)
+        parent = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
+        child = wait_for_child(parent.pid)
+        os.kill(parent.pid, signal_number)
+        parent.wait(10)
+        wait_for(lambda child=child: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE)
+        assert read_result(target.folder) is None
+        assert len(plan_cells([target]).todo) == 1
+
+
+def test_a_thread_that_its_executor_forgot_takes_an_interruption_for_no_failure(capture: Path, tmp_path: Path) -> None:
+    class Forgetful(ThreadPoolExecutor):
+        def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+            """As where SIGINT strikes between the start of a thread and its registration."""
+
+    class Impatient(Progress):
+        def tick(self, *, running: Sequence[str] = ()) -> None:
+            wait_for_child(os.getpid())
+            raise KeyboardInterrupt
+
+    target, executor = cell("sleeping", capture, tmp_path), Forgetful(1)
+    progress = Impatient("", 1, expected_s=1.0, workers=1, stream=io.StringIO())
+    with pytest.raises(KeyboardInterrupt):
+        run_cells(plan_cells([target]), executor, Limits(seconds=60.0, memory_mb=4096), progress)
+    ThreadPoolExecutor.shutdown(executor)
+    assert read_result(target.folder) is None
+    assert len(run([cell("good", capture, tmp_path)]).todo) == 1, "the next run is not stopped"
+
+
+def test_a_cell_that_was_told_to_stop_is_unfinished_and_not_failed(capture: Path, tmp_path: Path) -> None:
+    target = cell("sleeping", capture, tmp_path)
+    stopper = subprocess.Popen([sys.executable, "-c", STOP_THE_CELL, str(os.getpid()), target.config.key])
+    plan = run([target])
+    stopper.wait()
+    assert len(plan.todo) == 1 and read_result(target.folder) is None
+    assert len(plan_cells([target]).todo) == 1
+
+
+STOP_THE_CELL = """
+import os, signal, sys, time, psutil
+def cells():
+    others = [p for p in psutil.Process(int(sys.argv[1])).children() if p.pid != os.getpid()]
+    return [p for p in others if sys.argv[2] in ' '.join(p.cmdline())]
+while not cells():
+    time.sleep(0.05)
+time.sleep(1)
+cells()[0].send_signal(signal.SIGTERM)
+"""
+
+
+def test_a_run_in_a_process_leaves_its_log(capture: Path, tmp_path: Path) -> None:
+    target = cell("raising", capture, tmp_path)
+    engine.write_config(target)
+    assert run_in_process(str(target.folder), LIMITS) == "crashed"
+    assert "RuntimeError: the method's own mistake" in (target.folder / "output.log").read_text()
+
+
+def test_progress_without_a_terminal_is_one_line_per_cell() -> None:
+    stream = io.StringIO()
+    progress = Progress("cells", 2, expected_s=10.0, workers=1, stream=stream)
+    progress.tick(running=["a"])
+    progress.finish("a")
+    progress.finish("b", status="crashed")
+    progress.close()
+    lines = stream.getvalue().splitlines()
+    assert lines[0].startswith("[1/2] a (0:00")
+    assert lines[1].startswith("[2/2] b: crashed")
+
+
+def test_time_left_starts_with_the_expectation_and_follows_the_pace() -> None:
+    progress = Progress("cells", 4, expected_s=10.0, workers=2, stream=io.StringIO())
+    assert progress.seconds_left() == pytest.approx(20, abs=0.5)
+    progress.start -= 30
+    progress.finish("a")
+    assert progress.seconds_left() == pytest.approx(90, abs=1)
+
+
+def test_an_unknown_executor_is_refused() -> None:
+    with pytest.raises(InputError, match="expected local or dask://"), make_executor("slurm", workers=1):
+        pass
+
+
+def wait_for_child(pid: int) -> psutil.Process:
+    found: list[psutil.Process] = []
+    wait_for(lambda: bool(found.extend(psutil.Process(pid).children()) or found))
+    return found[0]
+
+
+def wait_for(condition, seconds: float = 20.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited too long"
+        time.sleep(0.05)

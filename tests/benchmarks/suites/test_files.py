@@ -1,0 +1,137 @@
+"""A suite's file: ours and a user's, and errors that name file, line and key."""
+
+from pathlib import Path
+
+import pytest
+from helpers import fakes
+
+from ash.files import InputError
+from benchmarks.cell.methods import WRONG_BY_MM
+from benchmarks.suites.files import find_suite, given_captures, line_of, read_suite, suite_files
+from benchmarks.suites.suites import SceneSpec, varied_name
+
+GOOD = """\
+about = "is width needed?"
+scenes = ["tight", { of = "tight", name = "tight_swing", outfit.swing = 0.8 }]
+size = "ci"
+methods = [
+    "ash",
+    { of = "ash", model.width = 4 },
+    { of = "ddc", name = "mesh", preset = "brief", texture = 256 },
+]
+preset = "ci"
+seeds = 2
+limit_minutes = 30
+stresses.cameras = [25, 50]
+"""
+TABLES = """\
+scenes = ["mannequin"]
+preset = "ci"
+[[methods]]
+of = "ash"
+[[methods]]
+of = "ash"
+model.width = 4
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "mine.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_file_says_scenes_methods_and_what_is_replaced_in_them(tmp_path: Path) -> None:
+    suite = read_suite(written(tmp_path, GOOD))
+    assert (suite.name, suite.seeds, suite.limit_minutes, suite.limit_mb) == ("mine", 2, 30.0, 8192)
+    assert suite.scenes[1] == SceneSpec(name="tight_swing", of="tight", changes=(("outfit.swing", 0.8),))
+    assert [row.name for row in suite.methods] == ["ash", "ash+width=4", "mesh"]
+    cells = list(suite.cells)
+    assert len(cells) == 2 * 2 * 3 * (1 + 2)
+    assert (cells[1].method, cells[1].factory, cells[1].changes) == ("ash+width=4", "ash", (("model.width", 4),))
+    assert (cells[0].factory, cells[2].preset) == ("", "brief")
+
+
+def test_an_ablation_is_three_lines(tmp_path: Path) -> None:
+    assert [row.name for row in read_suite(written(tmp_path, TABLES)).methods] == ["ash", "ash+width=4"]
+
+
+def test_a_capture_that_is_there_is_a_scene(tmp_path: Path) -> None:
+    capture = fakes.write_capture(tmp_path / "mine")
+    suite = read_suite(written(tmp_path, GOOD.replace('"tight",', f"{{ capture = {str(capture)!r} }},", 1)))
+    assert suite.captures[0].folder == capture and suite.captures[0].scene == "boxes"
+    assert [row.name for row in given_captures([capture, capture])] == ["mine", "mine"]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "line", "message"),
+    [
+        ("seeds", "sedes", 10, "unknown key 'sedes', did you mean seeds"),
+        ("seeds = 2", "seeds = 0", 10, "seeds: expected at least 1"),
+        ("seeds = 2", 'seeds = "two"', 10, "seeds: expected a whole number, got 'two'"),
+        ("seeds = 2", "seeds = = 2", 10, "not valid TOML"),
+        ('"tight",', '"tihgt",', 2, "unknown scene 'tihgt', did you mean tight"),
+        ("outfit.swing", "outfit.swnig", 2, "unknown key 'outfit.swnig', did you mean outfit.swing"),
+        ("0.8", "8", 2, "swing is 8.0, expected 0 to 1"),
+        ('"ci"\nmethods', '"huge"\nmethods', 2, "unknown size 'huge', expected one of ci, quick, long, table, paper"),
+        ('    "ash"', '    "ahs"', 5, "unknown method 'ahs', did you mean ash"),
+        ("model.width = 4", "model.width = 'x'", 6, "model.width: expected a whole number, got 'x'"),
+        ("model.width = 4", "width = 4", 6, "unknown key 'width', did you mean model.width"),
+        ("texture = 256", "texture = 256, seed = 3", 7, "seed: a row has none of its own"),
+        ('of = "ddc"', 'of = "nearest"', 7, "nearest: offers no configuration, and so has no key 'texture'"),
+        ('preset = "brief"', 'preset = "chaep"', 7, "preset: expected one of ci, brief"),
+        ('name = "mesh"', 'name = "ash"', 4, "two methods are called 'ash'"),
+        ("cameras = [", "camreas = [", 12, "unknown stress axis 'camreas', did you mean cameras"),
+        ("[25, 50]", "[0]", 12, "expected a severity above zero"),
+        ("[25, 50]", "25", 12, "expected a list of numbers"),
+        ("30\n", "0\n", 11, "limit_minutes"),
+    ],
+)
+def test_errors_name_file_line_and_key(before: str, after: str, line: int, message: str, tmp_path: Path) -> None:
+    assert before in GOOD
+    path = written(tmp_path, GOOD.replace(before, after, 1))
+    with pytest.raises(InputError) as refusal:
+        read_suite(path)
+    assert str(refusal.value).startswith(f"{path}:{line}: "), refusal.value
+    assert message in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_lines_are_found_in_lists_tables_and_dotted_keys() -> None:
+    assert line_of(GOOD, ("methods", 2, "texture")) == 7
+    assert line_of(TABLES, ("methods", 1, "model", "width")) == 7
+    assert line_of(TABLES, ("methods", 1)) == 5
+    assert line_of(TABLES, ("nothing",)) == 1
+
+
+def test_our_suites_are_such_files() -> None:
+    assert set(suite_files()) >= {
+        "quick",
+        "table",
+        "ladder",
+        "stability",
+        "template",
+        "switches",
+        "speed",
+        "paper",
+        "ci",
+    }
+    for name in suite_files():
+        suite = find_suite(name)
+        assert suite.name == name and suite.about and list(suite.cells)
+    template = {row.name for row in find_suite("template").methods}
+    assert {method for row in WRONG_BY_MM.values() for method in row} <= template
+
+
+def test_a_suite_is_narrowed_and_widened() -> None:
+    suite = find_suite("quick").narrowed(methods=("ddc", "static"), seeds=5, preset=None)
+    assert [row.name for row in suite.methods] == ["ddc", "static"]
+    assert (suite.seeds, suite.preset) == (5, "cpu")
+    with pytest.raises(InputError, match="unknown method 'nosuch'"):
+        suite.narrowed(methods=("nosuch",))
+
+
+def test_names_of_variants_are_fit_for_files() -> None:
+    assert varied_name("ash", (("model.texels", 128), ("training.warmup", "none"))) == "ash+texels=128+warmup=none"
+    assert varied_name("tight", (("rig.distortion", (0.1, 0, 0, 0)),)) == "tight+distortion=0.1,0,0,0"
+    assert "/" not in varied_name("tight", (("rig.given", "../" * 99),))
+    assert len(varied_name("tight", (("rig.given", "x" * 999),))) < 40

@@ -1,0 +1,63 @@
+"""The suite `ci`, for real: a capture is rendered, methods are trained, and the numbers are those of working parts."""
+
+import numpy as np
+import pytest
+
+from benchmarks import cli
+from benchmarks.analysis.scores import Quantity, Scores, foreground, scores_of
+from benchmarks.cell.cells import CellResult
+from benchmarks.suites.files import find_suite
+from benchmarks.suites.runs import read_run, results_of
+from benchmarks.verbs import arguments
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> list[CellResult]:
+    folder = tmp_path_factory.mktemp("ci")
+    command = ["run", "ci", "--out", str(folder / "run"), "--data", str(folder / "data")]
+    assert cli.main(command) == arguments.DONE
+    assert (folder / "run" / "report.html").stat().st_size > 100_000
+    assert (folder / "run" / "worst_mannequin.png").exists()
+    assert "of the squared error on" in (folder / "run" / "report.md").read_text()
+    return results_of(read_run(folder / "run"))
+
+
+@pytest.fixture(scope="module")
+def scores(results: list[CellResult]) -> Scores:
+    return scores_of(results)
+
+
+def test_every_method_of_the_suite_came_through(scores: Scores) -> None:
+    assert scores.methods("mannequin") == tuple(method.name for method in find_suite("ci").methods)
+    assert set(scores.rows["status"]) == {"done"}
+
+
+@pytest.mark.parametrize("split", ["novel_view", "novel_pose"])
+@pytest.mark.parametrize(
+    ("method", "least_psnr", "least_iou"),
+    [("ash", 17.7, 0.93), ("ddc", 18.5, 0.93), ("ash_truth", 19.0, 0.955), ("ddc_truth", 20.5, 0.955)],
+)
+def test_quality_is_what_working_parts_reach(
+    scores: Scores, method: str, split: str, least_psnr: float, least_iou: float
+) -> None:
+    asked = foreground(split), Quantity(split, "full", "iou")
+    psnr, iou = (scores.get("mannequin", method, quantity) for quantity in asked)
+    assert psnr is not None and psnr.mean > least_psnr
+    assert iou is not None and iou.mean > least_iou
+
+
+def test_an_oracle_has_no_template_error_and_the_others_have_an_honest_one(scores: Scores) -> None:
+    errors = {
+        m: scores.get("mannequin", m, Quantity("novel_pose", "", "template_mm")) for m in scores.methods("mannequin")
+    }
+    assert errors["ash_truth"].mean < 0.01 and errors["ddc_truth"].mean < 0.01
+    assert 1 < errors["ash"].mean < 30
+
+
+def test_every_stage_is_timed_and_they_add_up_to_the_frame(results: list[CellResult]) -> None:
+    for timing in (result.timing for result in results):
+        assert timing is not None and list(timing.stage_ms) == [f"stg{i}" for i in range(1, 5)]
+        frames = np.asarray(timing.frame_ms)
+        shares = np.sum(list(timing.stage_ms.values()), axis=0) / frames
+        assert (shares <= 1).all()
+        assert shares[frames.argmin()] > 0.65  # In the least disturbed frame.

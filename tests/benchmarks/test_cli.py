@@ -1,0 +1,497 @@
+import json
+import os
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from helpers import fakes
+
+from benchmarks import cli
+from benchmarks.cell import methods
+from benchmarks.suites import captures
+from benchmarks.suites.files import find_suite
+from benchmarks.suites.suites import CaptureSpec
+from benchmarks.verbs import arguments
+from benchmarks.verbs.captures import Synth
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fakes.write_capture(tmp_path_factory.mktemp("capture"))
+
+
+@pytest.fixture(autouse=True)
+def installed_fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fakes.use(tmp_path / "plugins", monkeypatch)
+
+
+@pytest.fixture
+def boxes(capture: Path, tmp_path: Path) -> str:
+    """The file of a suite whose capture needs no renderer."""
+    return str(fakes.write_suite(tmp_path, capture))
+
+
+@pytest.fixture(scope="module")
+def made_once(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of the suite boxes."""
+    folder = tmp_path_factory.mktemp("made")
+    with pytest.MonkeyPatch.context() as patch:
+        fakes.use(folder / "plugins", patch)
+        suite = fakes.write_suite(folder, capture)
+        assert cli.main(["run", str(suite), "--out", str(folder / "run")]) == arguments.DONE
+    return folder / "run"
+
+
+@pytest.fixture
+def finished(made_once: Path, tmp_path: Path) -> Path:
+    """A copy of the finished run."""
+    return Path(shutil.copytree(made_once, tmp_path / "run"))
+
+
+def refused(capsys: pytest.CaptureFixture[str], *command: str) -> str:
+    """The one line with which a command is refused."""
+    assert cli.main(list(command)) == arguments.WRONG_INPUT
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("ash-bench: ")
+    return lines[0]
+
+
+def damaged(capture: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(capture, tmp_path / "damaged"))
+
+
+def test_a_run_leaves_its_report(finished: Path) -> None:
+    for name in ("report.html", "report.md", "results.csv", "tables.tex", "chart_boxes.svg", "pictures_boxes.png"):
+        assert (finished / name).stat().st_size > 0, name
+    (cell, _) = sorted((finished / "cells").iterdir())
+    assert {"config.json", "result.json", "log.jsonl", "images"} <= {path.name for path in cell.iterdir()}
+
+
+def test_a_second_run_repeats_nothing(finished: Path, boxes: str, capsys) -> None:
+    before = {path: path.read_bytes() for path in [*finished.rglob("result.json"), finished / "report.html"]}
+    assert cli.main(["run", boxes, "--out", str(finished)]) == arguments.DONE
+    told = capsys.readouterr()
+    assert "fake_good is best on held-out views" in told.out
+    assert "2 of 2 cells are there already" in told.err
+    changed = {path for path, content in before.items() if path.read_bytes() != content}
+    assert changed <= {finished / "report.html"}, "only the page may change: it names the command"
+
+
+def test_a_failed_cell_is_told_and_exits_with_1(boxes: str, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "run"
+    assert cli.main(["run", boxes, "--methods", "fake_good,fake_nan", "--out", str(out)]) == arguments.FAILED
+    told = capsys.readouterr()
+    assert "diverged: the rendered image holds NaN or infinity" in told.err
+    assert "fake_nan" in (out / "report.html").read_text()
+    assert "fake_nan" in (out / "results.csv").read_text()
+
+
+def test_rescore_recomputes_every_number_from_the_stored_images(capture: Path, tmp_path: Path, capsys) -> None:
+    assert cli.main(["train", "fake_good", str(capture), "--preset", "ci", "--out", str(tmp_path)]) == arguments.DONE
+    path = next(tmp_path.rglob("result.json"))
+    out, original = path.parent, path.read_bytes()
+    path.write_bytes(original.replace(b'"foreground/psnr": ', b'"foreground/psnr": 1'))
+    assert cli.main(["rescore", str(out)]) == arguments.DONE
+    assert path.read_bytes() == original
+    capsys.readouterr()
+    image = sorted(path.parent.rglob("*.png"))[0]
+    shutil.copy(sorted(path.parent.rglob("*.png"))[1], image)
+    assert "altered since it was scored" in refused(capsys, "rescore", str(out))
+
+
+def test_a_methods_configuration_is_flags_recorded_hashed_and_used(capture: Path, tmp_path: Path, capsys) -> None:
+    train = ["train", "fake_tuned", str(capture), "--preset", "ci", "--out", str(tmp_path)]
+    found, psnr = {}, {}
+    for flags in ((), ("--detail", "0.8"), ("--detail", "0.5"), ("--detail", "0.8", "--row", "sharp")):
+        assert cli.main([*train, *flags]) == arguments.DONE
+        told = capsys.readouterr()
+        folder = Path(told.out.strip().rpartition(" in ")[2])
+        found[flags] = json.loads((folder / "config.json").read_text())["config"]
+        psnr[flags] = float(told.out.partition("novel view ")[2].split()[0])
+    assert "taken as it is" not in told.err
+    assert len(list((tmp_path / "cells").iterdir())) == 3, "what the preset says anyway is no change"
+    assert psnr["--detail", "0.8"] > psnr[()] + 1
+    varied = found["--detail", "0.8"]
+    assert (varied["method"], varied["factory"], varied["changes"]) == (
+        "fake_tuned+detail=0.8",
+        "fake_tuned",
+        {"detail": 0.8},
+    )
+    assert found["--detail", "0.8", "--row", "sharp"]["method"] == "sharp"
+    assert cli.main([*train, "--detail", "0.8"]) == arguments.DONE
+    assert "trained before, from the same inputs" in capsys.readouterr().err
+    assert "detail: expected 0 to 1, got 2.0" in refused(capsys, *train, "--detail", "2")
+    assert "unknown option '--detial', did you mean --detail" in refused(capsys, *train, "--detial", "2")
+    assert "preset: expected one of ci, cpu, got 'huge'" in refused(capsys, *train[:3], "--preset", "huge")
+
+
+def test_help_tells_a_methods_configuration(capsys) -> None:
+    with pytest.raises(SystemExit) as end:
+        cli.main(["train", "fake_tuned", "--help"])
+    assert end.value.code == 0
+    told = " ".join(re.sub("[│╭╮╰╯─]", " ", capsys.readouterr().out).split())
+    assert "--detail FLOAT" in told and "(default: 0.9)" in told and "--shift-m" in told
+
+
+def test_a_scenes_fields_are_flags_and_part_of_what_it_is(capsys) -> None:
+    command = ["mannequin", "--size", "ci", "--rig.cameras", "9", "--train.0.frames", "6", "--outfit.skirt", "False"]
+    scene, name = arguments.read_verb(Synth, "synth", command)._described()
+    assert (scene.rig.cameras, scene.train[0].frames, scene.train[1].frames, scene.outfit.skirt) == (9, 6, 4, False)
+    assert scene.name == "mannequin+skirt=False+cameras=9+frames=6"
+    assert name == f"mannequin-ci-0-{scene.identity[:8]}" and scene.parameters["rig"]["cameras"] == 9
+    same, _ = arguments.read_verb(Synth, "synth", ["mannequin", "--rig.cameras=9", "--size", "quick"])._described()
+    assert same.identity != scene.identity and same.rig.cameras == 9
+    plain, name = arguments.read_verb(Synth, "synth", ["mannequin", "--size", "ci"])._described()
+    assert (plain, name) == (
+        arguments.read_verb(Synth, "synth", ["mannequin", "--size", "ci"]).settings(),
+        "mannequin-ci-0",
+    )
+    splats, _ = arguments.read_verb(Synth, "synth", ["splats", "--size", "ci", "--name", "mine"])._described()
+    assert (splats.name, splats.body) == ("mine", "mannequin")
+
+
+def test_a_methods_mistake_comes_with_file_and_line(capture: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    (tmp_path / "own_method.py").write_text("def mine(capture, *, seed, preset):\n    return 1 / 0\n")
+    (tmp_path / "own_typo.py").write_text("import nowhere_to_be_found\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]))
+    train = ["train", "own_method:mine", str(capture), "--out", str(tmp_path / "out")]
+    assert cli.main(train) == arguments.FAILED
+    assert "crashed: ZeroDivisionError: division by zero (" in (told := capsys.readouterr().err)
+    assert "own_method.py:2)" in told
+    told = refused(capsys, "train", "own_typo:mine", str(capture))
+    assert "cannot be imported: ModuleNotFoundError" in told and "own_typo.py:1)" in told
+
+
+def test_suites_are_printed_as_files(tmp_path: Path, capsys) -> None:
+    assert cli.main(["suites", "quick"]) == arguments.DONE
+    (tmp_path / "copy.toml").write_text(capsys.readouterr().out)
+    mine, ours = find_suite(tmp_path / "copy.toml"), find_suite("quick")
+    assert replace(mine, name="quick") == ours
+
+
+def test_a_run_on_a_given_capture(capture: Path, tmp_path: Path, capsys) -> None:
+    command = ["run", "ci", "--capture", str(capture), "--methods", "fake_good", "--out", str(tmp_path)]
+    assert cli.main(command) == arguments.DONE
+    assert "boxes" in (tmp_path / "report.md").read_text()
+    assert "expected it or --scenes" in refused_last(capsys, *command, "--scenes", "tight")
+
+
+def test_the_reference_holds_the_public_names(tmp_path: Path) -> None:
+    pytest.importorskip("pdoc", reason="of the extra dev")
+    assert ash_bench("docs", "--out", str(tmp_path)).returncode == arguments.DONE
+    wanted = {
+        "ash/capture/dataset.html": ("Skeleton.heads", "Motion.dofs", "require_pose"),
+        "ash/capture/manifest.html": ("Split.views",),
+        "ash/protocol.html": ("Avatar.fit", "Configurable.config"),
+        "benchmarks/play/avatars.html": ("load_avatar", "TrainedAvatar.draw"),
+    }
+    for page, names in wanted.items():
+        text = (tmp_path / page).read_text()
+        assert [name for name in names if f'id="{name}"' not in text] == []
+
+
+def test_eval_renders_again_from_the_checkpoint(capture: Path, tmp_path: Path) -> None:
+    assert cli.main(["train", "fake_good", str(capture), "--preset", "ci", "--out", str(tmp_path)]) == arguments.DONE
+    path = next(tmp_path.rglob("result.json"))
+    before = json.loads(path.read_text())
+    shutil.rmtree(path.parent / "images")
+    assert cli.main(["eval", str(path.parent)]) == arguments.DONE
+    assert json.loads(path.read_text())["views"] == before["views"]
+
+
+def test_dry_run_starts_nothing(tmp_path: Path, capsys) -> None:
+    out = tmp_path / "run"
+    assert cli.main(["run", "ci", "--out", str(out), "--seeds", "2", "--dry-run"]) == arguments.DONE
+    told = capsys.readouterr().out
+    assert f"{2 * len(find_suite('ci').methods)} cells" in told
+    assert "GB" in told and "core-hours" in told
+    assert not out.exists()
+
+
+def test_unknown_names(capture: Path, tmp_path: Path, capsys) -> None:
+    assert "unknown suite 'nosuch', expected one of budget, ci, ladder, " in refused(capsys, "run", "nosuch")
+    assert "unknown suite 'qiuck', did you mean quick?" in refused(capsys, "run", "qiuck")
+    assert "unknown method 'nosuch', expected one of" in refused(capsys, "train", "nosuch", str(capture))
+    assert "expected a shard i/n" in refused(capsys, "run", "ci", "--shard", "3/2", "--dry-run")
+
+
+def test_a_missing_image(capture: Path, tmp_path: Path, capsys) -> None:
+    folder = damaged(capture, tmp_path)
+    (folder / "frames" / "cam0" / "000002.png").unlink()
+    assert "cam0/000002.png: missing" in refused(capsys, "train", "fake_good", str(folder))
+    assert cli.main(["verify", str(folder)]) == arguments.WRONG_INPUT
+
+
+def test_a_truncated_image(capture: Path, tmp_path: Path, capsys) -> None:
+    folder = damaged(capture, tmp_path)
+    image = folder / "frames" / "cam0" / "000002.png"
+    image.write_bytes(image.read_bytes()[:-200])
+    assert "cam0/000002.png: altered" in refused(capsys, "train", "fake_good", str(folder))
+
+
+def test_a_wrong_hash(capture: Path, tmp_path: Path, capsys) -> None:
+    folder = damaged(capture, tmp_path)
+    path = folder / "motion.npz"
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1  # In the archive's comment length: still readable, and still not what was made.
+    path.write_bytes(bytes(content))
+    assert cli.main(["verify", str(folder)]) == arguments.WRONG_INPUT
+    assert "motion.npz: altered (SHA-256 differs from the manifest)" in capsys.readouterr().err
+    assert cli.main(["verify", str(capture)]) == arguments.DONE
+
+
+def test_another_schema_version(capture: Path, tmp_path: Path, capsys) -> None:
+    folder = damaged(capture, tmp_path)
+    manifest = folder / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"schema": 1', '"schema": 99'))
+    assert "expected capture schema 1, got 99" in refused(capsys, "train", "fake_good", str(folder))
+
+
+def test_an_unfinished_capture_and_no_capture(capture: Path, tmp_path: Path, capsys) -> None:
+    folder = damaged(capture, tmp_path)
+    manifest = folder / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"complete": true', '"complete": false'))
+    assert "unfinished" in refused(capsys, "train", "fake_good", str(folder))
+    assert "manifest.json" in refused(capsys, "train", "fake_good", str(tmp_path / "nowhere"))
+
+
+def test_a_folder_that_cannot_be_written(capture: Path, tmp_path: Path, capsys) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    assert "a part of the path is a file" in refused(
+        capsys, "run", "ci", "--out", str(blocked / "run"), "--data", str(tmp_path)
+    )
+
+
+def test_no_space_on_the_device(capture: Path, tmp_path: Path) -> None:
+    small = tmp_path / "small"
+    small.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=40k", "tmpfs", small], capture_output=True).returncode:
+        pytest.skip("mounting a small file system needs rights that this user lacks")
+    try:
+        told = ash_bench("train", "fake_good", str(capture), "--out", str(small))
+        assert told.returncode == arguments.WRONG_INPUT
+        assert told.stderr.strip().splitlines()[-1].endswith("no space left on the device")
+        assert "Traceback" not in told.stderr
+    finally:
+        subprocess.run(["umount", small], check=True)
+
+
+def test_a_file_beyond_the_systems_limit(capture: Path, tmp_path: Path) -> None:
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+
+    told = ash_bench("train", "fake_good", str(capture), "--out", str(tmp_path / "out"), preexec_fn=limit)
+    assert told.returncode == arguments.WRONG_INPUT
+    assert "larger than the system allows" in told.stderr
+    assert "Traceback" not in told.stderr
+
+
+def test_reports_need_a_finished_cell(finished: Path, tmp_path: Path, capsys) -> None:
+    assert "run.json: cannot be read" in refused(capsys, "report", str(tmp_path))
+    out = finished
+    results = sorted(out.rglob("result.json"))
+    page = (out / "report.html").read_bytes()
+    results[0].write_bytes(results[0].read_bytes()[:300])
+    assert "result.json" in refused(capsys, "report", str(out))
+    for path in results:
+        path.unlink()
+    assert "no cell is finished" in refused(capsys, "report", str(out))
+    assert (out / "report.html").read_bytes() == page
+
+
+def test_ctrl_c_exits_with_130_and_the_same_command_goes_on(capture: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "benchmarks.cli", "train", "fake_sleeping", str(capture), "--out", str(tmp_path)]
+    for number in (signal.SIGINT, signal.SIGTERM):
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        while not list(tmp_path.glob("cells/*/log.jsonl")):
+            time.sleep(0.05)
+        time.sleep(0.5)
+        process.send_signal(number)
+        _, told = process.communicate(timeout=20)
+        assert process.returncode == arguments.INTERRUPTED
+        assert told.strip().endswith("interrupted; the same command goes on where it was")
+        shutil.rmtree(tmp_path / "cells")
+
+
+def test_help_lists_every_verb_and_how_to_go_on(capsys) -> None:
+    assert cli.main(["--help"]) == arguments.DONE
+    told = capsys.readouterr().out
+    for verb in cli.VERBS:
+        assert re.search(rf"^  {verb} +[A-Z]", told, re.MULTILINE), verb
+    assert f"{arguments.own_name()} run my.toml" in told
+
+
+@pytest.mark.parametrize("verb", cli.VERBS)
+def test_a_verbs_help_needs_nothing_heavy(verb: str) -> None:
+    code = f"""
+import sys
+from benchmarks.cli import main
+try:
+    main([{verb!r}, "--help"])
+except SystemExit as end:
+    assert end.code == 0
+heavy = {{"torch", "mitsuba", "pandas", "altair", "scipy", "matplotlib"}} & set(sys.modules)
+assert not heavy, heavy
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert f"ash-bench {verb}" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("", "expected a verb"),
+        ("rn", "unknown verb 'rn', did you mean run"),
+        ("run --seeds 0", "--seeds: expected at least 1, got 0"),
+        ("run --workers x", "--workers: expected a whole number, got 'x'"),
+        ("run --sedes 3", "unknown option '--sedes', did you mean --seeds"),
+        ("run ci extra", "unexpected 'extra'"),
+        ("run --scenes nosuch", "unknown scene 'nosuch', expected one of mannequin, "),
+        ("run --methods nosuch", "unknown method 'nosuch', expected one of"),
+        ("run --size huge --dry-run", "unknown size 'huge', expected one of ci, quick, long, table, paper"),
+        ("speed else", "WHAT: expected one of kernels, frame, got 'else'"),
+        ("verify", "expected FOLDER"),
+        ("export", "expected FOLDER and --format"),
+        ("suites qiuck", "unknown suite 'qiuck', did you mean quick"),
+        ("synth tihgt", "unknown scene 'tihgt', did you mean tight"),
+        ("synth mannequin --rig.camers 24", "unknown option '--rig.camers', did you mean --rig.cameras"),
+        ("synth mannequin --rig.cameras many", "--rig.cameras: invalid literal"),
+        ("synth mannequin --size ci --rig.cameras 2000", "held out, expected 1 to all but one"),
+        ("train ash nowhere --model.texel 3", "unknown option '--model.texel', did you mean --model.texels"),
+        ("train ash nowhere --model.texels 3", "texels: expected a multiple of shuffle"),
+        ("train nearest nowhere --model.texels 3", "unknown option '--model.texels', expected one of --preset"),
+        ("train ash nowhere --preset chaep", "preset: expected one of ci, brief, cpu"),
+    ],
+)
+def test_wrong_use_is_one_line_and_exits_with_2(command: str, message: str, capsys) -> None:
+    assert message in refused(capsys, *command.split())
+
+
+def test_a_shell_can_complete_verbs_and_flags(tmp_path: Path) -> None:
+    script = ash_bench("--tyro-print-completion", "bash").stdout
+    (tmp_path / "completion").write_text(script)
+    asked = (
+        f"source {tmp_path}/completion; COMP_WORDS=(ash-bench {{}}); COMP_CWORD={{}}; "
+        "$(complete -p ash-bench | sed -E 's/.*-F ([^ ]+) .*/\\1/'); echo ${{COMPREPLY[@]}}"
+    )
+    for words, wanted in (("sy", "synth"), ("run --see", "--seeds")):
+        done = subprocess.run(
+            ["bash", "-c", asked.format(words, len(words.split()))], capture_output=True, text=True, check=True
+        )
+        assert wanted in done.stdout.split(), done
+
+
+def ash_bench(*command: str, preexec_fn=None) -> subprocess.CompletedProcess[str]:
+    whole = [sys.executable, "-m", "benchmarks.cli", *command]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.run(
+        whole, env=environment, capture_output=True, text=True, timeout=120, preexec_fn=preexec_fn, check=False
+    )
+
+
+def test_the_code_version_follows_every_deciding_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = Path(shutil.copytree(Path(cli.__file__).parents[1] / "ash", tmp_path / "ash"))
+    monkeypatch.setattr(methods, "_package_folder", lambda package: root)
+    seen = set()
+    for path in (None, root / "model.py", root / "native" / "splat.cpp", root / "native" / "project.inc"):
+        if path is not None:
+            path.write_text(path.read_text() + "\n")
+        methods.code_version.cache_clear()
+        seen.add(methods.code_version("fake_good"))
+    methods.code_version.cache_clear()
+    assert len(seen) == 4
+    assert methods._package_folder("ash") == root
+
+
+def test_the_code_version_reads_the_sources_that_run() -> None:
+    import ash.files
+    from benchmarks.cell.methods import _package_folder
+
+    assert _package_folder("ash") == Path(ash.files.__file__).parent
+
+
+def test_two_runs_in_one_folder_do_not_meet(boxes: str, tmp_path: Path, capsys) -> None:
+    from ash.files import only_run_in
+
+    (tmp_path / "run").mkdir()
+    with only_run_in(tmp_path / "run"):
+        assert "another ash-bench is at work there" in refused(capsys, "run", boxes, "--out", str(tmp_path / "run"))
+
+
+def test_shards_are_merged_into_the_undisturbed_run(finished: Path, boxes: str, tmp_path: Path, capsys) -> None:
+    whole = finished
+    shards = [tmp_path / "a", tmp_path / "b"]
+    for index, shard in enumerate(shards, 1):
+        assert cli.main(["run", boxes, "--out", str(shard), "--shard", f"{index}/2"]) == arguments.DONE
+    assert "are in no shard" in refused_last(capsys, "merge", str(shards[0]), "--out", str(tmp_path / "half"))
+    assert cli.main(["merge", *map(str, shards), "--out", str(tmp_path / "merged")]) == arguments.DONE
+    quality = [
+        [
+            line
+            for line in (run / "results.csv").read_text().splitlines()
+            if ",speed," not in line and ",memory," not in line
+        ]
+        for run in (whole, tmp_path / "merged")
+    ]
+    assert quality[0] == quality[1] and len(quality[0]) > 40
+
+
+def test_the_gate_on_a_run(finished: Path, tmp_path: Path, capsys) -> None:
+    baseline = tmp_path / "baseline.json"
+    gate = ["gate", "--baseline", str(baseline), "--head", str(finished)]
+    assert "baseline.json" in refused_last(capsys, *gate)
+    assert cli.main([*gate, "--update-baseline"]) == arguments.DONE
+    assert cli.main([*gate, "--markdown", str(tmp_path / "s.md"), "--junit", str(tmp_path / "j.xml")]) == arguments.DONE
+    assert "passed" in (tmp_path / "s.md").read_text() and (tmp_path / "j.xml").exists()
+    baseline.write_text(baseline.read_text().replace('"params": 2', '"params": 1'))
+    assert cli.main(gate) == arguments.FAILED
+
+
+def refused_last(capsys: pytest.CaptureFixture[str], *command: str) -> str:
+    """The last line of a command that is refused after others spoke."""
+    assert cli.main(list(command)) == arguments.WRONG_INPUT
+    return capsys.readouterr().err.strip().splitlines()[-1]
+
+
+def test_a_capture_of_an_older_scene_is_kept_and_the_new_one_goes_beside_it(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Path] = []
+    monkeypatch.setattr(captures, "make_capture_in", lambda spec, folder, *, workers: made.append(folder))
+    old = tmp_path / "mannequin-ci-0"
+    shutil.copytree(capture, old)
+    manifest = old / "manifest.json"
+    spec = CaptureSpec(scene="mannequin", size="ci")
+    own = captures.described(spec).identity
+    for identity, folder in (("older", tmp_path / f"mannequin-ci-0-{own[:8]}"), (own, old)):
+        manifest.write_text((capture / "manifest.json").read_text().replace("{", f'{{"identity": "{identity}",', 1))
+        assert captures.make_capture(spec, tmp_path, workers=1) == folder == made.pop()
+        assert identity in manifest.read_text()
+
+
+def test_a_variant_of_a_scene_has_a_capture_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(captures, "make_capture_in", lambda spec, folder, *, workers: None)
+    plain = CaptureSpec(scene="mannequin", size="ci")
+    seen = CaptureSpec(scene="seen", size="ci", of="mannequin", changes=(("rig.cameras", 9),))
+    folders = {captures.make_capture(spec, tmp_path, workers=1) for spec in (plain, seen)}
+    assert folders == {tmp_path / "mannequin-ci-0", tmp_path / "seen-ci-0"}
+    assert (captures.described(seen).rig.cameras, captures.described(seen).name) == (9, "seen")
+    assert captures.described(seen).identity != captures.described(plain).identity
+
+
+def test_help_on_a_scene_and_on_a_method_lists_their_fields(capsys) -> None:
+    for command, flag in (("synth mannequin", "--rig.cameras"), ("train ash", "--model.texels"), ("synth", "--seed")):
+        with pytest.raises(SystemExit) as end:
+            cli.main([*command.split(), "--help"])
+        assert end.value.code == 0
+        assert flag in capsys.readouterr().out, command

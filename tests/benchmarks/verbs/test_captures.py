@@ -1,0 +1,171 @@
+"""The door's capture verbs, with files that users bring: good ones, broken ones and hostile ones."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.motion_files import amass_file, bvh_file
+from helpers.scenes import small_capture
+
+from ash.capture.formats import load_capture, read_cameras, write_cameras
+from benchmarks.cli import main
+from synth.camera.rig import rig_from_file
+from synth.motion.clips import FLOOR
+
+
+def _rig(folder: Path) -> Path:
+    cameras = list(read_cameras(small_capture() / "cameras.json").values())[:3]
+    write_cameras(folder / "rig.json", cameras)
+    return folder / "rig.json"
+
+
+def test_a_users_motion_seen_by_a_users_cameras(tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Two shards render it; what comes out moves as the files say and is seen by the cameras given."""
+    motion = amass_file(tmp_path / "walk.npz", mocap_framerate=np.array(12.0))
+    test, rig = bvh_file(tmp_path / "turn.bvh"), _rig(tmp_path)
+    test.write_text(test.read_text().replace("0.04", "0.0833333"))
+    out = tmp_path / "capture"
+    command = ["synth", "mannequin", "--size", "ci", "--out", str(out), "--workers", "1"]
+    command += ["--motion", str(motion), "--test-motion", str(test), "--rig", str(rig)]
+    assert main([*command, "--shard", "2/2"]) == 0
+    assert "shard is done" in capsys.readouterr().err
+    assert main([*command, "--shard", "1/2"]) == 0
+    told = capsys.readouterr().err
+    assert "core-minutes" in told and "degrees from the nearest training pose" in told
+    capture = load_capture(out)
+    assert [len(capture.splits[name].frames) for name in ("train", "novel_pose")] == [5, 2]
+    assert list(capture.cameras) == list(read_cameras(rig))
+    knee = 3 + 3 * capture.skeleton.names.index("shin_left")
+    bend = np.linalg.norm(capture.motion.dofs[:, knee : knee + 3], axis=1)
+    assert bend[:2].max() < 0.3 and bend[3] > 0.8
+    root = capture.motion.dofs[:5, [0, 2]] + capture.skeleton.heads[0, [0, 2]]
+    np.testing.assert_allclose(root.min(axis=0) + root.max(axis=0), 0, atol=1e-9)
+    assert all(capture.image(*view)[..., 3].any() for view in capture.splits["train"].views)
+    # The same files elsewhere are the same scene; other contents are not.
+    moved = tmp_path / "elsewhere.npz"
+    moved.write_bytes(motion.read_bytes())
+    command[command.index(str(motion))] = str(moved)
+    assert main(command) == 0
+    assert "1/2" not in capsys.readouterr().err
+
+
+def test_a_rig_may_be_the_bare_list_of_its_cameras(tmp_path: Path) -> None:
+    rig = _rig(tmp_path)
+    bare = tmp_path / "bare.json"
+    bare.write_text(json.dumps(json.loads(rig.read_text())["cameras"]))
+    assert rig_from_file(bare) == rig_from_file(rig)
+
+
+def _bad_rigs(folder: Path) -> dict[str, str]:
+    rows = json.loads(_rig(folder).read_text())["cameras"]
+
+    def changed(**fields) -> str:
+        return json.dumps({"cameras": [rows[0], {**rows[1], **fields}]})
+
+    shifted = np.array(rows[1]["viewmat"])
+    shifted[2, 3] = -5.0
+    return {
+        "camera name": changed(name="../../etc/passwd"),
+        "expected a camera name": changed(name="/absolute"),
+        "two cameras are called": changed(name=rows[0]["name"]),
+        "not orthonormal": changed(viewmat=(2 * np.eye(4)).tolist()),
+        "finite numbers": changed(K=[[float("nan")] * 3] * 3),
+        "fx, fy > 0": changed(K=[[-50, 0, 32], [0, 50, 32], [0, 0, 1]]),
+        "one size": changed(width=65),
+        "16384": changed(width=10**9),
+        "in front of it": changed(viewmat=shifted.tolist()),
+        "folds": changed(distortion=[-9.0, 0, 0, 0]),
+        "shape": changed(distortion=[0.1]),
+        "held out": json.dumps({"cameras": rows[:1]}),
+        "at least one camera": '{"cameras": []}',
+        "list of cameras": '{"cameras": 7}',
+        "not valid JSON": "[" * 200_000,
+        "JSON": '{"cameras": [',
+    }
+
+
+@pytest.mark.parametrize("message", [
+    "camera name", "expected a camera name", "two cameras are called", "not orthonormal", "finite numbers",
+    "fx, fy > 0", "one size", "16384", "in front of it", "folds", "shape", "held out", "at least one camera",
+    "list of cameras", "not valid JSON", "JSON",
+])  # fmt: skip
+def test_bad_rigs_end_in_one_clear_line(message: str, tmp_path: Path, capsys: pytest.CaptureFixture):
+    path = tmp_path / "bad.json"
+    path.write_text(_bad_rigs(tmp_path)[message])
+    _require_refusal(["--rig", str(path)], message, tmp_path, capsys)
+
+
+def _bad_motions(folder: Path) -> dict[str, Path]:
+    whole = bvh_file(folder / "whole.bvh").read_text()
+    far = np.linspace([0, 0, 0.9], [0, 2.5 * FLOOR, 0.9], 5)
+    poses = np.zeros((5, 156))
+    texts = {
+        "truncated": whole[: len(whole) // 2],
+        "promised": whole.replace("Frames: 2", "Frames: 1000000000"),
+        "finite": whole.replace("0 0 40", "0 nan 40"),
+        "bytes": "",
+    }
+    files = {}
+    for name, text in texts.items():
+        files[name] = folder / f"{name}.bvh"
+        files[name].write_text(text)
+    arrays = {
+        "NaN": {"poses": np.full((5, 156), np.nan)},
+        "objects": {"trans": np.array([{"a": 1}] * 5, dtype=object)},
+        "shape": {"poses": poses[:, :60]},
+        "far": {"trans": far, "mocap_framerate": np.array(12.0)},
+        "slow": {"mocap_framerate": np.array(3.0)},
+        "short": {"poses": poses[:1], "trans": far[:1]},
+    }
+    for name, changes in arrays.items():
+        files[name] = amass_file(folder / f"{name}.npz", **changes)
+    files["suffix"] = folder / "walk.fbx"
+    files["absent"] = folder / "absent.bvh"
+    files["folder"] = folder / "folder.bvh"
+    files["folder"].mkdir()
+    return files
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("truncated", "BVH"), ("promised", "1000000000 frames"), ("finite", "finite"), ("bytes", "BVH"), ("NaN", "NaN"),
+        ("objects", "npz"), ("shape", "shape"), ("far", "expected at most 1.2 m"), ("slow", "frames per second"),
+        ("short", "expected at least 2"), ("suffix", ".bvh or an AMASS"), ("absent", "cannot be read"),
+        ("folder", "regular file"),
+    ],
+)  # fmt: skip
+def test_bad_motions_end_in_one_clear_line(
+    name: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    _require_refusal(["--motion", str(_bad_motions(tmp_path)[name])], message, tmp_path, capsys)
+
+
+def _require_refusal(arguments: list[str], message: str, folder: Path, capsys: pytest.CaptureFixture) -> None:
+    out = folder / "out"
+    assert main(["synth", "mannequin", "--size", "ci", "--out", str(out), "--workers", "1", *arguments]) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ash-bench: ")]
+    assert len(lines) == 1 and message in lines[0]
+    assert not list(out.rglob("frames/*/*.png"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["--shard", "3/2"], "expected a shard"), (["--shutter", "7"], "shutter"), (["--executor", "pbs"], "executor")],
+)
+def test_bad_options_are_refused(arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture):
+    _require_refusal(arguments, message, tmp_path, capsys)
+
+
+def test_export_and_undistort_have_doors(tmp_path: Path, capsys: pytest.CaptureFixture):
+    small = str(small_capture())
+    assert main(["export", small, "--format", "glb", "--out", str(tmp_path / "glb")]) == 0
+    assert (tmp_path / "glb" / "human.glb").is_file()
+    assert main(["export", small, "--format", "fbx", "--out", str(tmp_path / "fbx")]) == 2
+    assert main(["export", small, "--format", "glb", "--out", str(tmp_path / "glb")]) == 2
+    assert main(["undistort", small, "--out", str(tmp_path / "straight")]) == 0
+    assert main(["verify", str(tmp_path / "straight")]) == 0
+    files = load_capture(tmp_path / "straight").manifest.files
+    assert files == load_capture(small_capture()).manifest.files  # Pinholes stay as they are, byte for byte.
+    assert "empty folder" in capsys.readouterr().err

@@ -1,0 +1,222 @@
+"""Mutants of every file that a user may bring: success, or an InputError of one line, in seconds and little memory.
+
+`MUTANTS=10000 ./ash-bench test -- tests/fuzz` tries more; `CASES` are findings, which stay.
+"""
+
+import json
+import os
+import random
+import struct
+import time
+import tracemalloc
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import fakes
+from helpers.motion_files import amass_file, bvh_file
+
+from ash.capture.formats import load_capture, read_cameras, read_motion, read_skeleton, read_template
+from ash.capture.manifest import read_manifest, verify_capture
+from ash.files import InputError, read_arrays, read_image, read_json
+from benchmarks.cell.cells import read_cell, read_result
+from benchmarks.cell.curves import read_curve
+from benchmarks.gate.gate import read_baseline
+from benchmarks.suites.runs import read_run
+from synth.camera.rig import rig_from_file
+from synth.motion.importing import import_motion, read_joint_map
+from synth.person.mannequin import heads
+from synth.skeleton import make_skeleton
+
+MUTANTS = int(os.environ.get("MUTANTS", "60"))
+SECONDS, MORE_MEMORY = 10.0, 64 << 20
+ROOT = Path(__file__).parents[2]
+Reader = Callable[[Path], object]
+SKELETON = make_skeleton(heads())
+
+NASTY = (
+    None, True, -1, 0, 2**63, 1e308, -0.5, "", "../../x", "a\n\x1b[2J", "\ud800", [], {}, [[]], "x" * 5000,
+    [0] * 1000, {"a": {"b": {}}},
+)  # fmt: skip
+CASES = (
+    b"", b"{", b"[]", b"null", b"NaN", b'{"a": NaN}', b'{"a": 1e999}', b"[" * 100_000, b"\xff\xfe{}", b"\xef\xbb\xbf{}",
+    b"1" * 10_000, b"\x00" * 100, b"PK\x03\x04", b"\x93NUMPY\x01\x00\xff\xff", b"HIERARCHY " + b"{ " * 100_000,
+    b"HIERARCHY ROOT a { CHANNELS 6 Xposition } MOTION Frames: 1 Frame Time: 0.1 " + b"1e200 " * 6,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Reader]]:
+    """One good file of each kind, and what reads it."""
+    folder = tmp_path_factory.mktemp("good")
+    capture = fakes.write_capture(folder / "capture")
+    joints = 3
+    (folder / "joints.json").write_text('{"pelvis": "Hips", "thigh_left": "LeftUpLeg"}')
+    (folder / "log.jsonl").write_text('{"seconds": 1, "loss": 2}\n{"seconds": 2, "train_psnr": 20.5}\n')
+    run = folder / "run.json"
+    run.write_text('{"protocol": "1", "suite": "ci", "about": "", "command": "", "cells": ["0123456789abcdef"]}')
+    surface = ("faces", "uvs", "uv_faces", "part")
+    return {
+        "manifest": (capture / "manifest.json", lambda path: read_manifest(path.parent)),
+        "cameras": (capture / "cameras.json", read_cameras),
+        "skeleton": (capture / "skeleton.json", read_skeleton),
+        "template": (capture / "template.npz", partial(read_template, joints=joints)),
+        "motion": (capture / "motion.npz", partial(read_motion, joints=joints)),
+        "surface": (capture / "truth" / "surface.npz", partial(read_arrays, expected=surface)),
+        "image": (capture / "frames" / "cam0" / "000000.png", partial(read_image, shape=(64, 64, 4))),
+        "bvh": (bvh_file(folder / "a.bvh"), lambda path: import_motion(path, SKELETON, fps=12.0, most=20)),
+        "amass": (amass_file(folder / "a.npz"), lambda path: import_motion(path, SKELETON, fps=12.0, most=20)),
+        "joint map": (folder / "joints.json", read_joint_map),
+        "rig": (capture / "cameras.json", rig_from_file),
+        "baseline": (ROOT / "reports" / "baseline.json", read_baseline),
+        "curve": (folder / "log.jsonl", read_curve),
+        "run": (run, lambda path: read_run(path.parent)),
+        "result": (_result(folder), lambda path: read_result(path.parent)),
+        "cell": (folder / "cell" / "config.json", lambda path: read_cell(path.parent)),
+        "json": (run, read_json),
+    }
+
+
+def _result(folder: Path) -> Path:
+    from benchmarks.cell.cells import Cell, CellConfig, failed_result, write_config, write_result
+
+    config = CellConfig(
+        scene="boxes", size="ci", capture_seed=0, capture="c", method="ash", preset="ci", seed=0, code="0"
+    )
+    write_config(Cell(config=config, folder=folder / "cell"))
+    write_result(folder / "cell", failed_result(config, "crashed", "as an example"))
+    return folder / "cell" / "result.json"
+
+
+KINDS = (
+    "manifest", "cameras", "skeleton", "template", "motion", "surface", "image", "bvh", "amass", "joint map", "rig",
+    "baseline", "curve", "run", "result", "cell", "json",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_mutants_are_read_or_refused_in_one_line(
+    kind: str, files: dict[str, tuple[Path, Reader]], tmp_path: Path
+) -> None:
+    good, read = files[kind]
+    whole, rng = good.read_bytes(), random.Random(kind)
+    place = tmp_path / "here" / good.name
+    place.parent.mkdir()
+    normal = _attempt(place, whole, read)
+    contents = [*CASES, *(_mutant(whole, rng) for _ in range(MUTANTS))]
+    for content in contents:
+        peak = _attempt(place, content, read)
+        assert peak < 2 * normal + MORE_MEMORY, f"{peak >> 20} MiB"
+    assert {path.name for path in tmp_path.rglob("*")} == {"here", good.name}, "nothing is written"
+
+
+def _attempt(place: Path, content: bytes, read: Reader) -> int:
+    """Bytes at the peak of reading."""
+    place.write_bytes(content)
+    start = time.monotonic()
+    tracemalloc.start()
+    try:
+        read(place)
+    except InputError as error:
+        assert str(error) and str(error).isprintable(), f"{error!r} is not one line"
+    finally:
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert time.monotonic() - start < SECONDS
+    return peak
+
+
+def _mutant(whole: bytes, rng: random.Random) -> bytes:
+    """By structure where the file is JSON, else by bytes, lengths in headers among them."""
+    if whole[:1] in b"{[" and rng.random() < 0.7:
+        try:
+            return json.dumps(_mutated(json.loads(whole), rng)).encode()
+        except ValueError:
+            pass
+    content = bytearray(whole)
+    for _ in range(rng.choice((1, 1, 2, 8))):
+        at = rng.randrange(len(content))
+        match rng.randrange(5):
+            case 0:
+                content[at] = rng.randrange(256)
+            case 1:
+                del content[at:]
+                content += b"\0"
+            case 2:
+                content[at : at + 4] = struct.pack("<I", rng.choice((0, 1, 2**31 - 1, 2**32 - 1)))
+            case 3:
+                content[at:at] = content[max(0, at - rng.randrange(1, 64)) : at]
+            case _:
+                del content[at : at + rng.randrange(1, 16)]
+        content = content or bytearray(b"\0")
+    return bytes(content)
+
+
+def _mutated(value: object, rng: random.Random) -> object:
+    """The same JSON with one value, somewhere, replaced, removed or doubled."""
+    if isinstance(value, dict) and value and rng.random() < 0.9:
+        key = rng.choice(sorted(value))
+        if rng.random() < 0.1:
+            return {k: v for k, v in value.items() if k != key}
+        if rng.random() < 0.05:
+            return {**value, "unknown": 1}
+        return {**value, key: _mutated(value[key], rng)}
+    if isinstance(value, list) and value and rng.random() < 0.9:
+        at = rng.randrange(len(value))
+        if rng.random() < 0.2:
+            return value[:at] + value[at + 1 :] if rng.random() < 0.5 else [*value, value[at]]
+        return [*value[:at], _mutated(value[at], rng), *value[at + 1 :]]
+    return rng.choice(NASTY)
+
+
+def test_verify_sees_every_change(tmp_path: Path) -> None:
+    capture = fakes.write_capture(tmp_path / "capture")
+    rng = random.Random(0)
+    names = sorted(read_manifest(capture).files)
+    for _ in range(min(MUTANTS, 200)):
+        path = capture / rng.choice(names)
+        whole = path.read_bytes()
+        path.write_bytes(_mutant(whole, rng))
+        if path.read_bytes() != whole:
+            assert verify_capture(capture)
+        path.write_bytes(whole)
+    assert not verify_capture(capture)
+
+
+@pytest.mark.parametrize("what", ["pipe", "device", "folder"])
+def test_only_regular_files_are_read(what: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.json"
+    match what:
+        case "pipe":
+            os.mkfifo(path)
+        case "device":
+            path.symlink_to("/dev/zero")
+        case _:
+            path.mkdir()
+    for read in (read_json, partial(read_arrays, expected=("a",)), partial(read_image, shape=(4, 4, 4)), read_baseline):
+        with pytest.raises(InputError, match="regular file"):
+            read(path)
+
+
+def test_a_small_archive_cannot_ask_for_much(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.npz"
+    np.savez_compressed(path, a=np.zeros(40_000_000))
+    with pytest.raises(InputError, match="bytes unpacked"):
+        read_arrays(path, expected=("a",), most=1 << 20)
+
+
+def test_a_capture_of_mutants_is_refused_in_one_line(tmp_path: Path) -> None:
+    capture = fakes.write_capture(tmp_path / "capture")
+    rng = random.Random(1)
+    for name in ("manifest.json", "cameras.json", "skeleton.json", "template.npz", "motion.npz"):
+        path = capture / name
+        whole = path.read_bytes()
+        for _ in range(MUTANTS // 4):
+            path.write_bytes(_mutant(whole, rng))
+            try:
+                load_capture(capture)
+            except InputError as error:
+                assert str(error).isprintable()
+        path.write_bytes(whole)

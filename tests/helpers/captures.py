@@ -1,0 +1,93 @@
+"""A small capture for tests: a bending tube with known texel Gaussians, drawn by the splatter itself."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from helpers.figures import ring_cameras, tube_mesh, tube_motion, tube_skeleton
+
+from ash import presets
+from ash.capture.dataset import Capture, Pose, image_path, surface_path
+from ash.capture.formats import load_capture, write_cameras, write_motion, write_skeleton, write_template
+from ash.config import AshConfig, ModelConfig
+from ash.files import sha256_of, write_arrays, write_image, write_json
+from ash.gaussians.initialising import blank_gaussians
+from ash.model import AshModel
+from ash.template.template import RestDeformation, Template
+from ash.textures import build_lattice
+
+CAMERAS, FRAMES, SIZE, TEXELS = 5, 6, 48, 16
+
+
+def tube_model_config(**changes) -> ModelConfig:
+    """A model small enough for tests."""
+    settings = {
+        "texels": TEXELS,
+        "window": 2,
+        "yaw_normalise": True,
+        "width": 4,
+        "levels": 2,
+        "norm": "none",
+        "shared_trunk": True,
+        "sh_degree": 0,
+        "base": True,
+        "dilation": 0.05,
+    }
+    return ModelConfig(**(settings | changes))
+
+
+def tiny_preset(*, steps: int, warmup_steps: int) -> AshConfig:
+    """The preset `ci` at a size for the tube."""
+    base = presets.ci()
+    model = replace(base.model, texels=16, shuffle=1, width=4, levels=2, window=2)
+    training = replace(base.training, steps=steps, warmup_steps=warmup_steps)
+    return replace(base, model=model, training=training, template=replace(base.template, nodes=20, steps=3))
+
+
+def known_model() -> AshModel:
+    """Texel Gaussians with random colours that no training has touched."""
+    config = tube_model_config(motion=False)
+    template = Template(tube_mesh(), tube_skeleton(), RestDeformation(tube_mesh()))
+    lattice = build_lattice(tube_mesh(), TEXELS)
+    raw = blank_gaussians(config, len(lattice.texels), 0.06)
+    raw[:, 10] = 3.0
+    raw[:, 11:14] = torch.randn(len(raw), 3, generator=torch.Generator().manual_seed(1))
+    return AshModel(config, template, lattice, raw, None)
+
+
+def write_tube_capture(folder: Path) -> Capture:
+    """Camera 0 is held out, and so are the last two frames, a sequence of their own."""
+    cameras, motion, model = ring_cameras(CAMERAS, SIZE), tube_motion(FRAMES), known_model()
+    motion.sequence[-2:] = 1
+    write_cameras(folder / "cameras.json", cameras)
+    write_skeleton(folder / "skeleton.json", tube_skeleton())
+    write_template(folder / "template.npz", tube_mesh())
+    write_motion(folder / "motion.npz", motion)
+    posed = np.stack([model.template.pose(Pose(motion, frame)).vertices.numpy() for frame in range(FRAMES)])
+    write_arrays(folder / "truth" / "template.npz", vertices=posed)
+    write_arrays(folder / "truth" / "surface.npz", faces=tube_mesh().faces)
+    for frame in range(FRAMES):
+        write_arrays(surface_path(folder, frame), vertices=posed[frame])
+    train = {"cameras": [c.name for c in cameras[1:]], "frames": list(range(FRAMES - 2))}
+    splits = {
+        "train": train,
+        "novel_view": {"cameras": ["cam0"], "frames": train["frames"]},
+        "novel_pose": {"cameras": ["cam0"], "frames": [FRAMES - 2, FRAMES - 1]},
+    }
+    for split in splits.values():
+        for name in split["cameras"]:
+            for frame in split["frames"]:
+                camera = next(c for c in cameras if c.name == name)
+                with torch.no_grad():
+                    drawn = model(Pose(motion, frame), camera)
+                write_image(image_path(folder, name, frame), _straight_rgba(drawn.rgb[0], drawn.alpha[0]))
+    files = {str(p.relative_to(folder)): sha256_of(p) for p in folder.rglob("*") if p.is_file()}
+    manifest = {"schema": 1, "scene": "tube", "seed": 0, "splits": splits, "files": files, "complete": True}
+    write_json(folder / "manifest.json", manifest)
+    return load_capture(folder)
+
+
+def _straight_rgba(premultiplied: torch.Tensor, alpha: torch.Tensor) -> np.ndarray:
+    colour = premultiplied / alpha.clamp(min=1e-3)[..., None]
+    return (torch.cat([colour, alpha[..., None]], -1).clamp(0, 1) * 255).round().to(torch.uint8).numpy()

@@ -1,0 +1,131 @@
+"""Comparing a fast path with its definition: one number per tensor, and scenes of Gaussians to compare on."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+from ash.gaussians.gaussians import Gaussians
+from ash.gaussians.splatting import Splatted
+
+IMAGES = ("rgb", "alpha", "depth")
+
+
+def relative_error(value: Tensor, truth: Tensor) -> float:
+    """Largest difference over the truth's largest number; infinite if either is not, or if only the truth is 0."""
+    assert value.shape == truth.shape, f"{tuple(value.shape)} against {tuple(truth.shape)}"
+    if truth.numel() == 0:
+        return 0.0
+    difference, size = (value.double() - truth.double()).abs().max().item(), truth.double().abs().max().item()
+    if difference == 0:
+        return 0.0
+    return difference / size if size > 0 and difference == difference else float("inf")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The arguments of `splat`."""
+
+    gaussians: Gaussians
+    viewmats: Tensor
+    Ks: Tensor
+    width: int
+    height: int
+    background: Tensor | None = None
+    dilation: float = 0.3
+    compensate: bool = False
+    near: float = 0.01
+
+
+def tensors_of(gaussians: Gaussians) -> dict[str, Tensor]:
+    return {field.name: getattr(gaussians, field.name) for field in fields(gaussians)}
+
+
+def cast(scene: Scene, dtype: torch.dtype) -> Scene:
+    """A copy of the scene in another precision whose Gaussians and cameras are leaves that ask for gradients."""
+
+    def leaf(tensor: Tensor) -> Tensor:
+        return tensor.detach().to(dtype, copy=True).requires_grad_()
+
+    return replace(
+        scene,
+        gaussians=Gaussians(**{name: leaf(tensor) for name, tensor in tensors_of(scene.gaussians).items()}),
+        viewmats=leaf(scene.viewmats),
+        Ks=scene.Ks.to(dtype),
+        background=None if scene.background is None else scene.background.to(dtype),
+    )
+
+
+def values_and_gradients(
+    draw: Callable[..., Splatted], scene: Scene, dtype: torch.dtype, **more: int
+) -> dict[str, Tensor]:
+    """All that `draw` returns, and the gradient of a random linear function of its images in all that it takes."""
+    scene = cast(scene, dtype)
+    drawn = draw(**{field.name: getattr(scene, field.name) for field in fields(scene)}, **more)
+    drawn.means2d.retain_grad()
+    generator = torch.Generator().manual_seed(7)
+    loss = torch.zeros((), dtype=dtype)
+    for name in IMAGES:
+        image = getattr(drawn, name)
+        loss = loss + (image * torch.randn(image.shape, generator=generator, dtype=torch.float64).to(dtype)).sum()
+    if loss.requires_grad:  # the definition of an empty image is a constant
+        loss.backward()
+    results = {name: getattr(drawn, name).detach() for name in (*IMAGES, "means2d")}
+    leaves = tensors_of(scene.gaussians) | {"viewmats": scene.viewmats, "means2d": drawn.means2d}
+    return results | {f"grad_{name}": _gradient(tensor) for name, tensor in leaves.items()}
+
+
+def _gradient(tensor: Tensor) -> Tensor:
+    return torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
+
+
+def assert_same(
+    results: dict[str, Tensor], truth: dict[str, Tensor], tolerance: float, wider: dict[str, float] | None = None
+) -> None:
+    """Every tensor within `tolerance`, or its own in `wider`, of the truth in `relative_error`."""
+    assert results.keys() == truth.keys()
+    errors = {name: relative_error(results[name], truth[name]) for name in truth}
+    bad = {name: error for name, error in errors.items() if not error <= (wider or {}).get(name, tolerance)}
+    assert not bad, f"beyond {tolerance}: {bad}"
+
+
+def turned_cameras(count: int, *, distance: float = 3.0) -> Tensor:
+    """World to camera `[c, 4, 4]`: cameras that look at the origin from `distance`, from several sides."""
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    for i in range(count):
+        yaw, pitch = torch.tensor(0.4 + 1.3 * i, dtype=torch.float64), torch.tensor(0.2 - 0.3 * i, dtype=torch.float64)
+        turn = torch.eye(3, dtype=torch.float64)
+        turn[0, 0], turn[0, 2], turn[2, 0], turn[2, 2] = yaw.cos(), yaw.sin(), -yaw.sin(), yaw.cos()
+        nod = torch.eye(3, dtype=torch.float64)
+        nod[1, 1], nod[1, 2], nod[2, 1], nod[2, 2] = pitch.cos(), -pitch.sin(), pitch.sin(), pitch.cos()
+        viewmats[i, :3, :3] = nod @ turn
+        viewmats[i, 2, 3] = distance
+    return viewmats.float()
+
+
+def random_scene(
+    *, count: int = 150, coefficients: int = 4, cameras: int = 1, seed: int = 0, width: int = 70, height: int = 50
+) -> Scene:
+    """Gaussians of all shapes around the origin, in an image of several tiles, its principal point off the centre."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    gaussians = Gaussians(
+        means=0.4 * normal(count, 3),
+        quats=normal(count, 4),
+        scales=torch.exp(0.7 * normal(count, 3) - 3),
+        opacities=torch.sigmoid(2 * normal(count)),
+        sh=0.3 * normal(count, coefficients, 3),
+    )
+    K = torch.tensor([[80.0, 0, 0.47 * width], [0, 90, 0.55 * height], [0, 0, 1]])
+    return Scene(
+        gaussians=gaussians,
+        viewmats=turned_cameras(cameras),
+        Ks=K.repeat(cameras, 1, 1),
+        width=width,
+        height=height,
+        background=torch.tensor([0.1, 0.5, 0.9]),
+    )

@@ -1,0 +1,161 @@
+"""Methods that reach for truth, the score, the clock or others' results, and those that end a cell badly."""
+
+import ctypes
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from helpers.fakes import FakeAvatar
+
+from ash.capture.dataset import Camera, Capture, Pose
+from ash.files import InputError
+from ash.protocol import StageClock
+
+TRUTH = Path(os.environ.get("ASH_BENCH_TEST_TRUTH", "/nowhere"))  # A held-out image of the real capture.
+OTHER = Path(os.environ.get("ASH_BENCH_TEST_OTHER", "/nowhere"))  # The result of another cell.
+
+
+def _reads() -> dict[str, object]:
+    """Ways to a file that Python's audit hook does not see, or sees too late; what each brought home."""
+
+    def by_descriptor() -> bytes:
+        root = os.open("/", os.O_RDONLY)
+        return os.read(os.open(str(TRUTH)[1:], os.O_RDONLY, dir_fd=root), 8)
+
+    def by_libc() -> bytes:
+        libc = ctypes.CDLL(None)
+        descriptor = libc.open(str(TRUTH).encode(), os.O_RDONLY)
+        buffer = ctypes.create_string_buffer(8)
+        return buffer.raw if libc.read(descriptor, buffer, 8) == 8 else b""
+
+    def by_torch() -> bytes:
+        import torch
+
+        return torch.from_file(str(TRUTH), size=8, dtype=torch.uint8).numpy().tobytes()
+
+    def by_shell() -> bytes:
+        command = ["sh", "-c", 'head -c 8 "$ASH_BENCH_TEST_TRUTH"']
+        return subprocess.run(command, capture_output=True, check=False).stdout
+
+    def by_truncating() -> bytes:
+        return b"x" if ctypes.CDLL(None).open(str(TRUTH).encode(), os.O_WRONLY | os.O_TRUNC) >= 0 else b""
+
+    return {
+        "shell": by_shell,
+        "dir_fd": by_descriptor,
+        "libc": by_libc,
+        "torch": by_torch,
+        "truncate": by_truncating,
+        "parent's files": lambda: Path(f"/proc/{os.getppid()}/root/etc/../{str(OTHER)[1:]}").read_bytes()[:8],
+        "other result": lambda: OTHER.read_bytes()[:8],
+        "overwrite": lambda: b"x" if OTHER.exists() and OTHER.write_bytes(b"{}") else b"",
+        "generator": lambda: bytes(str(__import__("synth.presets")), "utf8"),
+    }
+
+
+def _try_all() -> dict[str, str]:
+    loot = {}
+    for name, attempt in _reads().items():
+        try:
+            loot[name] = repr(attempt() or "")  # type: ignore[operator]
+        except Exception:
+            loot[name] = ""
+    return loot
+
+
+AT_IMPORT = _try_all() if Path("/nowhere") != TRUTH and "benchmarks.cell.guest" in " ".join(sys.orig_argv) else {}
+
+
+class Thief(FakeAvatar):
+    """Tries everything, and paints over the scorer."""
+
+    def fit(self, capture: Capture, *, folder: Path) -> None:
+        from benchmarks.cell import metrics
+
+        super().fit(capture, folder=folder)
+        metrics.score_view = lambda *_: {("foreground", "psnr"): 99.0}  # type: ignore[assignment]
+        (folder / "loot.json").write_text(json.dumps({"import": AT_IMPORT, "fit": _try_all()}))
+        (folder / "result.json").write_text('{"status": "done"}')
+        (folder.parent / "result.json").write_text('{"status": "done"}') if os.access(folder.parent, os.W_OK) else None
+
+
+class Slow(FakeAvatar):
+    """Draws in 30 ms and says that it took three."""
+
+    def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
+        start = time.monotonic()
+        while time.monotonic() - start < 0.03:
+            pass
+        return super().render(pose, camera, clock=clock)
+
+
+def thief(capture: Capture, *, seed: int, preset: str) -> Thief:
+    return Thief(capture, detail=0.9, seed=seed)
+
+
+def clock(capture: Capture, *, seed: int, preset: str) -> Slow:
+    real = time.perf_counter
+    time.perf_counter = lambda: real() / 10
+    return Slow(capture, detail=0.9, seed=seed)
+
+
+class Ends(FakeAvatar):
+    """Ends in the way its name says."""
+
+    how = ""
+
+    def fit(self, capture: Capture, *, folder: Path) -> None:
+        super().fit(capture, folder=folder)
+        match self.how:
+            case "exit_2":
+                os._exit(2)
+            case "exit_0":
+                (folder / "result.json").write_text("{}")
+                os._exit(0)
+            case "exit_130":
+                sys.exit(130)
+            case "os_error":
+                raise OSError(28, "No space left on device", "/nowhere")
+            case "input_error":
+                raise InputError("the method's own refusal")
+            case "keyboard":
+                raise KeyboardInterrupt
+            case "leaves":
+                program = "import os, time; os.setsid(); open('/dev/shm/x', 'w'); time.sleep(600)"
+                subprocess.Popen([sys.executable, "-c", program, "left-behind-by-a-method"], start_new_session=True)
+            case "loud":
+                for _ in range(300):
+                    print("x" * (1 << 16), flush=True)
+                print("last words", flush=True)
+            case "killed":
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
+        image = super().render(pose, camera, clock=clock)
+        return (image * 255).astype(np.uint8) if self.how == "bytes" else image * 255 if self.how == "units" else image
+
+    def parameter_count(self) -> int:
+        return -5 if self.how == "negative" else 2
+
+
+HOW = (
+    "exit_2", "exit_0", "exit_130", "os_error", "input_error", "keyboard", "leaves", "loud", "killed", "bytes",
+    "units", "negative",
+)  # fmt: skip
+
+
+def _ends(how: str):
+    def make(capture: Capture, *, seed: int, preset: str) -> Ends:
+        avatar = Ends(capture, detail=0.9, seed=seed)
+        avatar.how = how
+        return avatar
+
+    return make
+
+
+globals().update({how: _ends(how) for how in HOW})

@@ -1,0 +1,37 @@
+import numpy as np
+from helpers.scenes import small_capture
+
+from ash.capture.dataset import surface_path
+from ash.files import read_arrays
+from synth.cloth.checks import penetrations, stretch
+from synth.person.mannequin import mannequin
+
+BODY = mannequin(skirt=True)
+SKIRT = BODY.surface.vertices_of("skirt")
+
+
+def test_legs_that_poke_through_are_found_and_measured():
+    rest = BODY.surface.vertices
+    tight = rest.copy()
+    tight[SKIRT] *= [0.5, 1, 0.5]  # a skirt of half the width: the thighs stick out at the sides
+    found = penetrations(BODY, np.stack([rest, tight]))
+    assert found.share[0] == 0 and found.deepest[0] < 0.005
+    assert found.share[1] > 0.05 and found.deepest[1] > 0.01
+
+
+def test_stretch_is_relative_to_rest():
+    rest = BODY.surface.vertices
+    np.testing.assert_allclose(stretch(BODY, np.stack([rest, 1.2 * rest]), "skirt"), [1.0, 1.2])
+
+
+def test_a_capture_tells_what_its_clothes_do_in_every_frame():
+    folder = small_capture()
+    told = read_arrays(
+        folder / "truth" / "clothes.npz", expected=("penetrating", "penetration_mm", "stretch")
+    )  # fmt: skip
+    posed = np.stack(
+        [read_arrays(surface_path(folder, t), expected=("vertices",))["vertices"] for t in range(5)]
+    ).astype(np.float64)
+    np.testing.assert_allclose(told["stretch"], stretch(BODY, posed, "skirt"), atol=1e-5)
+    np.testing.assert_allclose(told["penetration_mm"], 1000 * penetrations(BODY, posed).deepest, atol=1e-3)
+    assert told["stretch"].max() < 1.08 and told["penetrating"].max() < 0.01

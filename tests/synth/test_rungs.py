@@ -1,0 +1,158 @@
+"""Every rung adds its phenomenon, and nothing else, to `skinned`."""
+
+import multiprocessing
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ash.capture.dataset import Capture, Motion
+from ash.capture.formats import load_capture
+from ash.files import InputError
+from synth import presets
+from synth.capture import make_capture
+from synth.cloth.surface import true_surface
+from synth.motion.clips import make_motion
+from synth.person.body import PARTS
+from synth.person.mannequin import mannequin
+from synth.readers import truth
+from synth.scene import Clip, Outfit, Rig, Scene
+from synth.skeleton import SIDES
+
+BODY = mannequin(skirt=True)
+
+
+@pytest.fixture(scope="module")
+def pool() -> Iterator[ProcessPoolExecutor]:
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as executor:
+        yield executor
+
+
+def _tiny(scene: Scene, **changes) -> Scene:
+    """The rung with four small cameras and two frames of standing, 0.6 m apart on the floor."""
+    clips = tuple(Clip(generator="stand", frames=2, shift=(x, 0.0)) for x in (0.3, -0.3))
+    small = replace(
+        scene,
+        rig=Rig(cameras=4, held_out=1, width=64, height=64),
+        train=clips,
+        test=(Clip(generator="stand", frames=2),),
+        novel_view_stride=2,
+        samples=32,
+        texture=256,
+    )
+    return replace(small, **changes)
+
+
+def _captured(scene: Scene, folder: Path, pool: ProcessPoolExecutor) -> Capture:
+    return load_capture(make_capture(scene, folder, executor=pool))
+
+
+@pytest.mark.parametrize("name", presets.RUNGS)
+@pytest.mark.parametrize("size", presets.SIZES)
+def test_strength_zero_is_skinned_itself(name: str, size: str):
+    """Equal parameters make equal bytes, so this is equality of every image."""
+    skinned = presets.scene("skinned", size=size)
+    assert replace(presets.rung(name, size=size, strength=0.0), name="skinned") == skinned
+    changed = presets.scene(name, size=size)
+    different = [key for key in ("outfit", "light", "test") if getattr(changed, key) != getattr(skinned, key)]
+    assert len(different) == 1
+    assert replace(changed, name="skinned", **{key: getattr(skinned, key) for key in different}) == skinned
+
+
+def test_unknown_rungs_are_refused():
+    with pytest.raises(InputError, match="wrinkles, swing"):
+        presets.rung("creases", size="ci")
+
+
+def test_wrinkles_move_cloth_by_millimetres_and_depend_on_the_pose_only():
+    motion = make_motion(BODY.skeleton, (Clip(generator="reach", frames=6),), fps=12.0, seed=0)
+    outfit = presets.scene("wrinkles", size="ci").outfit
+    plain, folded = (true_surface(BODY, motion, o, seed=3) for o in (Outfit(skirt=True), outfit))
+    moved = np.linalg.norm(folded - plain, axis=-1)
+    assert 0.002 < np.sqrt(np.mean(moved[:, BODY.surface.vertices_of("shirt")] ** 2)) < 0.008
+    bare = BODY.surface.vertices_of("skin", "shoes") & ~BODY.surface.vertices_of("shirt", "trousers")
+    assert moved[:, bare].max() == 0
+    # The same pose at another time, place and heading folds in the same way.
+    elsewhere = replace(motion, dofs=motion.dofs[::-1].copy())
+    elsewhere.dofs[:, :3] += [0.4, 0, 0.1]
+    again = true_surface(BODY, elsewhere, outfit, seed=3)[::-1] - [0.4, 0, 0.1]
+    np.testing.assert_allclose(again, folded, atol=1e-12)
+
+
+def test_swing_depends_on_history_and_the_skinned_skirt_does_not():
+    """Two sequences end in the same pose: one stood there all along, the other one stepped sideways."""
+    still = make_motion(BODY.skeleton, (Clip(generator="stand", frames=8),), fps=12.0, seed=0).dofs
+    moving = still.copy()
+    moving[:, 0] -= 0.25 * np.cos(np.arange(8) * np.pi / 7) + 0.25
+    motion = Motion(dofs=np.concatenate([still, moving]), sequence=np.repeat([0, 1], 8), fps=12.0)
+    skirt = BODY.surface.vertices_of("skirt")
+    swung = true_surface(BODY, motion, presets.scene("swing", size="ci").outfit, seed=0)[:, skirt]
+    skinned = true_surface(BODY, motion, Outfit(skirt=True), seed=0)[:, skirt]
+    assert np.abs(skinned[7] - skinned[15]).max() < 1e-12
+    assert np.linalg.norm(swung[7] - swung[15], axis=-1).max() > 0.02
+
+
+def test_legs_stay_under_the_skirt():
+    """Hardly any of the thighs lies more than 2 cm beyond the cloth nearest to it, seen from the skirt's axis."""
+    clips = tuple(Clip(generator=name, frames=8) for name in ("walk", "dance", "squat"))
+    motion = make_motion(BODY.skeleton, clips, fps=12.0, seed=1)
+    posed = true_surface(BODY, motion, Outfit(skirt=True, swing=1.0, folds_mm=5.0), seed=0)
+    skirt = np.flatnonzero(BODY.surface.vertices_of("skirt"))
+    heads = [BODY.skeleton.names.index(f"thigh_{side}") for side in SIDES]
+    thighs = np.flatnonzero((BODY.skin_weights[:, heads].max(axis=1) > 0.9) & BODY.surface.vertices_of("trousers"))
+    thighs = thighs[(BODY.surface.vertices[thighs, 1] > 0.66) & (BODY.surface.vertices[thighs, 1] < 0.82)]
+    share = []
+    for vertices in posed:
+        cloth, legs = vertices[skirt], vertices[thighs]
+        nearest = np.argmin(np.linalg.norm(legs[:, None] - cloth, axis=-1), axis=1)
+        centre = cloth.mean(axis=0) * [1, 0, 1]
+        beyond = np.linalg.norm((legs - centre)[:, [0, 2]], axis=1) - np.linalg.norm(
+            (cloth[nearest] - centre)[:, [0, 2]], axis=1
+        )
+        share.append((beyond > 0.02).mean())
+    assert np.mean(share) < 0.03
+
+
+def test_turning_shows_headings_that_training_never_had():
+    skinned, turning = (presets.scene(name, size="quick") for name in ("skinned", "turning"))
+    headings = []
+    for clips in (skinned.train, skinned.test, turning.test):
+        motion = make_motion(BODY.skeleton, clips, fps=12.0, seed=0)
+        headings.append(np.rad2deg(np.linalg.norm(motion.dofs[:, 3:6], axis=1)))
+    assert headings[0].max() < 60 and headings[1].max() < 60
+    assert headings[2].min() > 80
+
+
+def test_light_varies_over_the_floor_in_lit_only(pool: ProcessPoolExecutor, tmp_path: Path):
+    change = {}
+    for name in ("skinned", "lit"):
+        capture = _captured(_tiny(presets.scene(name, size="ci")), tmp_path / name, pool)
+        shading = []
+        for frame in (1, 3):
+            ratios = []
+            for camera in capture.splits["train"].cameras:
+                pixels = truth.pixel_truth(capture, camera, frame)
+                seen = truth.parts(capture, pixels) == PARTS.index("shirt")
+                linear = (capture.image(camera, frame)[seen][:, :3] / 255.0) ** 2.2
+                ratios.append(linear.sum() / (truth.albedo(capture, pixels)[seen] ** 2.2).sum())
+            shading.append(np.mean(ratios))
+        change[name] = abs(np.log(shading[0] / shading[1]))
+    assert change["skinned"] < 0.06
+    assert change["lit"] > 0.12
+
+
+def test_gloss_adds_highlights_and_nothing_to_the_geometry(pool: ProcessPoolExecutor, tmp_path: Path):
+    plain, glossy = (
+        _captured(_tiny(presets.scene(name, size="ci")), tmp_path / name, pool) for name in ("skinned", "glossy")
+    )
+    camera = plain.splits["train"].cameras[0]
+    before, after = (truth.pixel_truth(capture, camera, 1) for capture in (plain, glossy))
+    np.testing.assert_array_equal(before.triangle, after.triangle)
+    difference = glossy.image(camera, 1)[..., :3].astype(float) - plain.image(camera, 1)[..., :3]
+    assert np.abs(difference[before.covered]).mean() > 2
+    assert difference.max() > 20
+    ratio = [np.median(c.image(camera, 1)[before.covered][:, 0] / 255.0) for c in (plain, glossy)]
+    assert abs(ratio[1] - ratio[0]) < 0.08  # No milk over the cloth: its typical colour is kept.
