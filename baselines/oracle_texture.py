@@ -38,6 +38,9 @@ class OracleTexture(DdcAvatar):
         texture, posed = self.module.texture, self._surfaces[frame]
         return torch.stack([self.module.draw(texture, posed, camera, background)[..., :3] for camera in cameras])
 
+    def corrections(self, frame: int) -> None:
+        """There is nothing that could differ between frames."""
+
     @torch.no_grad()
     def dress(self, pose: Pose, clock: StageClock) -> tuple[PosedTemplate, Float[Tensor, "3 t t"]]:
         """The posed surface and the texture."""
@@ -48,7 +51,7 @@ class OracleTexture(DdcAvatar):
 def _on_exact(preset: str) -> DdcConfig:
     config = named(preset)
     mesh = ddc_config(config, seed=0, template=TemplateConfig(kind="exact"))
-    return replace(mesh, texture=TEXTURE_FACTOR * config.model.texels)
+    return replace(mesh, texture=TEXTURE_FACTOR * config.model.texels, fade=0.0, search=False)
 
 
 oracle_texture = Recipe(config=_on_exact, build=OracleTexture)  # One texture, at the preset's budget.

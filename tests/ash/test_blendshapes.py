@@ -3,7 +3,7 @@ from helpers.captures import tube_model_config
 from helpers.figures import tube_mesh, tube_motion, tube_skeleton
 
 from ash.blendshapes import LocalBlendshapes
-from ash.capture.dataset import Skeleton
+from ash.capture.dataset import Pose, Skeleton
 from ash.rotations import RigidTransforms
 from ash.template.motion import normalised_motion
 from ash.template.skinning import near_joints
@@ -33,7 +33,7 @@ def conditions(motion: torch.Tensor) -> Conditions:
 
 
 def window(frame: int, seed: int = 0) -> torch.Tensor:
-    return normalised_motion(tube_motion(seed=seed), frame, window=2)
+    return normalised_motion(Pose(tube_motion(seed=seed), frame), window=2)
 
 
 def test_untrained_blendshapes_return_zero_and_then_learn_everything():

@@ -30,7 +30,7 @@ def woken(capture, **model) -> AshAvatar:
     return avatar
 
 
-@pytest.mark.parametrize("model", [{}, {"head": "blendshapes", "shuffle": 1, "global_features": False}])
+@pytest.mark.parametrize("model", [{}, {"head": "blendshapes", "shuffle": 1, "global_features": False, "fade": 0.0}])
 def test_what_is_played_is_what_was_trained(capture, model):
     avatar, camera = woken(capture, **model), capture.cameras["cam0"]
     player = Player(avatar, capture.motion, camera)

@@ -6,6 +6,7 @@ import pytest
 from helpers.captures import write_tube_capture
 
 from benchmarks import cli
+from benchmarks.cell.cells import read_cell
 
 
 @pytest.fixture(scope="session")
@@ -25,6 +26,5 @@ def tube_cells(tube_run: Path) -> dict[str, Path]:
     """The folder of each method's cell."""
     found = {}
     for config in tube_run.glob("cells/*/config.json"):
-        method = "ash" if '"method": "ash"' in config.read_text() else "ddc"
-        found[method] = config.parent
+        found[read_cell(config.parent).config.method.partition("+")[0]] = config.parent
     return found

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import viser
 import zstandard
+from helpers.waiting import wait_for
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
@@ -172,10 +173,7 @@ class FakeBrowser:
 
     def wait_for(self, what, seconds: float = 20.0) -> None:
         """Until something is so."""
-        end = time.perf_counter() + seconds
-        while not what():
-            assert time.perf_counter() < end, f"still not so after {seconds} s; the page says: {self.words}"
-            time.sleep(0.02)
+        wait_for(what, seconds, about=lambda: f"; the page says: {self.words}")
 
     def close(self) -> None:
         """Leave."""

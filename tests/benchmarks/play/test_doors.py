@@ -5,13 +5,13 @@ import http.client
 import math
 import socket
 import threading
-import time
 from pathlib import Path
 
 import pytest
 import viser
 import viser._messages as messages
 from helpers.viewers import FakeBrowser, address_of, browsers, cookie_of, enter, get, message
+from helpers.waiting import wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -168,18 +168,18 @@ def test_large_and_broken_messages_end_their_connection_and_nothing_else(served)
                 with pytest.raises(ConnectionClosed):
                     for _ in range(200):
                         other.recv(timeout=10)
-        _until(lambda: doors.inside == 1)
+        wait_for(lambda: doors.inside == 1)
         _settle(server, kept)
 
 
 def test_so_many_viewers_and_no_more(served) -> None:
     _, url, doors = served
     with browsers(url, 3):
-        _until(lambda: doors.inside == 3)
+        wait_for(lambda: doors.inside == 3)
         with pytest.raises(InvalidStatus) as refused:
             enter(url)
         assert refused.value.response.status_code == 503
-    _until(lambda: doors.inside == 0)
+    wait_for(lambda: doors.inside == 0)
     enter(url).close()
 
 
@@ -227,16 +227,9 @@ def test_tokens_are_long_and_differ(url: str, served) -> None:
 
 def _settle(server: viser.ViserServer, browser: FakeBrowser) -> None:
     """Until everything that was sent before has been heard: messages of one connection are handled in order."""
-    _until(lambda: len(server.get_clients()) == 1)
+    wait_for(lambda: len(server.get_clients()) == 1)
     (client,) = server.get_clients().values()
     angle = browser.angle + 0.5
     browser.look(angle)
     browser.angle = angle
-    _until(lambda: abs(float(client.camera.position[0]) - 2.5 * math.sin(angle)) < 1e-6)
-
-
-def _until(what, seconds: float = 10.0) -> None:
-    end = time.perf_counter() + seconds
-    while not what():
-        assert time.perf_counter() < end
-        time.sleep(0.01)
+    wait_for(lambda: abs(float(client.camera.position[0]) - 2.5 * math.sin(angle)) < 1e-6)

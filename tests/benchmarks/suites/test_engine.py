@@ -3,7 +3,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 from helpers import fakes
+from helpers.waiting import wait_for
 
 from ash.files import InputError
 from benchmarks.cell.cells import Cell, read_result
@@ -228,10 +228,3 @@ def wait_for_child(pid: int) -> psutil.Process:
     found: list[psutil.Process] = []
     wait_for(lambda: bool(found.extend(psutil.Process(pid).children()) or found))
     return found[0]
-
-
-def wait_for(condition, seconds: float = 20.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited too long"
-        time.sleep(0.05)
