@@ -3,6 +3,7 @@ import re
 import shutil
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
+from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from helpers import fakes
 from helpers.browser import DESKTOP, PHONE, Visit, Visitor
 from helpers.cells import config
+from helpers.waiting import wait_for
 
 from ash.files import InputError
 from ash.protocol import TrainingOutcome
@@ -274,8 +276,9 @@ def seen(request: pytest.FixtureRequest, run: Run, visit: Visitor) -> Visit:
     for _ in range(40):
         found.page.evaluate("scrollBy(0, 500)")
         found.page.wait_for_timeout(20)
-    found.page.wait_for_function("[...document.querySelectorAll('.panels > .vega')].every((box) => box.dataset.drawn)")
-    found.page.wait_for_function("[...document.images].every((image) => image.naturalWidth > 0)")
+    drawn = "[...document.querySelectorAll('.panels > .vega')].every((box) => box.dataset.drawn)"
+    for fact in (drawn, "[...document.images].every((image) => image.naturalWidth > 0)"):
+        wait_for(partial(found.page.evaluate, fact))  # Playwright's own waiting is against the page's policy.
     return found
 
 
