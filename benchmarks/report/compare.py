@@ -9,7 +9,6 @@ from typing import Literal
 
 import numpy as np
 import pandas as pd
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 from scipy import stats
 
@@ -18,6 +17,7 @@ from ash.files import InputError, write_atomic
 from benchmarks.cell.cells import Cell, CellResult, ViewScore, read_result, stored_prediction
 from benchmarks.cell.metrics import METRICS, occupied, on_black
 from benchmarks.cell.views import View
+from benchmarks.report.page import environment
 from benchmarks.suites.runs import Run, results_of
 
 Verdict = Literal["better", "worse", "identical", "no change seen", "one seed", "only before", "only after"]
@@ -78,12 +78,11 @@ def write_comparison(before: Run, after: Run, out: Path) -> str:
     table = pd.DataFrame([asdict(change) for change in found])
     verdict = verdict_of(found)
     write_atomic(out / "compare.csv", table.to_csv(index=False, float_format="%.6g").encode())
-    environment = Environment(
-        loader=PackageLoader("benchmarks.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
     frames = {key: list(_worst_frames(old[key][0], new[key][0])) for key in old if key in new}
-    page = environment.get_template("compare.html").render(
-        before=before, after=after, verdict=verdict, changes=[_told(change) for change in found], frames=frames
+    page = (
+        environment("html")
+        .get_template("compare.html")
+        .render(before=before, after=after, verdict=verdict, changes=[_told(change) for change in found], frames=frames)
     )
     write_atomic(out / "compare.html", page.encode())
     return f"{verdict}\n\n{pd.DataFrame([_told(change) for change in found]).to_string(index=False)}"

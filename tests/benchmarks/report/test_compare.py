@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from helpers import fakes
+from helpers.browser import DESKTOP, PHONE, Visitor
 from helpers.cells import cell
 
 from ash.files import InputError
@@ -108,3 +109,14 @@ def test_runs_without_a_common_row_are_refused(runs: tuple[Path, Path], tmp_path
     renamed = replace(run, cells=tuple(replace(c, config=replace(c.config, scene="other")) for c in run.cells))
     with pytest.raises(InputError, match="no scene and method in common"):
         write_comparison(run, renamed, tmp_path)
+
+
+@pytest.mark.parametrize(("size", "scheme"), [(DESKTOP, "dark"), (PHONE, "light")], ids=str)
+def test_nothing_is_wrong_with_the_comparison_in_a_browser(
+    runs: tuple[Path, Path], tmp_path: Path, visit: Visitor, size: tuple[int, int], scheme: str
+) -> None:
+    assert cli.main(["compare", *map(str, runs), "--out", str(tmp_path)]) == 0
+    seen = visit(tmp_path / "compare.html", size=size, scheme=scheme)
+    assert (seen.errors, seen.requests, seen.too_wide(), seen.poor_contrast()) == ([], [], [], [])
+    pictures = seen.page.evaluate("[...document.images].map((image) => image.naturalWidth > 0)")
+    assert len(pictures) >= 9 and all(pictures)
