@@ -4,10 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.analysis.names import is_oracle, look_of
+from benchmarks.analysis.names import look_of
 from benchmarks.analysis.pareto import Candidate
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Scores, foreground
 from benchmarks.analysis.statistics import Difference, hierarchical_bootstrap, holm, paired, welch
+from benchmarks.cell.methods import is_oracle
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

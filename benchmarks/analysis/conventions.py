@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from benchmarks.analysis.names import is_oracle
 from benchmarks.analysis.scores import Quantity, Scores
 from benchmarks.analysis.statistics import kendall
+from benchmarks.cell.methods import is_oracle
 
 CONVENTIONS = {  # region, and who scores so
     "foreground": "ours: foreground",

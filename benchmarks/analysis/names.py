@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from functools import cache
 
-from benchmarks.cell.methods import DECIDING_PACKAGES, ORACLES, methods
+from benchmarks.cell.methods import DECIDING_PACKAGES, methods
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -46,11 +46,6 @@ def look_of(method: str) -> Look:
     name = method.rpartition(":")[2]
     title = name.replace("_", " ") if name != method else method  # A factory's name, where it came by its path.
     return Look(title=title, colour=SPARE_COLOURS[sum(method.encode()) % len(SPARE_COLOURS)])
-
-
-def is_oracle(method: str) -> bool:
-    """Whether the method was shown the truth, and so is a bound and no competitor."""
-    return method in ORACLES
 
 
 def is_ours(method: str) -> bool:

@@ -1,6 +1,7 @@
 """Which methods there are, who of them may see the truth, and which sources decide their outcome."""
 
 import hashlib
+import re
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -28,6 +29,8 @@ WRONG_BY_MM = {
 # Who may look at truth/ is decided here, not by the method: these get the whole capture, all others its training part.
 ORACLES = frozenset({"baselines.switches:by_vertices"}).union(*WRONG_BY_MM.values())
 
+ROW_NAME = re.compile(r"[\w.:]*")  # what a row's name begins with; how it differs from that method follows
+
 
 # Whose sources decide a cell's outcome, besides this folder; a change elsewhere (a report, say) leaves results valid.
 DECIDING_PACKAGES = ("ash", "baselines")
@@ -52,6 +55,20 @@ class Method:
         module, _, function = self.target.partition(":")
         factory: Callable[..., Any] = getattr(import_module(module), function)
         return factory
+
+
+def is_oracle(row: str) -> bool:
+    """Whether a row's method is shown the truth, and so is a bound and no competitor.
+
+    A variant of an oracle begins with the oracle's name, such as `ash_truth+texels=64`; suites see to it.
+    """
+    return named_method(row) in set(map(named_method, ORACLES))
+
+
+def named_method(row: str) -> str:
+    """The method whose name a row's name begins with; of `package.module:factory`, the factory."""
+    found = ROW_NAME.match(row)
+    return (found.group() if found else row).rpartition(":")[2]
 
 
 def methods() -> dict[str, Method]:

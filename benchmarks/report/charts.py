@@ -16,7 +16,8 @@ import altair as alt
 import pandas as pd
 import vl_convert
 
-from benchmarks.analysis.names import is_oracle, look_of
+from benchmarks.analysis.names import look_of
+from benchmarks.cell.methods import is_oracle
 
 VERSION = "6.4"  # of Vega-Lite, among those that vl-convert brings
 PAPER, INK, DIM, GRID, LINE = "#fffffe", "#1f2733", "#5d6878", "#dfe4eb", "#8a94a3"

@@ -3,8 +3,9 @@
 import numpy as np
 
 from benchmarks.analysis import contrasts, pareto
-from benchmarks.analysis.names import EXACT, SPLIT_WORDS, is_oracle, look_of
+from benchmarks.analysis.names import EXACT, SPLIT_WORDS, look_of
 from benchmarks.analysis.scores import FRAME_MS, Quantity, Scores, foreground
+from benchmarks.cell.methods import is_oracle
 
 TOO_CLOSE_DB = 0.1
 FEW_METHODS = 6

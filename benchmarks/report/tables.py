@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import pandas as pd
 
-from benchmarks.analysis.names import is_oracle, look_of
+from benchmarks.analysis.names import look_of
 from benchmarks.analysis.scores import Quantity, Score, Scores, foreground
+from benchmarks.cell.methods import is_oracle
 from benchmarks.cell.metrics import METRICS, Metric
 from benchmarks.report.content import Entry, Head, Mark, Row, Table
 from benchmarks.report.escaping import latex as tex

@@ -141,7 +141,8 @@ class _Reader:
         own = known.get("preset", "")
         self.each(place, changes, lambda some: configured(of, own or preset, some))
         varied = changes + ((("preset", own),) if own else ())
-        return MethodSpec(name=known.get("name") or varied_name(of, varied), of=of, preset=own, changes=changes)
+        name = known.get("name") or varied_name(of, varied)
+        return self.told(place, lambda: MethodSpec(name=name, of=of, preset=own, changes=changes))  # type: ignore[no-any-return]
 
     def stresses(self, table: Any) -> Iterator[Stress]:
         """Every step of every axis."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ash.fields import Changes
 from ash.files import InputError, hash_of
-from benchmarks.cell.methods import find_method
+from benchmarks.cell.methods import ORACLES, find_method, is_oracle, named_method
 from benchmarks.suites.stress import Stress
 
 LONGEST_VALUE = 24  # Characters of a changed value in a name; its hash stands for a longer one.
@@ -32,6 +32,17 @@ class MethodSpec:
     of: str = ""  # the entry point or factory, where it has another name
     preset: str = ""  # none: the suite's
     changes: Changes = ()  # in the configuration that the preset means
+
+    def __post_init__(self) -> None:
+        """Refuse an oracle under a competitor's name, and a competitor under an oracle's."""
+        shown = self.of in ORACLES
+        if self.of and (is_oracle(self.name) != shown or (shown and named_method(self.name) != named_method(self.of))):
+            expected = (
+                f"a name that begins with {named_method(self.of)!r}, an oracle"
+                if shown
+                else "a name that is no oracle's"
+            )
+            raise InputError(f"method {self.name!r}: expected {expected}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

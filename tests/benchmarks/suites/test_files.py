@@ -6,7 +6,7 @@ import pytest
 from helpers import fakes
 
 from ash.files import InputError
-from benchmarks.cell.methods import WRONG_BY_MM
+from benchmarks.cell.methods import WRONG_BY_MM, is_oracle
 from benchmarks.suites.files import find_suite, given_captures, line_of, read_suite, suite_files
 from benchmarks.suites.suites import SceneSpec, varied_name
 
@@ -101,6 +101,26 @@ def test_lines_are_found_in_lists_tables_and_dotted_keys() -> None:
     assert line_of(TABLES, ("methods", 1, "model", "width")) == 7
     assert line_of(TABLES, ("methods", 1)) == 5
     assert line_of(TABLES, ("nothing",)) == 1
+
+
+@pytest.mark.parametrize(
+    ("row", "refused"),
+    [
+        ("{ of = 'ash_truth', name = 'mine' }", "expected a name that begins with 'ash_truth', an oracle"),
+        ("{ of = 'ddc_truth', name = 'ash_truth' }", "expected a name that begins with 'ddc_truth', an oracle"),
+        ("{ of = 'ash', name = 'ash_truth' }", "expected a name that is no oracle's"),
+        ("{ of = 'ash_truth', name = 'ash_truth, narrow', model.width = 4 }", ""),
+        ("{ of = 'ash_truth', model.width = 4 }", ""),
+    ],
+)
+def test_an_oracle_is_told_by_its_rows_name(row: str, refused: str, tmp_path: Path) -> None:
+    path = written(tmp_path, f"scenes = ['loose']\nmethods = [{row}]\npreset = 'ci'\n")
+    if refused:
+        with pytest.raises(InputError, match=refused):
+            read_suite(path)
+    else:
+        (method,) = read_suite(path).methods
+        assert is_oracle(method.name)
 
 
 def test_our_suites_are_such_files() -> None:
