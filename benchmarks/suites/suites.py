@@ -35,14 +35,11 @@ class MethodSpec:
 
     def __post_init__(self) -> None:
         """Refuse an oracle under a competitor's name, and a competitor under an oracle's."""
-        shown = self.of in ORACLES
-        if self.of and (is_oracle(self.name) != shown or (shown and named_method(self.name) != named_method(self.of))):
-            expected = (
-                f"a name that begins with {named_method(self.of)!r}, an oracle"
-                if shown
-                else "a name that is no oracle's"
-            )
-            raise InputError(f"method {self.name!r}: expected {expected}")
+        oracle, method = self.of in ORACLES, named_method(self.of)
+        if oracle and named_method(self.name) != method:
+            raise InputError(f"method {self.name!r}: expected a name that begins with {method!r}, an oracle")
+        if self.of and not oracle and is_oracle(self.name):
+            raise InputError(f"method {self.name!r}: expected a name that is no oracle's")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
