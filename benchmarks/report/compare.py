@@ -54,7 +54,7 @@ class Change:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Frame:
+class WorstFrame:
     """A view that is among the worst of one of the runs, as both draw it. Pictures are data URIs."""
 
     title: str
@@ -196,7 +196,7 @@ def _told(change: Change) -> dict[str, str]:
     }
 
 
-def _worst_frames(before: tuple[Cell, CellResult], after: tuple[Cell, CellResult]) -> Iterator[Frame]:
+def _worst_frames(before: tuple[Cell, CellResult], after: tuple[Cell, CellResult]) -> Iterator[WorstFrame]:
     """The worst views of each run that the other has as well, of the first seed; none where pictures are gone."""
     scores = [{_key(view): view for view in result.views} for _, result in (before, after)]
     shared = [key for key in scores[0] if key in scores[1] and key[0] in SPLIT_WORDS]  # Training views are no exam.
@@ -209,7 +209,7 @@ def _worst_frames(before: tuple[Cell, CellResult], after: tuple[Cell, CellResult
             truth, drawn = _pixels(before[0], after[0], key)
         except InputError:
             return
-        yield Frame(
+        yield WorstFrame(
             title=f"{SPLIT_WORDS[key[0]]}, camera {key[1]}, frame {key[2]}: among the worst {run}",
             before_db=_db(scores[0][key]),
             after_db=_db(scores[1][key]),

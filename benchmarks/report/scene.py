@@ -21,8 +21,8 @@ from benchmarks.report.content import (
     Bullets,
     Chart,
     Entry,
+    Flipbook,
     Head,
-    Player,
     Row,
     Section,
     Strips,
@@ -265,7 +265,7 @@ def _picture_sections(
     try:
         if capture is None:
             raise InputError(trouble)
-        player, sheets = _player(data, capture, shown)
+        flipbook, sheets = _flipbook(data, capture, shown)
         strips, worst_sheet = _worst(data, capture, shown)
     except InputError as error:
         reason = trouble or f"No pictures: {error}. The numbers come from {data.run.folder} and do not need it."
@@ -275,7 +275,7 @@ def _picture_sections(
         "First seed. "
         "Difference: that to the truth, four times enlarged."
     )
-    sections = [Section(title=title, blocks=(player, Text(text=note, note=True)))]
+    sections = [Section(title=title, blocks=(flipbook, Text(text=note, note=True)))]
     if strips is not None:
         regions = (
             "Held-out motion, worst foreground PSNR first, each from another frame. FLIP error from black (0) to "
@@ -288,7 +288,7 @@ def _picture_sections(
     return sections, sheets | worst_sheet
 
 
-def _player(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Player, dict[str, bytes]]:
+def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Flipbook, dict[str, bytes]]:
     tracks = pictures.tracks(capture, shown, data.album, room=data.room)
     looks = charts.series_of([each.cell.config.method for each in shown])
     points = [
@@ -309,7 +309,7 @@ def _player(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Play
     wanted += [each for each in shown if each.cell.config.method in ON_SHEETS]
     sheet = pictures.sheet(pictures.comparisons(capture, (wanted or shown)[:AT_MOST_ON_SHEETS]))
     names = tuple(look.title for look in looks)
-    return Player(file=file, tracks=tuple(tracks), names=names, chart=chart), {file: sheet}
+    return Flipbook(file=file, tracks=tuple(tracks), names=names, chart=chart), {file: sheet}
 
 
 def _worst(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Strips | None, dict[str, bytes]]:
