@@ -30,7 +30,7 @@ from ash.kept import Kept
 from ash.mesh.drawing import draw_mesh, textured, topology_of
 from ash.presets import Recipe, named
 from ash.protocol import Display, DressedMesh, StageClock, TrainingOutcome
-from ash.searching import Build, Candidate, Choice, brief_training, sufficient, with_choice, write_choice
+from ash.searching import Build, Candidate, Choice, at_size, brief_training, sufficient, with_choice, write_choice
 from ash.template.refining import Refinement
 from ash.template.template import PosedTemplate, Template
 from ash.template_learning.learning import template_of
@@ -151,7 +151,7 @@ class DdcAvatar:
         self.choice: Choice | None = None
         if config.search:
             self.choice = sufficient(self._brief(config), config, capture)
-            config = _sized(config, self.choice.candidate, self.choice.fade)
+            config = at_size(config, self.choice.candidate, self.choice.fade)
         torch.manual_seed(config.seed)
         self.config = config
         initial = initial_texture(capture, self.template, build_lattice(capture.template, config.texture))
@@ -176,7 +176,7 @@ class DdcAvatar:
         """How the search builds its candidates: on this template."""
 
         def build(candidate: Candidate, capture: Capture) -> DdcAvatar:
-            sized = _sized(config, candidate, config.model.fade)
+            sized = at_size(config, candidate, config.model.fade)
             return DdcAvatar(replace(sized, training=brief_training(sized.training)), capture, template=self.template)
 
         return build
@@ -319,18 +319,6 @@ class DdcAvatar:
     def load(self, path: Path) -> None:
         """Read the weights that `save` wrote."""
         load_module(self.module, read_safetensors(path)[0], path)
-
-
-def _sized(config: DdcConfig, candidate: Candidate, fade: float) -> DdcConfig:
-    """The configuration at a candidate's size; its search is over. A mesh has no Phi."""
-    model = replace(
-        config.model,
-        width=max(1, config.model.width >> candidate.halvings),
-        window=config.model.window if candidate.history else 1,
-        fade=fade,
-    )
-    training = replace(config.training, texture_noise=candidate.noise or config.training.texture_noise)
-    return replace(config, model=model, training=training, search=False)
 
 
 def _of_preset(preset: str) -> DdcConfig:
