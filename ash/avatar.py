@@ -21,7 +21,7 @@ from ash.gaussians.initialising import blank_gaussians, initial_gaussians, relea
 from ash.kept import Kept
 from ash.model import AshModel, Decode, image_of
 from ash.protocol import StageClock, TrainingOutcome
-from ash.searching import Build, Candidate, Choice, brief_training, sufficient, with_choice, write_choice
+from ash.searching import Build, Candidate, Choice, at_size, brief_training, sufficient, with_choice, write_choice
 from ash.template.motion import normalised_motion
 from ash.template.template import Template
 from ash.template_learning.learning import template_of
@@ -257,13 +257,6 @@ class AshAvatar:
 
 def _sized(config: AshConfig, candidate: Candidate, fade: float) -> AshConfig:
     """The configuration at a candidate's size; its search is over."""
-    model = config.model
-    model = replace(
-        model,
-        width=max(1, model.width >> candidate.halvings),
-        window=model.window if candidate.history else 1,
-        global_features=model.global_features and candidate.place,
-        fade=fade,
-    )
-    training = replace(config.training, texture_noise=candidate.noise or config.training.texture_noise)
-    return replace(config, model=model, training=training, search=False)
+    sized: AshConfig = at_size(config, candidate, fade)
+    place = config.model.global_features and candidate.place
+    return replace(sized, model=replace(sized.model, global_features=place))

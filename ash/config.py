@@ -13,32 +13,19 @@ def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class ModelConfig:
-    """The avatar. Fields that the paper does not have say so."""
+class AtlasConfig:
+    """What ASH and the mesh avatar share: U-Nets in the template's atlas, and what they see. Light included."""
 
     texels: int  # resolution of the texel lattice, per side
     window: int  # frames in the motion-aware textures (k)
     yaw_normalise: bool  # turn the textures into the root's heading; the release does not
-    motion: bool = True  # False: one static set of Gaussians, skinned only (w/o mot.)
-    offset: bool = True  # False: no learned canonical offset d (w/o disp.)
     width: int = 64  # channels of the U-Nets' first level
     levels: int = 4  # halvings of the U-Nets
-    head: str = "unet"  # "unet": the paper's decoders; "blendshapes": local low-rank correctives, not in the paper
-    rank: int = 6  # correctives per body region of the head "blendshapes"
     norm: str = "none"  # of the U-Nets: "batch-as-released" (always on the statistics of its batch of 1), or "instance"
-    shared_trunk: bool = False  # one U-Net for E_geo and E_app together; not in the paper
     shuffle: int = 1  # decode at 1/shuffle of the lattice's resolution and shuffle pixels up; not in the paper
-    sh_degree: int = 3
-    global_features: bool = True  # Phi, from the root translation, at the bottleneck of E_app
-    global_mlp: str = "paper"  # Phi's layers: 32, 32, 16 wide; "released": 64, 32, 16 on the translation over 1.2
-    offset_unit_m: float = 0.01  # metres per unit of a decoded offset; the release decodes metres
-    quat_frame: str = "canonical"  # "canonical": rotations and SH turn with the surface; "world": as released
     standardise: bool = False  # decoders see deviations from the mean training texture, in its units; not in the paper
     fade: float = 0.0  # novelty of a pose, in spreads, at which corrections fade to 1/e; 0: never; not in the paper
-    base: bool = False  # learned static texels with the decoders as residual; not in the paper
-    refine: bool = False  # images also move the template's vertices, alike in all frames; the paper's future work
     light: bool = False  # colour times exp(SH2 of the posed normal), 27 numbers; not in the paper
-    dilation: float = 0.3  # px^2 added to the projected covariance
 
     @property
     def decoded_texels(self) -> int:
@@ -47,21 +34,48 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be built."""
-        one_of("head", self.head, ("unet", "blendshapes"))
         one_of("norm", self.norm, ("none", "batch-as-released", "instance"))
-        one_of("global_mlp", self.global_mlp, ("paper", "released"))
-        one_of("quat_frame", self.quat_frame, ("canonical", "world"))
         if self.shuffle < 1 or self.texels < 4 or self.texels % (self.shuffle * 2**self.levels):
             unit = f"shuffle {self.shuffle} times 2^levels {2**self.levels}"
             raise InputError(f"texels: expected a multiple of {unit}, got {self.texels}")
-        if not 0 <= self.sh_degree <= 3:
-            raise InputError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
-        if min(self.window, self.width, self.rank) < 1 or self.dilation < 0 or self.offset_unit_m <= 0:
-            raise InputError("window, width and rank must be at least 1, dilation at least 0, offset_unit_m positive")
+        if min(self.window, self.width) < 1:
+            raise InputError(f"window and width: expected at least 1, got {self.window} and {self.width}")
         if not 0 <= self.fade < math.inf:
             raise InputError(f"fade: expected a finite novelty of at least 0, got {self.fade}")
-        if self.fade and not (self.standardise and self.head == "unet" and self.decoded_texels % 4 == 0):
-            raise InputError("fade compares standardised textures: it needs U-Nets, standardise=True and 4 texels")
+        if self.fade and not (self.standardise and self.decoded_texels % 4 == 0):
+            raise InputError("fade compares standardised textures: it needs standardise=True and 4 texels")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ModelConfig(AtlasConfig):
+    """The avatar. Fields that the paper does not have say so."""
+
+    motion: bool = True  # False: one static set of Gaussians, skinned only (w/o mot.)
+    offset: bool = True  # False: no learned canonical offset d (w/o disp.)
+    head: str = "unet"  # "unet": the paper's decoders; "blendshapes": local low-rank correctives, not in the paper
+    rank: int = 6  # correctives per body region of the head "blendshapes"
+    shared_trunk: bool = False  # one U-Net for E_geo and E_app together; not in the paper
+    sh_degree: int = 3
+    global_features: bool = True  # Phi, from the root translation, at the bottleneck of E_app
+    global_mlp: str = "paper"  # Phi's layers: 32, 32, 16 wide; "released": 64, 32, 16 on the translation over 1.2
+    offset_unit_m: float = 0.01  # metres per unit of a decoded offset; the release decodes metres
+    quat_frame: str = "canonical"  # "canonical": rotations and SH turn with the surface; "world": as released
+    base: bool = False  # learned static texels with the decoders as residual; not in the paper
+    refine: bool = False  # images also move the template's vertices, alike in all frames; the paper's future work
+    dilation: float = 0.3  # px^2 added to the projected covariance
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be built."""
+        AtlasConfig.__post_init__(self)  # `super()` does not know a class that slots made anew.
+        one_of("head", self.head, ("unet", "blendshapes"))
+        one_of("global_mlp", self.global_mlp, ("paper", "released"))
+        one_of("quat_frame", self.quat_frame, ("canonical", "world"))
+        if not 0 <= self.sh_degree <= 3:
+            raise InputError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
+        if self.rank < 1 or self.dilation < 0 or self.offset_unit_m <= 0:
+            raise InputError("rank must be at least 1, dilation at least 0, offset_unit_m positive")
+        if self.fade and self.head != "unet":
+            raise InputError("fade compares what U-Nets see: it needs head='unet'")
         if self.refine and not self.offset:
             raise InputError("refine moves Gaussians by their canonical offset and needs offset=True")
         if not (self.motion or self.base):

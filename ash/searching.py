@@ -100,6 +100,18 @@ def brief_training(training: TrainingConfig) -> TrainingConfig:
     )
 
 
+def at_size(config: Any, candidate: Candidate, fade: float) -> Any:
+    """A configuration, of ASH or the mesh avatar, at a candidate's size; its search is over."""
+    model = replace(
+        config.model,
+        width=max(1, config.model.width >> candidate.halvings),
+        window=config.model.window if candidate.history else 1,
+        fade=fade,
+    )
+    training = replace(config.training, texture_noise=candidate.noise or config.training.texture_noise)
+    return replace(config, model=model, training=training, search=False)
+
+
 def sufficient(build: Build, config: Any, capture: Capture) -> Choice:
     """The smallest candidate that suffices on a capture, from the capture's `store` where it was found before."""
     if capture.store is None:

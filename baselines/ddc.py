@@ -6,7 +6,7 @@ pixel sees; texture and light are learned through perspective-correct bilinear s
 so is a displacement of the template's vertices.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,9 @@ from torch import Tensor, nn
 import ash.native.shading
 from ash.capture.dataset import Camera, Capture, Pose, TemplateMesh
 from ash.checkpoints import contiguous_state, load_module, read_safetensors
-from ash.config import AshConfig, ModelConfig, TemplateConfig, TrainingConfig
+from ash.config import AshConfig, AtlasConfig, TemplateConfig, TrainingConfig
 from ash.decoders import UNet
-from ash.files import write_atomic
+from ash.files import InputError, write_atomic
 from ash.gaussians.initialising import initial_texture
 from ash.gaussians.texels import LIGHT_COEFFICIENTS
 from ash.harmonics import sh_basis
@@ -30,7 +30,7 @@ from ash.kept import Kept
 from ash.mesh.drawing import draw_mesh, textured, topology_of
 from ash.presets import Recipe, named
 from ash.protocol import Display, DressedMesh, StageClock, TrainingOutcome
-from ash.searching import Build, Candidate, Choice, brief_training, sufficient, with_choice, write_choice
+from ash.searching import Build, Candidate, Choice, at_size, brief_training, sufficient, with_choice, write_choice
 from ash.template.refining import Refinement
 from ash.template.template import PosedTemplate, Template
 from ash.template_learning.learning import template_of
@@ -51,37 +51,30 @@ class DdcConfig:
     """The texture network sees what ASH's decoders see, at the same resolution and width."""
 
     texture: int  # pixels per side
-    texels: int  # resolution of the motion-aware textures, which the network sees
-    window: int
-    yaw_normalise: bool
-    width: int
-    levels: int
-    norm: str
-    standardise: bool
-    fade: float
+    model: AtlasConfig
     search: bool
-    light: bool
     training: TrainingConfig
     template: TemplateConfig
     refine: bool  # let images move the vertices; an exact surface has nothing to gain
     seed: int
 
+    def __post_init__(self) -> None:
+        """Refuse a texture that what is decoded cannot be shuffled up to."""
+        if self.texture < 1 or self.texture % self.model.decoded_texels:
+            raise InputError(f"texture: expected a multiple of {self.model.decoded_texels}, got {self.texture}")
+
+    @property
+    def shuffle(self) -> int:
+        """Texture pixels per decoded one, per side."""
+        return self.texture // self.model.decoded_texels
+
 
 def ddc_config(ash: AshConfig, *, seed: int, template: TemplateConfig) -> DdcConfig:
     """DDC with the budget and the conditions of an ASH preset."""
-    model: ModelConfig = ash.model
     return DdcConfig(
-        texture=TEXTURE_FACTOR * model.texels,
-        texels=model.decoded_texels,
-        window=model.window,
-        yaw_normalise=model.yaw_normalise,
-        width=model.width,
-        levels=model.levels,
-        norm=model.norm,
-        standardise=model.standardise,
-        fade=model.fade,
+        texture=TEXTURE_FACTOR * ash.model.texels,
+        model=AtlasConfig(**{field.name: getattr(ash.model, field.name) for field in fields(AtlasConfig)}),
         search=ash.search,
-        light=model.light,
         training=ash.training,
         template=template,
         refine=template.kind != "exact" or template.error_mm > 0,
@@ -103,34 +96,29 @@ class DdcModel(nn.Module):
         self.topology = topology_of(template.faces)
         self.texture = nn.Parameter(initial.clone())
         self.mean_correction: Tensor
-        if config.fade:
+        if config.model.fade:
             self.register_buffer("mean_correction", torch.zeros_like(initial))
         self.refinement = Refinement(mesh) if config.refine else None
         self.network = UNet(
-            6 * config.window,
-            3 * (config.texture // config.texels) ** 2,
-            width=config.width,
-            levels=config.levels,
-            norm=config.norm,
+            6 * config.model.window,
+            3 * config.shuffle**2,
+            width=config.model.width,
+            levels=config.model.levels,
+            norm=config.model.norm,
         )
-        self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.light else None
+        self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.model.light else None
 
     def dynamic_texture(self, conditions: Float[Tensor, "c r r"]) -> Float[Tensor, "3 t t"]:
         """The texture of a frame; far from the training motion the mean correction counts (`TextureDrawer.trust`)."""
         trust = self.textures.trust(conditions)
         if trust == 1 and self.texture.dtype == torch.float32 and self.texture.device.type == "cpu":
-            return ash.native.shading.add_shuffled(self.texture, self._decoded(conditions), self.shuffle)
+            return ash.native.shading.add_shuffled(self.texture, self._decoded(conditions), self.config.shuffle)
         added = self.correction(conditions)
         return self.texture + (added if trust == 1 else self.mean_correction.lerp(added, trust))
 
     def correction(self, conditions: Float[Tensor, "c r r"]) -> Float[Tensor, "3 t t"]:
         """What the network adds: decoded at the resolution of the motion-aware textures and shuffled up."""
-        return nn.functional.pixel_shuffle(self._decoded(conditions), self.shuffle)
-
-    @property
-    def shuffle(self) -> int:
-        """Texture pixels per decoded one, per side."""
-        return self.config.texture // self.config.texels
+        return nn.functional.pixel_shuffle(self._decoded(conditions), self.config.shuffle)
 
     def _decoded(self, conditions: Float[Tensor, "c r r"]) -> Float[Tensor, "o r r"]:
         return self.network(conditions[None].contiguous(memory_format=torch.channels_last))[0]  # type: ignore[no-any-return]
@@ -163,16 +151,16 @@ class DdcAvatar:
         self.choice: Choice | None = None
         if config.search:
             self.choice = sufficient(self._brief(config), config, capture)
-            config = _sized(config, self.choice.candidate, self.choice.fade)
+            config = at_size(config, self.choice.candidate, self.choice.fade)
         torch.manual_seed(config.seed)
         self.config = config
         initial = initial_texture(capture, self.template, build_lattice(capture.template, config.texture))
         textures = TextureDrawer(
-            build_lattice(capture.template, config.texels),
-            window=config.window,
-            yaw_normalise=config.yaw_normalise,
-            standardise=config.standardise,
-            fade=config.fade,
+            build_lattice(capture.template, config.model.decoded_texels),
+            window=config.model.window,
+            yaw_normalise=config.model.yaw_normalise,
+            standardise=config.model.standardise,
+            fade=config.model.fade,
         )
         textures.observe(self.template, capture.motion, capture.splits["train"].frames)
         self.module = DdcModel(config, capture.template, self.template, textures, initial)
@@ -188,7 +176,7 @@ class DdcAvatar:
         """How the search builds its candidates: on this template."""
 
         def build(candidate: Candidate, capture: Capture) -> DdcAvatar:
-            sized = _sized(config, candidate, config.fade)
+            sized = at_size(config, candidate, config.model.fade)
             return DdcAvatar(replace(sized, training=brief_training(sized.training)), capture, template=self.template)
 
         return build
@@ -227,7 +215,7 @@ class DdcAvatar:
 
     def fade_to(self, mean: Tensor) -> None:
         """What counts far from the training motion in place of what the network says there."""
-        if self.config.fade:
+        if self.config.model.fade:
             self.module.mean_correction.copy_(mean)
 
     def _posed_in(self, frame: int) -> PosedTemplate:
@@ -331,18 +319,6 @@ class DdcAvatar:
     def load(self, path: Path) -> None:
         """Read the weights that `save` wrote."""
         load_module(self.module, read_safetensors(path)[0], path)
-
-
-def _sized(config: DdcConfig, candidate: Candidate, fade: float) -> DdcConfig:
-    """The configuration at a candidate's size; its search is over. A mesh has no Phi."""
-    return replace(
-        config,
-        width=max(1, config.width >> candidate.halvings),
-        window=config.window if candidate.history else 1,
-        fade=fade,
-        training=replace(config.training, texture_noise=candidate.noise or config.training.texture_noise),
-        search=False,
-    )
 
 
 def _of_preset(preset: str) -> DdcConfig:

@@ -51,7 +51,8 @@ class OracleTexture(DdcAvatar):
 def _on_exact(preset: str) -> DdcConfig:
     config = named(preset)
     mesh = ddc_config(config, seed=0, template=TemplateConfig(kind="exact"))
-    return replace(mesh, texture=TEXTURE_FACTOR * config.model.texels, fade=0.0, search=False)
+    model = replace(mesh.model, fade=0.0)
+    return replace(mesh, texture=TEXTURE_FACTOR * config.model.texels, model=model, search=False)
 
 
 oracle_texture = Recipe(config=_on_exact, build=OracleTexture)  # One texture, at the preset's budget.

@@ -220,7 +220,7 @@ def textured(
     """`textured_naive`, by native kernels where only texture, light and weights need gradients."""
     if not _native(texture, light, uvs, normals) or uvs.requires_grad or normals.requires_grad or len(texture) != 3:
         return textured_naive(texture, uvs, uv_faces, normals, faces, light)
-    surface = ash.native.shading.Surface(*(t.contiguous() for t in (uvs, uv_faces, normals, faces)))
+    surface = ash.native.shading.TexturedMesh(*(t.contiguous() for t in (uvs, uv_faces, normals, faces)))
 
     def shade(triangles: Tensor, weights: Tensor) -> Tensor:
         return ash.native.shading.shade(texture, light, triangles, weights, surface)

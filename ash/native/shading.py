@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 from ash.native.library import address, load
 
 
-class Surface(NamedTuple):
+class TexturedMesh(NamedTuple):
     """Constants of the graph: what a mesh is drawn with. Float32 and int64, contiguous, on the CPU."""
 
     uvs: Tensor  # [u, 2]
@@ -20,7 +20,7 @@ class Surface(NamedTuple):
     faces: Tensor  # [f, 3]
 
 
-def shade(texture: Tensor, light: Tensor | None, triangles: Tensor, weights: Tensor, surface: Surface) -> Tensor:
+def shade(texture: Tensor, light: Tensor | None, triangles: Tensor, weights: Tensor, surface: TexturedMesh) -> Tensor:
     """Colours `[n, 3]` at points of triangles `[n]` with corners' weights `[n, 3]`.
 
     Differentiable in the texture `[3, t, s]`, the light `[9, 3]` and the weights.
@@ -31,7 +31,7 @@ def shade(texture: Tensor, light: Tensor | None, triangles: Tensor, weights: Ten
 class _Shade(Function):
     @staticmethod
     def forward(
-        ctx: Any, texture: Tensor, light: Tensor | None, weights: Tensor, triangles: Tensor, surface: Surface
+        ctx: Any, texture: Tensor, light: Tensor | None, weights: Tensor, triangles: Tensor, surface: TexturedMesh
     ) -> Tensor:
         texture, weights = texture.contiguous(), weights.contiguous()
         colours = torch.empty_like(weights)
@@ -60,7 +60,7 @@ class _Shade(Function):
         return grad_texture, grad_light, grad_weights, None, None
 
 
-def _inputs(saved: tuple[Tensor | None, ...], surface: Surface) -> list[int | None]:
+def _inputs(saved: tuple[Tensor | None, ...], surface: TexturedMesh) -> list[int | None]:
     texture, light, triangles, weights = saved
     assert texture is not None and weights is not None
     sizes = texture.shape[1:]

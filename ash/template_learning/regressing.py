@@ -30,14 +30,14 @@ LOOK_EVERY = 20  # Steps between two looks at the frames held out.
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Choice:
+class RidgeChoice:
     """What the frames left out preferred."""
 
     ridge: float  # infinite: the pose explains nothing
     static: bool  # whether what all frames share is kept
 
 
-def fit_linear(deformation: LinearDeformation, motion: Motion, tracked: Tracked) -> Choice:
+def fit_linear(deformation: LinearDeformation, motion: Motion, tracked: Tracked) -> RidgeChoice:
     """Fit the static displacement and the nodes' maps, in place."""
     dofs = torch.stack([deformation.window(Pose(motion, frame)) for frame in tracked.frames]).double()
     targets = _node_translations(deformation.graph, tracked.shift).double()
@@ -80,11 +80,11 @@ def _ridge(
 
 def _choose(
     deformation: LinearDeformation, tracked: Tracked, dofs: Tensor, targets: Tensor, sequence: np.ndarray
-) -> Choice:
+) -> RidgeChoice:
     """Leave out every fourth sequence (or a quarter of the only one) in turn, and score what it would have got."""
     folds = held_out_folds(sequence)
     if len(folds) < 2:
-        return Choice(ridge=np.inf, static=True)
+        return RidgeChoice(ridge=np.inf, static=True)
     nodes = deformation.graph.nodes
     true = (tracked.canonical - deformation.rest)[:, nodes].double()
     reach = deformation.reach.double()
@@ -99,7 +99,7 @@ def _choose(
         errors[index, -2] = _mean_square(true[fold] - static)
         errors[index, -1] = _mean_square(true[fold])
     best = int(errors.mean(0).argmin())
-    return Choice(ridge=(*RIDGES, np.inf, np.inf)[best], static=best <= len(RIDGES))
+    return RidgeChoice(ridge=(*RIDGES, np.inf, np.inf)[best], static=best <= len(RIDGES))
 
 
 def held_out_folds(sequence: np.ndarray) -> list[Tensor]:

@@ -28,7 +28,15 @@ from ash.protocol import TrainingOutcome
 from ash.training.adam import Adam
 from ash.training.batches import Batch, TrainingImages, cut_batch, draw_batch
 from ash.training.losses import l1_ssim_loss, ssim_target
-from ash.training.stopping import Course, Score, decided, gain_of_last_third, is_mark, last_step, rate_factor
+from ash.training.stopping import (
+    ReservedScore,
+    TrainingCourse,
+    decided,
+    gain_of_last_third,
+    is_mark,
+    last_step,
+    rate_factor,
+)
 
 LOG_EVERY = 50
 COMPARED_FRAMES = 40  # Training frames, evenly taken, over which the decoders' output is averaged and compared.
@@ -127,7 +135,7 @@ class _Run:
         self.initial_rates = [group["lr"] for group in groups]
         self.folder, self.path, self.log = folder, folder / "checkpoint.safetensors", folder / "log.jsonl"
         self.step, self.seconds, self.rate_scale = 0, 0.0, 1.0
-        self.course = Course()
+        self.course = TrainingCourse()
         self.average: dict[str, Tensor] = {}
         self.average_afresh()
         self.started, self.saved_at = time.process_time(), time.monotonic()
@@ -176,7 +184,7 @@ class _Run:
 
     def _score(self) -> None:
         with self._as_used():
-            score = Score(step=self.step, psnr=self._reserved_psnr())
+            score = ReservedScore(step=self.step, psnr=self._reserved_psnr())
         if math.isfinite(score.psnr):  # Else the next step meets the same, and deals with it.
             self.course = replace(self.course, scores=(*self.course.scores, score))
 
@@ -307,7 +315,7 @@ class _Run:
         for name, value in self.average.items():
             value.copy_(tensors[f"average.{name}"])
         self.step, self.seconds = int(facts["step"]), float(facts["seconds"])
-        self.rate_scale, self.course = float(facts["rate_scale"]), Course.from_json(facts["course"])
+        self.rate_scale, self.course = float(facts["rate_scale"]), TrainingCourse.from_json(facts["course"])
         self.started = time.process_time()
         return True
 

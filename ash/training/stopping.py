@@ -18,7 +18,7 @@ FINAL_LEARNING_RATE = 0.02  # Of the initial one, at the end.
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Score:
+class ReservedScore:
     """Foreground PSNR, dB, of the reserved views after a step, with the weights as they would be used."""
 
     step: int
@@ -26,10 +26,10 @@ class Score:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Course:
+class TrainingCourse:
     """What a training has decided so far. It is part of the checkpoint: a resumed run decides nothing anew."""
 
-    scores: tuple[Score, ...] = ()
+    scores: tuple[ReservedScore, ...] = ()
     decay_from: int | None = None  # None: not yet
     ended_by: str = ""  # "plateau", "steps" or "seconds": what the decay began for
 
@@ -38,10 +38,10 @@ class Course:
         return json.dumps(asdict(self))
 
     @classmethod
-    def from_json(cls, text: str) -> "Course":
+    def from_json(cls, text: str) -> "TrainingCourse":
         """What `to_json` wrote."""
         content = json.loads(text)
-        return cls(**{**content, "scores": tuple(Score(**score) for score in content["scores"])})
+        return cls(**{**content, "scores": tuple(ReservedScore(**score) for score in content["scores"])})
 
 
 def is_mark(step: int) -> bool:
@@ -52,7 +52,7 @@ def is_mark(step: int) -> bool:
     return step == round(FIRST_MARK * 1.5 ** (nearest / 2))
 
 
-def gain_of_last_third(scores: tuple[Score, ...], *, since: int = 0) -> float | None:
+def gain_of_last_third(scores: tuple[ReservedScore, ...], *, since: int = 0) -> float | None:
     """What the last third of the steps gained, dB; None where there is no score of two thirds of them after `since`."""
     if not scores:
         return None
@@ -60,7 +60,7 @@ def gain_of_last_third(scores: tuple[Score, ...], *, since: int = 0) -> float | 
     return scores[-1].psnr - before[-1].psnr if before else None
 
 
-def decided(course: Course, config: TrainingConfig, *, step: int, seconds: float) -> Course:
+def decided(course: TrainingCourse, config: TrainingConfig, *, step: int, seconds: float) -> TrainingCourse:
     """The course after a step: whether the rates begin to fall now, and for what.
 
     A plateau counts once the warm-up is less than half of the steps that are compared. `seconds`: CPU time so far.
@@ -78,7 +78,7 @@ def decided(course: Course, config: TrainingConfig, *, step: int, seconds: float
     return course
 
 
-def last_step(course: Course, config: TrainingConfig) -> int:
+def last_step(course: TrainingCourse, config: TrainingConfig) -> int:
     """After which step training ends, as far as that is known."""
     if course.decay_from is None:
         return config.steps
@@ -87,7 +87,7 @@ def last_step(course: Course, config: TrainingConfig) -> int:
     return min(config.steps, course.decay_from + math.ceil(course.decay_from * DECAY))
 
 
-def rate_factor(course: Course, config: TrainingConfig, *, step: int) -> float:
+def rate_factor(course: TrainingCourse, config: TrainingConfig, *, step: int) -> float:
     """By what the learning rates are multiplied in a step; 1 throughout in the schedule of the release."""
     if config.schedule == "constant":
         return 1.0

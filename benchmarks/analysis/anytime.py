@@ -6,7 +6,8 @@ from itertools import combinations, pairwise
 import numpy as np
 import pandas as pd
 
-from benchmarks.analysis.names import SPLIT_WORDS, look_of
+from benchmarks.analysis.names import SPLIT_NAMES, look_of
+from benchmarks.analysis.scores import RANKED_SPLITS
 from benchmarks.analysis.statistics import mean_interval
 from benchmarks.cell.cells import CellResult
 
@@ -25,7 +26,7 @@ def snapshots(results: Sequence[CellResult]) -> pd.DataFrame:
         end = result.training.seconds if result.training else result.value("speed", "", "train_s")
         where = (result.config.scene, result.config.method, result.config.seed)
         points = [(row.split, row.seconds, row.psnr) for row in result.snapshots]
-        final = [(split, end, result.value(split, "foreground", "psnr")) for split in SPLIT_WORDS]
+        final = [(split, end, result.value(split, "foreground", "psnr")) for split in RANKED_SPLITS]
         for split, seconds, psnr in points + [point for point in final if None not in point]:
             rows.append((where[0], split, where[1], seconds, where[2], psnr))
     return pd.DataFrame(rows, columns=list(COLUMNS))
@@ -87,8 +88,8 @@ def sentences(table: pd.DataFrame) -> list[str]:
     """The crossings in words; and pairs that never cross, by who leads throughout."""
     crossed = crossings(table)
     found = [
-        f"On {row.scene}, {SPLIT_WORDS[row.split]}, {look_of(row.leader).title} is ahead of {look_of(row.other).title}"
-        f" from {row.seconds:.0f} s of training on."
+        f"On {row.scene}, {SPLIT_NAMES[row.split].words}, {look_of(row.leader).title} is ahead of"
+        f" {look_of(row.other).title} from {row.seconds:.0f} s of training on."
         for row in crossed.itertuples()
     ]
     for (scene, split), here in table.groupby(["scene", "split"], sort=False):
@@ -98,7 +99,7 @@ def sentences(table: pd.DataFrame) -> list[str]:
             if len(margin) and ((margin > 0).all() or (margin < 0).all()):
                 ahead, behind = (first, second) if margin.iloc[0] > 0 else (second, first)
                 found.append(
-                    f"On {scene}, {SPLIT_WORDS[split]}, {look_of(ahead).title} is ahead of {look_of(behind).title}"
-                    f" at every time, by {abs(margin).min():.1f} to {abs(margin).max():.1f} dB."
+                    f"On {scene}, {SPLIT_NAMES[split].words}, {look_of(ahead).title} is ahead of"
+                    f" {look_of(behind).title} at every time, by {abs(margin).min():.1f} to {abs(margin).max():.1f} dB."
                 )
     return found

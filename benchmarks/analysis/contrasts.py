@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.analysis.names import look_of
-from benchmarks.analysis.pareto import Candidate
+from benchmarks.analysis.pareto import Contender
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Scores, foreground
 from benchmarks.analysis.statistics import Difference, hierarchical_bootstrap, holm, paired, welch
 from benchmarks.cell.methods import is_oracle
@@ -65,13 +65,13 @@ def contrasts(scores: Scores, scene: str, *, reference: str = "ash") -> tuple[Co
     )
 
 
-def candidates(scores: Scores, scene: str, split: str) -> tuple[Candidate, ...]:
+def candidates(scores: Scores, scene: str, split: str) -> tuple[Contender, ...]:
     """The methods that compete on a scene, with foreground PSNR per seed and milliseconds per frame."""
     found = []
     for method in scores.methods(scene):
         frame, values = scores.get(scene, method, FRAME_MS), scores.values(scene, method, foreground(split))
         if frame and values and not is_oracle(method) and scores.whole(scene, method):
-            found.append(Candidate(name=method, qualities=tuple(values), cost=frame.mean))
+            found.append(Contender(name=method, qualities=tuple(values), cost=frame.mean))
     return tuple(found)
 
 

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from benchmarks.analysis.names import SPLIT_WORDS, look_of
+from benchmarks.analysis.names import look_of
+from benchmarks.analysis.scores import RANKED_SPLITS
 from benchmarks.analysis.statistics import mean_interval
 from benchmarks.cell.cells import CellResult
 from benchmarks.suites.stress import FOOTAGE_FRAMES
@@ -21,7 +22,7 @@ def curves(results: Sequence[CellResult]) -> pd.DataFrame:
     places = dict.fromkeys((r.config.scene, r.config.method, r.config.severity) for r in used)
     for scene, method, severity in places:
         own = [r for r in used if (r.config.scene, r.config.method, r.config.severity) == (scene, method, severity)]
-        for split in SPLIT_WORDS:
+        for split in RANKED_SPLITS:
             scores = [score for r in own if (score := r.value(split, "foreground", "psnr")) is not None]
             if scores:
                 interval = mean_interval(scores)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import product
 
 from benchmarks.analysis.contrasts import difference
-from benchmarks.analysis.names import SPLIT_WORDS
+from benchmarks.analysis.names import SPLIT_NAMES
 from benchmarks.analysis.scores import Quantity, Scores, foreground
 from benchmarks.analysis.statistics import Interval, mean_interval
 from benchmarks.cell.methods import ON_EXACT, WRONG_BY_MM
@@ -84,7 +84,7 @@ def margin_curves(scores: Scores) -> tuple[MarginCurve, ...]:
 def sentence(curve: MarginCurve) -> str:
     """The finding in one sentence."""
     first, last = curve.known[0], curve.known[-1]
-    text = f"On {curve.scene}, {SPLIT_WORDS[curve.split]}: "
+    text = f"On {curve.scene}, {SPLIT_NAMES[curve.split].words}: "
     text += f"ASH minus DDC goes from {first.mean:+.1f} dB at {first.error_mm:g} mm"
     text += f" to {last.mean:+.1f} dB at {last.error_mm:g} mm of template error"
     crossing = curve.crossing_mm

@@ -14,6 +14,14 @@ class Look:
     colour: str
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SplitName:
+    """What a split, or the place of costs, is called over a column, and in a sentence."""
+
+    title: str
+    words: str
+
+
 LOOKS = {
     "ash": Look(title="ASH", colour="#2f6fde"),
     "ash_truth": Look(title="ASH, exact surface", colour="#2f6fde"),
@@ -34,7 +42,13 @@ LOOKS = {
     "nearest": Look(title="nearest image", colour="#7a869a"),
     "oracle_texture": Look(title="best texture, exact mesh", colour="#b8860b"),
 }
-SPLIT_WORDS = {"novel_view": "held-out views", "novel_pose": "held-out motion"}  # In sentences; tables have titles.
+SPLIT_NAMES = {
+    "novel_view": SplitName(title="Novel view", words="held-out views"),
+    "novel_pose": SplitName(title="Novel pose", words="held-out motion"),
+    "train_view": SplitName(title="Training view", words="training views"),
+    "speed": SplitName(title="Cost", words="cost"),
+    "memory": SplitName(title="Cost", words="cost"),
+}
 SPARE_COLOURS = ("#b8860b", "#c2415c", "#5b8c2a", "#7a869a", "#008fb3", "#a0522d")
 EXACT = {"ash": "ash_truth", "ddc": "ddc_truth"}  # A method and the same method given the exact surface.
 

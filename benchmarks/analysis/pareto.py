@@ -16,7 +16,7 @@ REFERENCE_MS, REFERENCE_DB = 1000.0, 10.0  # The hypervolume's fixed corner: a f
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Candidate:
+class Contender:
     """A method with its quality for each seed and its cost."""
 
     name: str
@@ -38,13 +38,13 @@ class Sufficient:
     loss_bound_db: float
 
 
-def front(candidates: Sequence[Candidate]) -> tuple[str, ...]:
+def front(candidates: Sequence[Contender]) -> tuple[str, ...]:
     """Names of those that no other beats in both quality and cost, cheapest first."""
     kept = [c for c in candidates if not any(_dominates(other, c) for other in candidates)]
     return tuple(c.name for c in sorted(kept, key=lambda c: c.cost))
 
 
-def hypervolume(candidates: Sequence[Candidate]) -> float:
+def hypervolume(candidates: Sequence[Contender]) -> float:
     """Area that the front covers up to the fixed corner, in dB times decades of time."""
     area, reached = 0.0, REFERENCE_DB
     for candidate in sorted(candidates, key=lambda c: c.cost):
@@ -55,13 +55,13 @@ def hypervolume(candidates: Sequence[Candidate]) -> float:
 
 
 def hypervolume_interval(
-    candidates: Sequence[Candidate], *, rng: np.random.Generator, resamples: int = 1000
+    candidates: Sequence[Contender], *, rng: np.random.Generator, resamples: int = 1000
 ) -> tuple[float, float]:
     """95 % interval of the hypervolume by drawing seeds anew."""
     areas = []
     for _ in range(resamples):
         drawn = [
-            Candidate(name=c.name, cost=c.cost, qualities=tuple(rng.choice(c.qualities, len(c.qualities)).tolist()))
+            Contender(name=c.name, cost=c.cost, qualities=tuple(rng.choice(c.qualities, len(c.qualities)).tolist()))
             for c in candidates
         ]
         areas.append(hypervolume(drawn))
@@ -69,7 +69,7 @@ def hypervolume_interval(
     return float(low), float(high)
 
 
-def smallest_sufficient(candidates: Sequence[Candidate], *, margin: float = SUFFICIENT_DB) -> Sufficient | None:
+def smallest_sufficient(candidates: Sequence[Contender], *, margin: float = SUFFICIENT_DB) -> Sufficient | None:
     """The cheapest candidate whose loss to the best has an upper 95 % bound (one-sided) below the margin.
 
     None with fewer than two seeds, for one seed bounds nothing. The best itself loses nothing and always qualifies.
@@ -84,5 +84,5 @@ def smallest_sufficient(candidates: Sequence[Candidate], *, margin: float = SUFF
     return None
 
 
-def _dominates(a: Candidate, b: Candidate) -> bool:
+def _dominates(a: Contender, b: Contender) -> bool:
     return a.quality >= b.quality and a.cost <= b.cost and (a.quality > b.quality or a.cost < b.cost)

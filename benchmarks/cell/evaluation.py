@@ -46,7 +46,7 @@ class PosedFrames:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Drawn:
+class Submission:
     """What a trained method left besides its stored pictures, when its process ended."""
 
     views: tuple[View, ...]
@@ -58,7 +58,7 @@ class Drawn:
     isolated: bool
 
 
-def draw_all(cell: Cell, capture: Capture, host: Host) -> Drawn:
+def draw_all(cell: Cell, capture: Capture, host: Host) -> Submission:
     """Let the method draw every view that is scored, and measure it; nothing is compared with truth yet."""
     views = evaluated_views(capture)
     host.meet(cell.folder.resolve() / EXAM, capture)
@@ -66,7 +66,7 @@ def draw_all(cell: Cell, capture: Capture, host: Host) -> Drawn:
         write_image(prediction_path(cell.folder, view), metrics.quantise(host.draw(view, capture.cameras[view.camera])))
     timing = _timing(host, playback(views))
     described = host.describe()
-    return Drawn(
+    return Submission(
         views=views,
         timing=timing,
         geometry=_pose_geometry(host, described, views),
@@ -78,7 +78,7 @@ def draw_all(cell: Cell, capture: Capture, host: Host) -> Drawn:
 
 
 def judge(
-    cell: Cell, capture: Capture, drawn: Drawn, train_s: float, training: TrainingOutcome | None = None
+    cell: Cell, capture: Capture, drawn: Submission, train_s: float, training: TrainingOutcome | None = None
 ) -> CellResult:
     """Score the stored pictures, when the method's process is gone.
 
@@ -274,7 +274,7 @@ def _surface_distance(capture: Capture, means: np.ndarray, frame: int) -> float 
     return metrics.surface_distance_mm(some, vertices, faces)
 
 
-def _cost_summary(drawn: Drawn, train_s: float) -> tuple[Summary, ...]:
+def _cost_summary(drawn: Submission, train_s: float) -> tuple[Summary, ...]:
     timing, described = drawn.timing, drawn.described
     costs = {
         ("speed", "frame_ms"): float(np.median(timing.frame_ms)),

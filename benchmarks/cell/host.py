@@ -20,10 +20,9 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, distribution
 from importlib.util import find_spec
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
-import psutil
 
 from ash.capture.dataset import Camera, Capture
 from ash.capture.formats import write_cameras, write_motion
@@ -32,6 +31,7 @@ from ash.files import one_line, require_plain
 from ash.protocol import TrainingOutcome
 from benchmarks.cell import isolation
 from benchmarks.cell.cells import CHECKPOINT, Cell, Status
+from benchmarks.cell.children import end_family, pass_on, peak_memory_mb
 from benchmarks.cell.guest import LARGEST_HEADER
 from benchmarks.cell.methods import OUR_PACKAGES, Method
 from benchmarks.cell.sources import editable_folder, package_files
@@ -39,7 +39,6 @@ from benchmarks.cell.views import View
 
 WORK, EXAM, BASE = "work", "exam", "room"  # In a cell's folder: the method's own, what it is to draw, its file system.
 KEPT = (CHECKPOINT, "log.jsonl")
-LOUDEST, LAST_WORDS = 1 << 20, 1 << 14  # bytes of printing that are kept: the first of them, and the last
 MOST_POINTS, MOST_COUNT = 10_000_000, 10**13
 LOWEST, HIGHEST = -0.5, 2.0  # of a picture; rounding and overbright colours leave 0..1 a little, other units far
 CLOCK_SLACK_MS, CLOCK_SLACK = 2.0, 0.1
@@ -169,11 +168,7 @@ class Host:
 
     def peak_memory_mb(self) -> float:
         """The largest resident memory that one of the method's processes had so far, MiB."""
-        peaks = [0.0]
-        with contextlib.suppress(psutil.Error):
-            whole = psutil.Process(self._process.pid)
-            peaks += [_peak_mb(member) for member in (whole, *whole.children(recursive=True))]
-        return max(peaks)
+        return peak_memory_mb(self._process.pid)
 
     def _ask(self, what: str, *, most: int = 0, **arguments: Any) -> tuple[dict[str, Any], bytes]:
         """Send a request and read the checked reply: a header, and at most `most` bytes besides."""
@@ -255,12 +250,12 @@ def hosted(
         try:
             host._receive(0)
         except isolation.Refused:
-            _end(host._process)
+            end_family(host._process)
             host, pump = _start(order | {"room": None}, isolated=False)
             host._receive(0)
         yield host
     finally:
-        _end(host._process)
+        end_family(host._process)
         for descriptor in (host._requests, host._replies):
             os.close(descriptor)
         pump.join(5)
@@ -342,77 +337,9 @@ def _start(order: dict[str, Any], *, isolated: bool) -> tuple[Host, threading.Th
     os.close(theirs)
     os.close(answers)
     assert process.stdout is not None
-    pump = threading.Thread(target=_pass_on, args=(process.stdout,), daemon=True)
+    pump = threading.Thread(target=pass_on, args=(process.stdout,), daemon=True)
     pump.start()
     return Host(process, requests, replies, isolated=isolated), pump
-
-
-def _pass_on(output: IO[bytes]) -> None:
-    """Print what the method prints: the first megabyte of it, and its last words."""
-    kept, left_out, last = 0, 0, b""
-    while part := os.read(output.fileno(), 1 << 16):
-        now = part[: max(0, LOUDEST - kept)]
-        os.write(2, now)
-        kept += len(now)
-        rest = part[len(now) :]
-        left_out += len(rest)
-        last = (last + rest)[-LAST_WORDS:]
-    if left_out:
-        os.write(2, f"\n({left_out - len(last)} bytes left out)\n".encode() + last)
-    output.close()
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a method's process and everything that it started."""
-    family = []
-    with contextlib.suppress(psutil.Error):
-        whole = psutil.Process(process.pid)
-        family = [*whole.children(recursive=True), whole]
-    for member in reversed(family):
-        with contextlib.suppress(psutil.Error):
-            member.kill()
-    process.wait()
-    # What lost its parents has become ours (see `adopt_orphans`).
-    deadline = time.monotonic() + 5
-    while (orphans := _children()) and time.monotonic() < deadline:
-        for orphan in orphans:
-            with contextlib.suppress(psutil.Error):
-                for member in (*orphan.children(recursive=True), orphan):
-                    member.kill()
-        _reap()
-
-
-def adopt_orphans() -> None:
-    """Let what a method leaves behind become this process's child, so that it can be ended with the cell."""
-    if sys.platform.startswith("linux"):
-        import ctypes
-
-        ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER
-
-
-def _children() -> list[psutil.Process]:
-    if not _adopting():
-        return []
-    return psutil.Process().children()
-
-
-def _adopting() -> bool:
-    return os.environ.get("ASH_BENCH_CELL_PROCESS") == str(os.getpid())
-
-
-def _reap() -> None:
-    with contextlib.suppress(ChildProcessError):
-        while os.waitpid(-1, os.WNOHANG)[0]:
-            pass
-    time.sleep(0.02)
-
-
-def _peak_mb(process: psutil.Process) -> float:
-    status = Path(f"/proc/{process.pid}/status")
-    if status.exists():
-        lines = [line for line in status.read_text().splitlines() if line.startswith("VmHWM")]
-        return int(lines[0].split()[1]) / 1024 if lines else 0.0
-    return float(process.memory_info().rss / 2**20)
 
 
 def _number(value: Any, what: str) -> float:

@@ -36,8 +36,9 @@ from benchmarks.cell.cells import (
     stored_prediction,
     write_result,
 )
+from benchmarks.cell.children import adopt_orphans
 from benchmarks.cell.evaluation import _flicker_summary, _gap_summary, _image_summary, _score, draw_all, judge
-from benchmarks.cell.host import Host, Killed, MethodFailed, adopt_orphans, give_files, hosted, take_files
+from benchmarks.cell.host import Host, Killed, MethodFailed, give_files, hosted, take_files
 from benchmarks.cell.methods import ORACLES, configured, find_method
 from benchmarks.cell.sealing import seen_by_method, watched
 from benchmarks.cell.views import View

@@ -14,6 +14,8 @@ from scipy import stats
 
 from ash.capture.formats import load_capture
 from ash.files import InputError, write_atomic
+from benchmarks.analysis.names import SPLIT_NAMES
+from benchmarks.analysis.scores import RANKED_SPLITS
 from benchmarks.cell.cells import Cell, CellResult, ViewScore, read_result, stored_prediction
 from benchmarks.cell.metrics import METRICS, occupied, on_black
 from benchmarks.cell.views import View
@@ -30,7 +32,6 @@ QUANTITIES = (
     ("speed", "", "frame_ms"),
     ("speed", "", "train_s"),
 )
-SPLIT_WORDS = {"novel_view": "held-out views", "novel_pose": "held-out motion", "speed": "cost"}
 WORST = 2  # Frames of each run that are shown of a row.
 GREY, MARGIN = 236, 6  # Behind the subject, and pixels around it.
 
@@ -54,7 +55,7 @@ class Change:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Frame:
+class WorstFrame:
     """A view that is among the worst of one of the runs, as both draw it. Pictures are data URIs."""
 
     title: str
@@ -139,7 +140,7 @@ def _change(
     return Change(
         scene=row[0],
         method=row[1],
-        what=f"{METRICS[metric].title}, {SPLIT_WORDS[split]}",
+        what=f"{METRICS[metric].title}, {SPLIT_NAMES[split].words}",
         unit=METRICS[metric].unit,
         before=means[0],
         after=means[1],
@@ -195,10 +196,10 @@ def _told(change: Change) -> dict[str, str]:
     }
 
 
-def _worst_frames(before: tuple[Cell, CellResult], after: tuple[Cell, CellResult]) -> Iterator[Frame]:
+def _worst_frames(before: tuple[Cell, CellResult], after: tuple[Cell, CellResult]) -> Iterator[WorstFrame]:
     """The worst views of each run that the other has as well, of the first seed; none where pictures are gone."""
     scores = [{_key(view): view for view in result.views} for _, result in (before, after)]
-    shared = [key for key in scores[0] if key in scores[1] and key[0] in SPLIT_WORDS]  # Training views are no exam.
+    shared = [key for key in scores[0] if key in scores[1] and key[0] in RANKED_SPLITS]  # Training views are no exam.
     chosen: dict[tuple[str, str, int], str] = {}
     for name, views in zip(("before", "after"), scores, strict=True):
         for key in sorted(shared, key=lambda key, views=views: _db(views[key]))[:WORST]:  # type: ignore[misc]
@@ -208,8 +209,8 @@ def _worst_frames(before: tuple[Cell, CellResult], after: tuple[Cell, CellResult
             truth, drawn = _pixels(before[0], after[0], key)
         except InputError:
             return
-        yield Frame(
-            title=f"{SPLIT_WORDS[key[0]]}, camera {key[1]}, frame {key[2]}: among the worst {run}",
+        yield WorstFrame(
+            title=f"{SPLIT_NAMES[key[0]].words}, camera {key[1]}, frame {key[2]}: among the worst {run}",
             before_db=_db(scores[0][key]),
             after_db=_db(scores[1][key]),
             truth=truth,

@@ -134,20 +134,20 @@ class Strips:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Player:
+class Flipbook:
     """The pictures of all methods, to be put side by side and stepped through; `file` is the sheet for Markdown.
 
     `tracks` is what the page's script reads: see `pictures.py`. `chart` shows PSNR per frame.
     """
 
-    kind: ClassVar[str] = "player"
+    kind: ClassVar[str] = "flipbook"
     file: str
     tracks: tuple[dict[str, Any], ...]
     names: tuple[str, ...]
     chart: Figure
 
 
-Block = Text | Bullets | Table | Chart | Strips | Player
+Block = Text | Bullets | Table | Chart | Strips | Flipbook
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -6,12 +6,11 @@ import pandas as pd
 
 from benchmarks.analysis import contrasts, pareto
 from benchmarks.analysis.contrasts import Contrast
-from benchmarks.analysis.names import EXACT, SPLIT_WORDS, look_of
+from benchmarks.analysis.names import EXACT, SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Score, Scores, foreground
 from benchmarks.cell.methods import WRONG_BY_MM
 from benchmarks.report import charts
 from benchmarks.report.charts import Figure, Series
-from benchmarks.report.tables import SPLIT_TITLES
 
 STAGES = {
     "stg1_ms": Series(title="Stg.1 template", colour="#2f6fde"),
@@ -33,7 +32,7 @@ def speed_figure(scores: Scores, scene: str) -> Figure | None:
     points, front, links = [], [], []
     notes: dict[str, str] = {}
     for split in RANKED_SPLITS:
-        panel = SPLIT_WORDS[split].capitalize()
+        panel = SPLIT_NAMES[split].words.capitalize()
         competing = contrasts.candidates(scores, scene, split)
         sufficient = pareto.smallest_sufficient(competing)
         here = {
@@ -111,7 +110,7 @@ def effects_figure(found: Sequence[Contrast], scene: str) -> Figure | None:
     """The contrasts as a chart, where they are many enough for a table to be hard to read."""
     rows = [
         {
-            "panel": SPLIT_TITLES[c.split],
+            "panel": SPLIT_NAMES[c.split].title,
             "row": c.title,
             "mean": c.test.mean,
             "low": c.test.low,

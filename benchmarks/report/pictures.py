@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ash.capture.dataset import Capture
 from benchmarks.analysis.causes import REGION_COLOURS, psnr_of, worst_frames
-from benchmarks.analysis.names import SPLIT_WORDS, look_of
+from benchmarks.analysis.names import SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import RANKED_SPLITS
 from benchmarks.cell import metrics
 from benchmarks.cell.cells import Cell, CellResult, ViewScore, stored_prediction
@@ -189,7 +189,7 @@ def _track(
     shape = truths[frames[0]][crop].shape
     kept = sorted(keys)
     return {
-        "title": f"{SPLIT_WORDS[split].capitalize()}, camera {camera}",
+        "title": f"{SPLIT_NAMES[split].words.capitalize()}, camera {camera}",
         "split": split,
         "camera": camera,
         "frames": kept,
@@ -228,7 +228,7 @@ def _compare(capture: Capture, shown: Sequence[Shown], view: ViewScore) -> Frame
         images.append(Frame(caption=each.title, score=f"{psnr_of(own):.1f} dB", pixels=on_paper(prediction[crop])))
         errors.append(Frame(caption="FLIP error", score=f"{flip:.3f}", pixels=_flip(prediction, truth, crop)))
     return Frames(
-        title=f"{SPLIT_WORDS[view.split]}, camera {view.camera}, frame {view.frame}",
+        title=f"{SPLIT_NAMES[view.split].words}, camera {view.camera}, frame {view.frame}",
         images=tuple(images),
         errors=tuple(errors),
     )

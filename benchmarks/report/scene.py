@@ -10,7 +10,7 @@ from ash.files import InputError
 from benchmarks.analysis import contrasts, conventions
 from benchmarks.analysis.causes import REGIONS
 from benchmarks.analysis.contrasts import Contrast
-from benchmarks.analysis.names import EXACT, SPLIT_WORDS, is_ours, look_of
+from benchmarks.analysis.names import EXACT, SPLIT_NAMES, is_ours, look_of
 from benchmarks.analysis.scores import RANKED_SPLITS, Quantity, Scores, curves_of, foreground
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS
@@ -21,8 +21,8 @@ from benchmarks.report.content import (
     Bullets,
     Chart,
     Entry,
+    Flipbook,
     Head,
-    Player,
     Row,
     Section,
     Strips,
@@ -31,9 +31,9 @@ from benchmarks.report.content import (
     texts,
 )
 from benchmarks.report.pictures import Album, Shown
-from benchmarks.report.tables import SPLIT_TITLES
 from benchmarks.suites.runs import Run
 
+IMAGE_SPLITS = (*RANKED_SPLITS, "train_view")  # In the order of the columns.
 COSTS = (
     "frame_ms",
     *figures.STAGE_METRICS,
@@ -128,9 +128,9 @@ def what_was_compared(data: SceneData, capture: Capture | None) -> str:
     text += "."
     judged = []
     seen = scores.images.query("scene == @scene")[["split", "camera", "frame"]].drop_duplicates()
-    for split, images in seen[seen["split"].isin(SPLIT_WORDS)].groupby("split", sort=False):
+    for split, images in seen[seen["split"].isin(RANKED_SPLITS)].groupby("split", sort=False):
         cameras, frames = (_count(images[name].nunique(), name) for name in ("camera", "frame"))
-        judged.append(f"{len(images)} images of {SPLIT_WORDS[str(split)]} ({cameras}, {frames})")
+        judged.append(f"{len(images)} images of {SPLIT_NAMES[str(split)].words} ({cameras}, {frames})")
     text += f" They are judged on {' and '.join(judged)}." if judged else ""
     seconds = rows.query("metric == 'train_s' and status == 'done'")["value"]
     if len(seconds):
@@ -163,9 +163,9 @@ def _more_tables(scores: Scores, scene: str) -> tuple[Table, ...]:
     geometry = [Quantity(split, "", metric) for split in RANKED_SPLITS for metric in ("template_mm", "surface_mm")]
     geometry.append(foreground("novel_pose", "flicker"))
     regions = (("full", "psnr"), ("release_crop", "psnr"), ("full", "ssim"), ("full", "flip"))
-    whole = [Quantity(split, region, metric) for split in SPLIT_TITLES for region, metric in regions]
+    whole = [Quantity(split, region, metric) for split in IMAGE_SPLITS for region, metric in regions]
     training = [foreground("train_view", metric) for metric in ("psnr", "ssim", "flip")]
-    ceiling = [foreground(split, "noise_ceiling") for split in SPLIT_TITLES]
+    ceiling = [foreground(split, "noise_ceiling") for split in IMAGE_SPLITS]
     asked = {
         "Geometry against the truth, and flicker beyond the truth's own": geometry,
         "Whole frame, and the crop of the released ASH code": whole,
@@ -202,7 +202,7 @@ def _contrasts(scores: Scores, scene: str) -> list[Section]:
 
 def _contrast_row(c: Contrast) -> Row:
     numbers = (
-        Entry(text=SPLIT_TITLES[c.split]),
+        Entry(text=SPLIT_NAMES[c.split].title),
         Entry(text=f"{c.test.mean:+.2f}", sort=c.test.mean, mark="strong" if c.established else ""),
         Entry(text=f"[{c.test.low:+.2f}, {c.test.high:+.2f}]", sort=c.test.low),
         Entry(text="n/a" if c.bootstrap[0] != c.bootstrap[0] else f"[{c.bootstrap[0]:+.2f}, {c.bootstrap[1]:+.2f}]"),
@@ -231,7 +231,7 @@ def _exact(scores: Scores, scene: str) -> list[Section]:
         margins = [Entry(text=f"{margin:+.2f}", mark="strong") for margin in (ash - ddc, ash_exact - ddc_exact)]
         rows.append(Row(name="ASH minus DDC", entries=(*margins, Entry(text="")), apart=True))
         heads = tuple(Head(title=title, unit="dB") for title in ("honest template", "exact surface", "gain"))
-        blocks.append(Table(title=SPLIT_TITLES[split], columns=heads, rows=tuple(rows)))
+        blocks.append(Table(title=SPLIT_NAMES[split].title, columns=heads, rows=tuple(rows)))
     note = (
         "Foreground PSNR. Splats can leave a wrong template, a textured mesh cannot: the margin between the two "
         "is a function "
@@ -265,7 +265,7 @@ def _picture_sections(
     try:
         if capture is None:
             raise InputError(trouble)
-        player, sheets = _player(data, capture, shown)
+        flipbook, sheets = _flipbook(data, capture, shown)
         strips, worst_sheet = _worst(data, capture, shown)
     except InputError as error:
         reason = trouble or f"No pictures: {error}. The numbers come from {data.run.folder} and do not need it."
@@ -275,7 +275,7 @@ def _picture_sections(
         "First seed. "
         "Difference: that to the truth, four times enlarged."
     )
-    sections = [Section(title=title, blocks=(player, Text(text=note, note=True)))]
+    sections = [Section(title=title, blocks=(flipbook, Text(text=note, note=True)))]
     if strips is not None:
         regions = (
             "Held-out motion, worst foreground PSNR first, each from another frame. FLIP error from black (0) to "
@@ -288,7 +288,7 @@ def _picture_sections(
     return sections, sheets | worst_sheet
 
 
-def _player(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Player, dict[str, bytes]]:
+def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Flipbook, dict[str, bytes]]:
     tracks = pictures.tracks(capture, shown, data.album, room=data.room)
     looks = charts.series_of([each.cell.config.method for each in shown])
     points = [
@@ -309,7 +309,7 @@ def _player(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Play
     wanted += [each for each in shown if each.cell.config.method in ON_SHEETS]
     sheet = pictures.sheet(pictures.comparisons(capture, (wanted or shown)[:AT_MOST_ON_SHEETS]))
     names = tuple(look.title for look in looks)
-    return Player(file=file, tracks=tuple(tracks), names=names, chart=chart), {file: sheet}
+    return Flipbook(file=file, tracks=tuple(tracks), names=names, chart=chart), {file: sheet}
 
 
 def _worst(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Strips | None, dict[str, bytes]]:
@@ -360,7 +360,7 @@ def _convention_table(found: conventions.Comparison) -> Table:
     taus = tuple(Entry(text=f"{tau:.2f}", sort=tau) for tau in found.agreement)
     rows.append(Row(name="agreement with ours (Kendall's tau)", entries=taus, apart=True))
     heads = tuple(Head(title=title) for title in conventions.CONVENTIONS.values())
-    return Table(title=f"{SPLIT_TITLES[found.split]}, {measure.title}", columns=heads, rows=tuple(rows))
+    return Table(title=f"{SPLIT_NAMES[found.split].title}, {measure.title}", columns=heads, rows=tuple(rows))
 
 
 def _count(number: int, word: str) -> str:

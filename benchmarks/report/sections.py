@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 import pandas as pd
 
 from benchmarks.analysis import anytime, footage, margin, necessity, paper, stability
-from benchmarks.analysis.names import SPLIT_WORDS, look_of
+from benchmarks.analysis.names import SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Scores, foreground
 from benchmarks.analysis.statistics import Difference
 from benchmarks.cell.cells import CellResult
@@ -14,7 +14,7 @@ from benchmarks.report import charts
 from benchmarks.report.charts import Figure, Series
 from benchmarks.report.content import Block, Bullets, Chart, Entry, Head, Mark, Row, Section, Table, Text, texts
 from benchmarks.report.glossary import GLOSSARY
-from benchmarks.report.tables import SPLIT_TITLES, entry_of
+from benchmarks.report.tables import entry_of
 
 WHISKERS = "Whiskers: 95 % interval over seeds."
 
@@ -98,7 +98,7 @@ def _spent_figure(table: pd.DataFrame, name: str, title: str, spent: str, x_titl
     names = {method: look.title for method, look in zip(methods, looks, strict=True)}
     samples = pd.DataFrame(
         {
-            "panel": table["scene"] + ", " + table["split"].map(SPLIT_WORDS),
+            "panel": table["scene"] + ", " + table["split"].map(lambda split: SPLIT_NAMES[split].words),
             "x_title": x_title,
             "series": table["method"].map(names),
             "x": table[spent].astype(float),
@@ -128,7 +128,7 @@ def beside_the_paper(scores: Scores, suite: str) -> list[Section]:
     for table, agreements in paper.tables_beside(scores):
         blocks.append(_paper_table(scores, table))
         blocks.append(
-            Bullets(items=tuple(f"Kendall's tau, {SPLIT_TITLES[a.split].lower()}: {a.text}" for a in agreements))
+            Bullets(items=tuple(f"Kendall's tau, {SPLIT_NAMES[a.split].title.lower()}: {a.text}" for a in agreements))
         )
     note = (
         "The paper: captured data at 1285x940 and weeks on a GPU, PSNR of the release's convention. Ours: "
@@ -200,11 +200,11 @@ def _need_table(matrix: necessity.Matrix) -> Table:
 
     rows = tuple(Row(name=row.scene, entries=tuple(map(entry, row.losses))) for row in matrix.rows)
     columns = tuple(Head(title=part, unit="dB lost") for part in matrix.parts)
-    return Table(title=SPLIT_TITLES[matrix.split], corner="scene", columns=columns, rows=rows)
+    return Table(title=SPLIT_NAMES[matrix.split].title, corner="scene", columns=columns, rows=rows)
 
 
 def _place(curve: margin.MarginCurve) -> str:
-    return f"{curve.scene}, {SPLIT_WORDS[curve.split]}"
+    return f"{curve.scene}, {SPLIT_NAMES[curve.split].words}"
 
 
 def _sample(
@@ -222,7 +222,7 @@ def _stability(scores: Scores, scene: str, curves: Sequence[stability.Curve]) ->
     if any(curve.trivial is not None for curve in curves):
         caption += " Crossed: the breakdown point."
     blocks: list[Block] = []
-    for index, split in enumerate(SPLIT_WORDS):
+    for index, split in enumerate(RANKED_SPLITS):
         shown = [curve for curve in curves if curve.split == split]
         samples = pd.DataFrame([row for curve in shown for row in _steps(curve, names)])
         floor = look_of(stability.TRIVIAL).title
@@ -230,7 +230,7 @@ def _stability(scores: Scores, scene: str, curves: Sequence[stability.Curve]) ->
         panels = charts.lines(
             samples, looks, y="PSNR [dB]", size=(240, 150), rules=pd.DataFrame(rules, columns=["panel", "y", "text"])
         )
-        title = SPLIT_WORDS[split].capitalize()
+        title = SPLIT_NAMES[split].words.capitalize()
         name = f"stability_{scene}_{index}"
         figure = Figure(
             name=name, title=title, caption=f"{title}. {caption} {WHISKERS}", panels=panels, series=looks, columns=3
@@ -268,7 +268,7 @@ def _breakdowns(curves: Sequence[stability.Curve], methods: Sequence[str]) -> Ta
     rows = []
     for curve in curves:
         own = {course.method: course for course in curve.courses}
-        name = f"{curve.title}, {SPLIT_WORDS[curve.split]}"
+        name = f"{curve.title}, {SPLIT_NAMES[curve.split].words}"
         rows.append(Row(name=name, entries=tuple(entry(own.get(method)) for method in methods)))
     columns = tuple(Head(title=look_of(method).title) for method in methods)
     return Table(

@@ -3,8 +3,8 @@
 import numpy as np
 
 from benchmarks.analysis import contrasts, pareto
-from benchmarks.analysis.names import EXACT, SPLIT_WORDS, look_of
-from benchmarks.analysis.scores import FRAME_MS, Quantity, Scores, foreground
+from benchmarks.analysis.names import EXACT, SPLIT_NAMES, look_of
+from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Scores, foreground
 from benchmarks.cell.methods import is_oracle
 
 TOO_CLOSE_DB = 0.1
@@ -46,7 +46,7 @@ def remarks(scores: Scores, scene: str) -> list[str]:
 def frontier(scores: Scores, scene: str) -> tuple[str, ...]:
     """Who is beaten by nobody in accuracy and speed together, what the field covers, and what would have sufficed."""
     found = []
-    for split, where in SPLIT_WORDS.items():
+    for split in RANKED_SPLITS:
         competing = contrasts.candidates(scores, scene, split)
         if len(competing) < 2:
             continue
@@ -55,7 +55,7 @@ def frontier(scores: Scores, scene: str) -> tuple[str, ...]:
         if scores.seeds > 1:
             low, high = pareto.hypervolume_interval(competing, rng=np.random.default_rng(0))
             area += f" [{low:.1f}, {high:.1f}]"
-        sentence = f"On {where}, nobody beats {names} in both accuracy and speed ({area})."
+        sentence = f"On {SPLIT_NAMES[split].words}, nobody beats {names} in both accuracy and speed ({area})."
         sufficient = pareto.smallest_sufficient(competing)
         if sufficient is not None:
             bound = f"{pareto.SUFFICIENT_DB} dB to {look_of(sufficient.best).title}"
@@ -70,11 +70,11 @@ def _duel(scores: Scores, scene: str) -> str:
     if fallen:
         return f"On {scene}, {' and '.join(fallen)} failed, so ASH and DDC cannot be compared."
     parts = []
-    for split, where in SPLIT_WORDS.items():
+    for split in RANKED_SPLITS:
         ours, theirs = (scores.get(scene, method, foreground(split)) for method in ("ash", "ddc"))
         if ours and theirs:
             standing = _standing(ours.mean - theirs.mean)
-            parts.append(f"{standing} on {where} ({ours.mean:.1f} against {theirs.mean:.1f} dB)")
+            parts.append(f"{standing} on {SPLIT_NAMES[split].words} ({ours.mean:.1f} against {theirs.mean:.1f} dB)")
     return f"On {scene}, ASH is {' and '.join(parts)}." if parts else f"On {scene}, ASH and DDC were not both scored."
 
 
@@ -106,7 +106,7 @@ def _cost(scores: Scores, scene: str) -> str:
 
 
 def _template(scores: Scores, scene: str) -> str:
-    errors = {split: _means(scores, scene, Quantity(split, "", "template_mm")) for split in SPLIT_WORDS}
+    errors = {split: _means(scores, scene, Quantity(split, "", "template_mm")) for split in RANKED_SPLITS}
     if not errors["novel_view"]:
         return ""
     method, error = errors["novel_view"][0]

@@ -5,15 +5,14 @@ from dataclasses import replace
 
 import pandas as pd
 
-from benchmarks.analysis.names import look_of
-from benchmarks.analysis.scores import Quantity, Score, Scores, foreground
+from benchmarks.analysis.names import SPLIT_NAMES, look_of
+from benchmarks.analysis.scores import RANKED_SPLITS, Quantity, Score, Scores, foreground
 from benchmarks.cell.methods import is_oracle
 from benchmarks.cell.metrics import METRICS, Metric
 from benchmarks.report.content import Entry, Head, Mark, Row, Table
 from benchmarks.report.escaping import latex as tex
 from benchmarks.report.glossary import METRIC_TERMS
 
-SPLIT_TITLES = {"novel_view": "Novel view", "novel_pose": "Novel pose", "train_view": "Training view"}
 REGION_TITLES = {"full": "whole frame", "release_crop": "release crop", "white_frame": "on white"}
 SEVERAL_REGIONS = ("psnr", "ssim", "flip")  # Their columns say which region they are of, if not the foreground.
 UNRANKED = ("gaussians",)  # Neither more nor fewer is better.
@@ -23,8 +22,7 @@ MEMORY = ("peak_rss_mb", "params", "gaussians")
 def quality_columns(metrics: Sequence[str]) -> list[Quantity]:
     """Foreground qualities on held-out views and poses (LPIPS and IoU are defined on whole frames)."""
     whole = ("lpips", "iou")
-    splits = ("novel_view", "novel_pose")
-    return [Quantity(s, "full", m) if m in whole else foreground(s, m) for s in splits for m in metrics]
+    return [Quantity(s, "full", m) if m in whole else foreground(s, m) for s in RANKED_SPLITS for m in metrics]
 
 
 def cost_columns(metrics: Sequence[str]) -> list[Quantity]:
@@ -61,7 +59,7 @@ def head_of(quantity: Quantity) -> Head:
         title=f"{measure.title}, {region}" if region else measure.title,
         unit=measure.unit,
         arrow="" if quantity.metric in UNRANKED else measure.arrow,
-        group=SPLIT_TITLES.get(quantity.split, "Cost"),
+        group=SPLIT_NAMES[quantity.split].title,
         term=METRIC_TERMS.get(quantity.metric, ""),
     )
 

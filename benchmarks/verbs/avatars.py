@@ -16,7 +16,7 @@ Stretch = Annotated[str | None, arg(metavar="A:B")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Play:
+class PlayVerb:
     """Play a run's avatars in the browser, beside the truth."""
 
     run: Positional[Path]  # a run's folder or a cell's
@@ -52,7 +52,7 @@ class Play:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Video:
+class VideoVerb:
     """Film a run's avatars: a motion from a camera, a spiral or a rig, beside the truth."""
 
     run: Positional[Path]  # a run's folder or a cell's
@@ -92,7 +92,7 @@ class Video:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportAvatar:
+class ExportAvatarVerb:
     """Write an avatar's Gaussians, mesh or skeleton for other programs."""
 
     cell: Positional[Path]  # a cell's folder, or a run's with one avatar
@@ -134,7 +134,7 @@ class ExportAvatar:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Share:
+class ShareVerb:
     """Write one page that plays a clip of an avatar without a server."""
 
     cell: Positional[Path]  # a cell's folder, or a run's with one avatar

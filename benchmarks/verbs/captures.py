@@ -39,7 +39,7 @@ Excerpts = Annotated[Excerpt, arg(name="", prefix_name=False)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Synth:
+class SynthVerb:
     """Render the ground truth of a scene into a capture folder.
 
     Every field of the scene is a flag (--rig.cameras 24 --outfit.swing 0.8); `synth SCENE --help` lists them.
@@ -145,7 +145,7 @@ def _shard(text: str | None) -> tuple[int, int]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verify:
+class VerifyVerb:
     """Hash every file of a capture again."""
 
     folder: Positional[Path]  # of the capture
@@ -167,7 +167,7 @@ class Verify:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Undistort:
+class UndistortVerb:
     """Resample a capture whose lenses distort for pinhole cameras."""
 
     folder: Positional[Path]  # of the capture
@@ -182,7 +182,7 @@ class Undistort:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export:
+class ExportVerb:
     """Write a capture in another format: ash (the release's), nerfstudio, colmap, glb."""
 
     folder: Positional[Path]  # of the capture
@@ -209,7 +209,7 @@ class Export:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Motions:
+class MotionsVerb:
     """Draw what a motion file becomes on our skeleton, in seconds: nothing is rendered."""
 
     file: Positional[Path]  # BVH or AMASS .npz
@@ -236,7 +236,7 @@ class Motions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sheets:
+class SheetsVerb:
     """Draw a contact sheet of all scenes and a turntable."""
 
     out: Folder = Path("reports/scenes")  # where they go

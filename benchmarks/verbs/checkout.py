@@ -25,7 +25,7 @@ PUBLIC = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Speed:
+class SpeedVerb:
     """Time the kernels, or whole frames by stage, beside their definitions."""
 
     what: Positional[Literal["kernels", "frame"]]  # kernels or frame
@@ -51,7 +51,7 @@ class Speed:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Doctor:
+class DoctorVerb:
     """What this machine has, and what follows from it."""
 
     def __call__(self) -> int:
@@ -64,7 +64,7 @@ class Doctor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Suites:
+class SuitesVerb:
     """Print our suites, each as the file that makes it: a copy of one is a start for your own (`run FILE.toml`)."""
 
     name: Positional[str] = ""  # only this one
@@ -84,7 +84,7 @@ class Suites:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Docs:
+class DocsVerb:
     """Write the reference of the public names as HTML, from their docstrings; needs pdoc."""
 
     out: Folder = Path("runs/docs")  # where the pages go
@@ -102,7 +102,7 @@ class Docs:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Test:
+class TestVerb:
     """Run every check that CI runs; what follows -- goes to pytest."""
 
     pytest: Positional[tuple[str, ...]] = ()  # arguments for pytest

@@ -10,7 +10,7 @@ from benchmarks.verbs.runs import run_and_report
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gate:
+class GateVerb:
     """Compare a run with a committed baseline; exit code 1 where it is worse."""
 
     baseline: File = Path("reports/baseline.json")  # what the run is compared with
@@ -55,7 +55,7 @@ class Gate:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GateRates:
+class GateRatesVerb:
     """Measure the gate's false alarms and the planted defects it catches."""
 
     reruns: Natural = 20  # unchanged runs

@@ -12,7 +12,7 @@ from benchmarks.verbs.arguments import DONE, FAILED, Count, CountIfAny, File, Fo
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckMethod:
+class CheckMethodVerb:
     """Check that a method keeps the rules (docs/plugin.md)."""
 
     method: Positional[str]  # an entry point, or package.module:factory
@@ -51,7 +51,7 @@ class CheckMethod:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Display:
+class DisplayVerb:
     """Time a trained mesh avatar's OpenGL display, and compare its picture."""
 
     run: Positional[Path]  # a run's folder or a cell's
@@ -84,7 +84,7 @@ class Display:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Retarget:
+class RetargetVerb:
     """Drive a run's avatars with a motion file, and score them against its truth."""
 
     run: Positional[Path]  # a run's folder or a cell's
@@ -111,7 +111,7 @@ class Retarget:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search:
+class SearchVerb:
     """Train ash or ddc with one setting of its preset changed at a time."""
 
     method: Positional[str]  # ash or ddc

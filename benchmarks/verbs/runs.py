@@ -31,7 +31,7 @@ LpipsWeights = Annotated[Path | None, arg(metavar="FILE")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run:
+class RunVerb:
     """Run a suite: capture, train, evaluate, report.
 
     SUITE is one of ours (`suites` prints them) or a file of yours. Flags narrow or widen it.
@@ -122,7 +122,7 @@ def run_and_report(suite: "Suite", options: "RunOptions") -> int:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report:
+class ReportVerb:
     """Write a report: of a run again, or of any cells and runs together."""
 
     runs: Positional[tuple[Path, ...]]  # folders of runs or of single cells
@@ -148,7 +148,7 @@ class Report:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compare:
+class CompareVerb:
     """Put two runs side by side: before and after, row by row, with the worst frames of each."""
 
     before: Positional[Path]  # a run's folder or a cell's
@@ -167,7 +167,7 @@ class Compare:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Merge:
+class MergeVerb:
     """Put the cells of shards together and report."""
 
     shards: Positional[tuple[Path, ...]]  # folders of runs
@@ -183,7 +183,7 @@ class Merge:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train:
+class TrainVerb:
     """Train and evaluate one method on one capture.
 
     Every field of the method's configuration is a flag (--model.texels 128 --training.steps 5000), if the method offers
@@ -241,7 +241,7 @@ class Train:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Eval:
+class EvalVerb:
     """Render and score a run's cells again from their checkpoints."""
 
     run: Positional[Path]  # a run's folder or a cell's
@@ -254,7 +254,7 @@ class Eval:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rescore:
+class RescoreVerb:
     """Recompute every quality from a run's stored predictions."""
 
     run: Positional[Path]  # a run's folder or a cell's

@@ -1,4 +1,3 @@
-from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import replace
 
@@ -9,7 +8,6 @@ from helpers.numerics import relative_error
 
 from ash.config import ModelConfig
 from ash.decoders import Decoders, UNet
-from ash.native.library import instruction_set, use_instruction_set
 from ash.native.unet import _UNet
 from ash.rotations import RigidTransforms
 from ash.textures import Conditions, build_lattice
@@ -103,15 +101,6 @@ SHAPES = {  # inputs, outputs, width, levels, height, width of the texture, feat
     "of no round number": (5, 3, 5, 1, 6, 10, 2),
     "one pixel at the bottom": (3, 17, 4, 2, 4, 4, 3),
 }
-
-
-@pytest.fixture(params=("avx512", "avx2", "plain"))
-def instructions(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = instruction_set()
-    if not use_instruction_set(request.param):
-        pytest.skip(f"this machine does not run {request.param}")
-    yield request.param
-    use_instruction_set(before)
 
 
 def network_and_inputs(shape: tuple[int, ...]) -> tuple[UNet, torch.Tensor, torch.Tensor | None]:

@@ -1,5 +1,5 @@
 import shutil
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -10,7 +10,8 @@ from helpers.figures import front_camera, tube_motion
 from ash.capture.dataset import Pose, image_path
 from ash.capture.formats import load_capture
 from ash.config import TemplateConfig
-from ash.files import write_image
+from ash.fields import replaced
+from ash.files import InputError, write_image
 from ash.mesh.drawing import SUPERSAMPLING, sample_texture
 from ash.presets import named
 from ash.protocol import StageClock
@@ -100,3 +101,16 @@ def test_noise_in_the_textures_is_for_learning_alone(capture):
     with torch.no_grad():
         still = [avatar.draw_training_views(0, cameras, torch.zeros(3), step) for step in (2, 3)]
     assert not torch.equal(*learned) and torch.equal(*still)
+
+
+def test_the_network_is_sized_as_the_presets_decoders_and_fills_its_texture():
+    preset = named("cpu")
+    config = ddc_config(preset, seed=0, template=TemplateConfig())
+    assert all(getattr(config.model, field.name) == getattr(preset.model, field.name) for field in fields(config.model))
+    assert config.texture == 2 * preset.model.texels == config.shuffle * config.model.decoded_texels
+    with pytest.raises(InputError, match="texture: expected a multiple of 64, got 500"):
+        replace(config, texture=500)
+    with pytest.raises(InputError, match=r"unknown key 'width', did you mean model\.width"):
+        replaced(config, {"width": 8}, of="ddc")
+    with pytest.raises(InputError, match=r"unknown key 'model\.sh_degree'"):  # A mesh has none.
+        replaced(config, {"model.sh_degree": 1}, of="ddc")

@@ -20,7 +20,7 @@ from benchmarks.suites import captures
 from benchmarks.suites.files import find_suite
 from benchmarks.suites.suites import CaptureSpec
 from benchmarks.verbs import arguments
-from benchmarks.verbs.captures import Synth
+from benchmarks.verbs.captures import SynthVerb
 
 
 @pytest.fixture(scope="module")
@@ -144,18 +144,18 @@ def test_help_tells_a_methods_configuration(capsys) -> None:
 
 def test_a_scenes_fields_are_flags_and_part_of_what_it_is(capsys) -> None:
     command = ["mannequin", "--size", "ci", "--rig.cameras", "9", "--train.0.frames", "6", "--outfit.skirt", "False"]
-    scene, name = arguments.read_verb(Synth, "synth", command)._described()
+    scene, name = arguments.read_verb(SynthVerb, "synth", command)._described()
     assert (scene.rig.cameras, scene.train[0].frames, scene.train[1].frames, scene.outfit.skirt) == (9, 6, 4, False)
     assert scene.name == "mannequin+skirt=False+cameras=9+frames=6"
     assert name == f"mannequin-ci-0-{scene.identity[:8]}" and scene.parameters["rig"]["cameras"] == 9
-    same, _ = arguments.read_verb(Synth, "synth", ["mannequin", "--rig.cameras=9", "--size", "quick"])._described()
+    same, _ = arguments.read_verb(SynthVerb, "synth", ["mannequin", "--rig.cameras=9", "--size", "quick"])._described()
     assert same.identity != scene.identity and same.rig.cameras == 9
-    plain, name = arguments.read_verb(Synth, "synth", ["mannequin", "--size", "ci"])._described()
+    plain, name = arguments.read_verb(SynthVerb, "synth", ["mannequin", "--size", "ci"])._described()
     assert (plain, name) == (
-        arguments.read_verb(Synth, "synth", ["mannequin", "--size", "ci"]).settings(),
+        arguments.read_verb(SynthVerb, "synth", ["mannequin", "--size", "ci"]).settings(),
         "mannequin-ci-0",
     )
-    splats, _ = arguments.read_verb(Synth, "synth", ["splats", "--size", "ci", "--name", "mine"])._described()
+    splats, _ = arguments.read_verb(SynthVerb, "synth", ["splats", "--size", "ci", "--name", "mine"])._described()
     assert (splats.name, splats.body) == ("mine", "mannequin")
 
 

@@ -2,14 +2,17 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ash.gaussians.gaussians import Gaussians
-from ash.gaussians.splatting import Splatted
+from ash.gaussians.splatting import Splatted, splat, splat_naive
 
 IMAGES = ("rgb", "alpha", "depth")
+# Errors are a few units in the last place of float32 (6e-8), summed: 1e-6 is typical. A halved gradient is off by 0.5.
+TOLERANCE = 2e-5
 
 
 def relative_error(value: Tensor, truth: Tensor) -> float:
@@ -88,6 +91,23 @@ def assert_same(
     errors = {name: relative_error(results[name], truth[name]) for name in truth}
     bad = {name: error for name, error in errors.items() if not error <= (wider or {}).get(name, tolerance)}
     assert not bad, f"beyond {tolerance}: {bad}"
+
+
+def draw(drawer: Callable[..., Splatted], scene: Scene, **more: Any) -> Splatted:
+    """A scene, drawn by `splat` or its definition."""
+    return drawer(**{field.name: getattr(scene, field.name) for field in fields(scene)}, **more)
+
+
+def change(scene: Scene, **tensors: Tensor) -> Scene:
+    """The scene with other Gaussians' tensors."""
+    return replace(scene, gaussians=Gaussians(**(tensors_of(scene.gaussians) | tensors)))
+
+
+def compare(scene: Scene, tolerance: float = TOLERANCE, **wider: float) -> dict[str, Tensor]:
+    """`splat` against its definition in double precision, in value and gradient; `wider`: tolerances of their own."""
+    results = values_and_gradients(splat, scene, torch.float32)
+    assert_same(results, values_and_gradients(splat_naive, scene, torch.float64), tolerance, wider)
+    return results
 
 
 def turned_cameras(count: int, *, distance: float = 3.0) -> Tensor:

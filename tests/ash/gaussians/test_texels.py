@@ -10,21 +10,13 @@ from helpers.figures import tube_mesh, tube_motion, tube_skeleton
 from ash.capture.dataset import Pose
 from ash.gaussians.gaussians import Gaussians, raw_channels
 from ash.gaussians.texels import place, place_naive, pose, pose_naive
-from ash.native.library import instruction_set, use_instruction_set
 from ash.rotations import RigidTransforms
 from ash.template.template import PosedTemplate, RestDeformation, Template
 from ash.textures import Conditions, TexelLattice, build_lattice
 
+pytestmark = pytest.mark.usefixtures("instructions")
+
 LATTICE = build_lattice(tube_mesh(), 70)  # 3,969 texels: two ranges, and no multiple of any vector's width
-
-
-@pytest.fixture(params=["avx512", "avx2", "plain"], autouse=True)
-def each_instruction_set(request):
-    before = instruction_set()
-    if not use_instruction_set(request.param):
-        pytest.skip(f"this machine has no {request.param}")
-    yield
-    use_instruction_set(before)
 
 
 def posed_tube(frame: int = 4) -> PosedTemplate:

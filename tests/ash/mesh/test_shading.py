@@ -1,7 +1,5 @@
 """Native shading of a textured mesh against its definition in torch, in value and gradient."""
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from helpers.figures import front_camera, tube_mesh
@@ -9,17 +7,7 @@ from helpers.numerics import relative_error
 
 from ash.mesh import drawing
 from ash.mesh.drawing import textured, textured_naive
-from ash.native.library import instruction_set, use_instruction_set
 from ash.native.shading import _Shade, add_shuffled
-
-
-@pytest.fixture(params=("avx512", "avx2", "plain"))
-def instructions(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = instruction_set()
-    if not use_instruction_set(request.param):
-        pytest.skip(f"this machine does not run {request.param}")
-    yield request.param
-    use_instruction_set(before)
 
 
 def shaded(make, dtype: torch.dtype, *, lit: bool, side: int = 12) -> list[torch.Tensor]:

@@ -6,7 +6,6 @@ import sys
 import pytest
 import torch
 
-from ash.native.library import instruction_set, use_instruction_set
 from ash.training.adam import Adam
 
 
@@ -39,15 +38,9 @@ def largest_difference(ours: list[torch.Tensor], theirs: list[torch.Tensor], ste
     return max(float((a - b).detach().abs().max()) for a, b in zip(ours, theirs, strict=True))
 
 
-@pytest.mark.parametrize("instructions", ["avx512", "avx2", "plain"])
-def test_steps_are_those_of_torch(instructions: str) -> None:
-    before = instruction_set()
-    if not use_instruction_set(instructions):
-        pytest.skip(f"this machine does not run {instructions}")
-    try:
-        assert largest_difference(leaves(), leaves(), steps=20) < 5e-6  # a step moves up to 0.1
-    finally:
-        use_instruction_set(before)
+@pytest.mark.usefixtures("instructions")
+def test_steps_are_those_of_torch() -> None:
+    assert largest_difference(leaves(), leaves(), steps=20) < 5e-6  # a step moves up to 0.1
 
 
 def test_in_other_precisions_the_definition_itself_runs() -> None:

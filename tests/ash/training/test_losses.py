@@ -1,7 +1,5 @@
 """`l1_ssim_loss` against its definition, and the definition against closed forms and scikit-image."""
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from helpers.numerics import relative_error
@@ -9,21 +7,12 @@ from skimage.metrics import structural_similarity
 from torch import Tensor
 
 from ash.files import InputError
-from ash.native.library import instruction_set, use_instruction_set
+from ash.native.library import instruction_set
 from ash.training.losses import _L1Ssim, l1_ssim_loss, l1_ssim_loss_naive, ssim_target
 
 SIZES = [(1, 1), (3, 40), (40, 3), (7, 9), (33, 47), (64, 70)]
 MASKS = ("none", "box", "weights", "last_row")
 TOLERANCE = 2e-6
-
-
-@pytest.fixture(params=("avx512", "avx2", "plain"))
-def instructions(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = instruction_set()
-    if not use_instruction_set(request.param):
-        pytest.skip(f"this machine does not run {request.param}")
-    yield request.param
-    use_instruction_set(before)
 
 
 def make_images(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:

@@ -8,8 +8,8 @@ from ash.config import TrainingConfig
 from ash.training.batches import reserved_views
 from ash.training.stopping import (
     FINAL_LEARNING_RATE,
-    Course,
-    Score,
+    ReservedScore,
+    TrainingCourse,
     decided,
     gain_of_last_third,
     is_mark,
@@ -28,14 +28,14 @@ CONFIG = TrainingConfig(
 )
 
 
-def train(curve, config: TrainingConfig, *, seconds_per_step: float = 0.0) -> tuple[Course, list[float]]:
+def train(curve, config: TrainingConfig, *, seconds_per_step: float = 0.0) -> tuple[TrainingCourse, list[float]]:
     """What would be decided if the reserved views scored `curve(step)`; and the rates' factors, step by step."""
-    course, step, factors = Course(), 0, []
+    course, step, factors = TrainingCourse(), 0, []
     while step < last_step(course, config):
         factors.append(rate_factor(course, config, step=step))
         step += 1
         if is_mark(step):
-            course = replace(course, scores=(*course.scores, Score(step=step, psnr=float(curve(step)))))
+            course = replace(course, scores=(*course.scores, ReservedScore(step=step, psnr=float(curve(step)))))
         course = decided(course, config, step=step, seconds=step * seconds_per_step)
     return course, factors
 
@@ -96,8 +96,12 @@ def test_the_schedule_of_the_release_stays_and_ends_at_the_plateau_itself():
 
 
 def test_a_course_survives_a_checkpoint():
-    course = Course(scores=(Score(step=64, psnr=1 / 3), Score(step=78, psnr=21.0)), decay_from=78, ended_by="plateau")
-    assert Course.from_json(course.to_json()) == course
+    course = TrainingCourse(
+        scores=(ReservedScore(step=64, psnr=1 / 3), ReservedScore(step=78, psnr=21.0)),
+        decay_from=78,
+        ended_by="plateau",
+    )
+    assert TrainingCourse.from_json(course.to_json()) == course
 
 
 @pytest.mark.parametrize(

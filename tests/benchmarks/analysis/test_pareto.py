@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from benchmarks.analysis.pareto import Candidate, front, hypervolume, hypervolume_interval, smallest_sufficient
+from benchmarks.analysis.pareto import Contender, front, hypervolume, hypervolume_interval, smallest_sufficient
 
 
-def candidate(name: str, quality: float, cost: float, spread: float = 0.05) -> Candidate:
-    return Candidate(name=name, qualities=(quality - spread, quality, quality + spread), cost=cost)
+def candidate(name: str, quality: float, cost: float, spread: float = 0.05) -> Contender:
+    return Contender(name=name, qualities=(quality - spread, quality, quality + spread), cost=cost)
 
 
 FIELD = [candidate("best", 30.0, 100.0), candidate("near", 29.8, 40.0), candidate("fast", 25.0, 5.0)]
@@ -37,4 +37,4 @@ def test_the_smallest_sufficient_is_the_cheapest_that_is_not_inferior() -> None:
     assert strict is not None and strict.name == "best"
     noisy = [FIELD[0], candidate("near", 29.8, 40.0, spread=1.0), FIELD[2]]
     assert smallest_sufficient(noisy).name == "best", "what is not known not to be inferior does not suffice"
-    assert smallest_sufficient([Candidate(name="a", qualities=(20.0,), cost=1.0)]) is None
+    assert smallest_sufficient([Contender(name="a", qualities=(20.0,), cost=1.0)]) is None

@@ -1,0 +1,193 @@
+// Convolutions, their transposes and pools, forward and backward, in planes whose border of one pixel is zero, so that a 3x3
+// convolution needs no other case.
+#pragma once
+#include <algorithm>
+#include <cstdint>
+
+#include "dispatch.h"
+#include "team.h"
+
+namespace ash {
+
+// Pixels (y, x) inside a border of zeros; `step` floats from one pixel to the next, `channels` of which are meant.
+struct Plane {
+    float* first = nullptr;  // pixel (0, 0)
+    int height = 0, width = 0, channels = 0;
+    int64_t step = 0;
+    int64_t row() const { return (width + 2) * step; }
+    float* at(int y, int x = 0) const { return first + y * row() + x * step; }
+    Plane part(int from, int count) const { return {first + from, height, width, count, step}; }
+};
+
+struct Layer {  // weights and bias; a convolution's lie [out][tap][in], a transposed one's [in][tap][out]
+    const float *weights, *bias;
+    float *grad_weights, *grad_bias;
+};
+
+constexpr int BAND = 4;  // image rows handed out at once
+
+template <class Work> void in_bands(int threads, int height, const Work& work) {
+    in_parallel(threads, (height + BAND - 1) / BAND, [&](int64_t band) {
+        for (int y = int(band) * BAND; y < std::min(height, int(band + 1) * BAND); ++y) work(y);
+    });
+}
+
+// A stencil: which pixel each tap reads, relative to the pixel that is made, and how far apart those read are.
+struct Taps {
+    int count;
+    int64_t at[9];
+};
+
+// out = the products of what the taps read with packed weights, row by row. `from`: of output row y, the first pixel of its input.
+template <class From> void convolve(Product product, const Taps& taps, int steps, const Plane& out, int threads, const From& from) {
+    int64_t b_at[9];
+    for (int t = 0; t < taps.count; ++t) b_at[t] = int64_t(t) * steps * PRODUCT_COLUMNS;
+    product.a_inner = 1, product.b_inner = PRODUCT_COLUMNS, product.b_block = int64_t(taps.count) * steps * PRODUCT_COLUMNS;
+    product.a_at = taps.at, product.b_at = b_at, product.segments = taps.count, product.steps = steps;
+    product.rows = out.width, product.columns = out.channels;
+    const float* active = product.active;
+    in_bands(threads, out.height, [&](int y) {
+        Product here = product;
+        here.a = from(y);
+        here.c = out.at(y);
+        if (active) here.active = active + y * (out.width + 2) * product.active_step;
+        kernels().multiply(here);
+    });
+}
+
+inline Taps around(const Plane& in, int sign) {
+    Taps taps{9, {}};
+    for (int t = 0; t < 9; ++t) taps.at[t] = sign * ((t / 3 - 1) * in.row() + (t % 3 - 1) * in.step);
+    return taps;
+}
+
+// A 3x3 convolution with ReLU.
+inline void forward(const Layer& layer, const Plane& in, const Plane& out, float* packed, int threads) {
+    const int ci = in.channels, co = out.channels;
+    kernels().pack({layer.weights, co, 9, ci, int64_t(9) * ci, ci, 1, packed});
+    Product product{};
+    product.a_step = in.step, product.b = packed, product.c_step = out.step, product.start = layer.bias, product.relu = true;
+    convolve(product, around(in, 1), ci, out, threads, [&](int y) { return in.at(y); });
+}
+
+// The gradient of its input, 0 where `active` (the input, if it came out of a ReLU) is not positive.
+inline void backward_input(const Layer& layer, const Plane& grad, const Plane& to, const Plane* active, float* packed, int threads) {
+    const int ci = to.channels, co = grad.channels;
+    kernels().pack({layer.weights, ci, 9, co, 1, ci, int64_t(9) * ci, packed});
+    Product product{};
+    product.a_step = grad.step, product.b = packed, product.c_step = to.step;
+    if (active) product.active = active->first, product.active_step = active->step;
+    convolve(product, around(grad, -1), co, to, threads, [&](int y) { return grad.at(y); });
+}
+
+// c[j][k] = the sum over pixels of a's channel j times b's channel k; a's pixels lie `a_row` and `a_pixel` floats apart, b's likewise.
+inline void correlate(const float* a, int64_t a_row, int64_t a_pixel, int rows, const float* b, int64_t b_row, int64_t b_pixel, int columns,
+               int height, int width, float* c, int64_t c_step) {
+    constexpr int MOST = 32;
+    const int band = std::max(1, std::min(MOST, 256 / width));  // what is read stays in the first-level cache for all sums
+    int64_t a_at[MOST], b_at[MOST];
+    for (int y = 0; y < band; ++y) a_at[y] = y * a_row, b_at[y] = y * b_row;
+    for (int y = 0; y < height; y += band) {
+        Product product{};
+        product.a = a + y * a_row, product.a_step = 1, product.a_inner = a_pixel;
+        product.b = b + y * b_row, product.b_inner = b_pixel, product.b_block = PRODUCT_COLUMNS;
+        product.a_at = a_at, product.b_at = b_at, product.segments = std::min(band, height - y), product.steps = width;
+        product.rows = rows, product.columns = columns, product.c = c, product.c_step = c_step, product.add = y > 0;
+        kernels().multiply(product);
+    }
+}
+
+inline void sum_pixels(const float* from, int64_t row, int64_t pixel, int height, int width, int channels, float* to) {
+    std::fill(to, to + channels, 0.0f);
+    for (int y = 0; y < height; ++y)
+        for (int x = 0; x < width; ++x)
+            for (int c = 0; c < channels; ++c) to[c] += from[y * row + x * pixel + c];
+}
+
+inline void backward_weights(const Layer& layer, const Plane& grad, const Plane& in, int threads) {
+    const int ci = in.channels;
+    const Taps taps = around(in, 1);
+    in_parallel(threads, 9, [&](int64_t t) {
+        correlate(grad.first, grad.row(), grad.step, grad.channels, in.first + taps.at[t], in.row(), in.step, ci, grad.height, grad.width,
+                  layer.grad_weights + t * ci, int64_t(9) * ci);
+    });
+    sum_pixels(grad.first, grad.row(), grad.step, grad.height, grad.width, grad.channels, layer.grad_bias);
+}
+
+// Every pixel makes 2x2 of them.
+inline void forward_up(const Layer& layer, const Plane& in, const Plane& out, float* packed, int threads) {
+    const int ci = in.channels, co = out.channels;
+    const int64_t size = int64_t((co + 15) / 16) * ci * PRODUCT_COLUMNS;
+    const Taps here{1, {0}};
+    for (int t = 0; t < 4; ++t) {
+        kernels().pack({layer.weights + t * co, co, 1, ci, 1, 0, int64_t(4) * co, packed + t * size});
+        Product product{};
+        product.a_step = in.step, product.b = packed + t * size, product.c_step = 2 * out.step, product.start = layer.bias;
+        Plane every_other{out.at(t / 2, t % 2), in.height, in.width, co, 2 * out.step};
+        int64_t b_at[1] = {0};
+        product.a_inner = 1, product.b_inner = PRODUCT_COLUMNS, product.b_block = int64_t(ci) * PRODUCT_COLUMNS;
+        product.a_at = here.at, product.b_at = b_at, product.segments = 1, product.steps = ci;
+        product.rows = in.width, product.columns = co;
+        in_bands(threads, in.height, [&](int y) {
+            Product line = product;
+            line.a = in.at(y), line.c = every_other.first + y * 2 * out.row();
+            kernels().multiply(line);
+        });
+    }
+}
+
+inline void backward_up_weights(const Layer& layer, const Plane& grad, const Plane& in, int threads) {
+    const int co = grad.channels;
+    in_parallel(threads, 4, [&](int64_t t) {
+        correlate(in.first, in.row(), in.step, in.channels, grad.at(int(t / 2), int(t % 2)), 2 * grad.row(), 2 * grad.step, co, in.height,
+                  in.width, layer.grad_weights + t * co, int64_t(4) * co);
+    });
+    sum_pixels(grad.first, grad.row(), grad.step, grad.height, grad.width, co, layer.grad_bias);
+}
+
+// Gradients of the input's channels from `from` on.
+inline void backward_up_input(const Layer& layer, const Plane& grad, int from, const Plane& to, const Plane* active, float* packed, int threads) {
+    const int co = grad.channels;
+    kernels().pack({layer.weights + int64_t(from) * 4 * co, to.channels, 4, co, int64_t(4) * co, co, 1, packed});
+    Product product{};
+    product.a_step = 2 * grad.step, product.b = packed, product.c_step = to.step;
+    if (active) product.active = active->first, product.active_step = active->step;
+    const Taps taps{4, {0, grad.step, grad.row(), grad.row() + grad.step}};
+    convolve(product, taps, co, to, threads, [&](int y) { return grad.at(2 * y); });
+}
+
+inline void pool(const Plane& in, const Plane& out, int threads) {
+    in_bands(threads, out.height, [&](int y) {
+        for (int x = 0; x < out.width; ++x) {
+            const float *a = in.at(2 * y, 2 * x), *b = a + in.step, *c = in.at(2 * y + 1, 2 * x), *d = c + in.step;
+            float* to = out.at(y, x);
+            for (int i = 0; i < out.channels; ++i) to[i] = std::max(std::max(a[i], b[i]), std::max(c[i], d[i]));
+        }
+    });
+}
+
+// grad_in = (grad_skip + grad_pooled where the pixel is the first largest of its four), 0 where the input is not positive.
+inline void backward_pool(const Plane& in, const Plane& pooled, const Plane& grad_pooled, const Plane& grad_skip, const Plane& grad_in, int threads) {
+    in_bands(threads, pooled.height, [&](int y) {
+        for (int x = 0; x < pooled.width; ++x) {
+            const float *most = pooled.at(y, x), *grad = grad_pooled.at(y, x);
+            const float *v[4], *s[4];
+            float* to[4];
+            for (int k = 0; k < 4; ++k) {
+                const int yy = 2 * y + k / 2, xx = 2 * x + k % 2;
+                v[k] = in.at(yy, xx), s[k] = grad_skip.at(yy, xx), to[k] = grad_in.at(yy, xx);
+            }
+            for (int i = 0; i < pooled.channels; ++i) {
+                float left = grad[i];  // goes to the first that has the largest value
+                for (int k = 0; k < 4; ++k) {
+                    const bool largest = v[k][i] == most[i];
+                    const float value = s[k][i] + (largest ? left : 0.0f);
+                    left = largest ? 0.0f : left;
+                    to[k][i] = v[k][i] > 0 ? value : 0.0f;
+                }
+            }
+        }
+    });
+}
+
+}  // namespace ash

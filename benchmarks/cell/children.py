@@ -1,0 +1,90 @@
+"""A method's process, and those that it starts: what they print, how much memory they take, and how they all end."""
+
+import contextlib
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import IO
+
+import psutil
+
+LOUDEST, LAST_WORDS = 1 << 20, 1 << 14  # bytes of printing that are kept: the first of them, and the last
+
+
+def pass_on(output: IO[bytes]) -> None:
+    """Print what the method prints: the first megabyte of it, and its last words."""
+    kept, left_out, last = 0, 0, b""
+    while part := os.read(output.fileno(), 1 << 16):
+        now = part[: max(0, LOUDEST - kept)]
+        os.write(2, now)
+        kept += len(now)
+        rest = part[len(now) :]
+        left_out += len(rest)
+        last = (last + rest)[-LAST_WORDS:]
+    if left_out:
+        os.write(2, f"\n({left_out - len(last)} bytes left out)\n".encode() + last)
+    output.close()
+
+
+def end_family(process: subprocess.Popen[bytes]) -> None:
+    """End a method's process and everything that it started."""
+    family = []
+    with contextlib.suppress(psutil.Error):
+        whole = psutil.Process(process.pid)
+        family = [*whole.children(recursive=True), whole]
+    for member in reversed(family):
+        with contextlib.suppress(psutil.Error):
+            member.kill()
+    process.wait()
+    # What lost its parents has become ours (see `adopt_orphans`).
+    deadline = time.monotonic() + 5
+    while (orphans := _children()) and time.monotonic() < deadline:
+        for orphan in orphans:
+            with contextlib.suppress(psutil.Error):
+                for member in (*orphan.children(recursive=True), orphan):
+                    member.kill()
+        _reap()
+
+
+def adopt_orphans() -> None:
+    """Let what a method leaves behind become this process's child, so that it can be ended with the cell."""
+    if sys.platform.startswith("linux"):
+        import ctypes
+
+        ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER
+
+
+def _children() -> list[psutil.Process]:
+    if not _adopting():
+        return []
+    return psutil.Process().children()
+
+
+def _adopting() -> bool:
+    return os.environ.get("ASH_BENCH_CELL_PROCESS") == str(os.getpid())
+
+
+def _reap() -> None:
+    with contextlib.suppress(ChildProcessError):
+        while os.waitpid(-1, os.WNOHANG)[0]:
+            pass
+    time.sleep(0.02)
+
+
+def peak_memory_mb(pid: int) -> float:
+    """The largest resident memory that a process, or one that it started, had so far, MiB."""
+    peaks = [0.0]
+    with contextlib.suppress(psutil.Error):
+        whole = psutil.Process(pid)
+        peaks += [_peak_mb(member) for member in (whole, *whole.children(recursive=True))]
+    return max(peaks)
+
+
+def _peak_mb(process: psutil.Process) -> float:
+    status = Path(f"/proc/{process.pid}/status")
+    if status.exists():
+        lines = [line for line in status.read_text().splitlines() if line.startswith("VmHWM")]
+        return int(lines[0].split()[1]) / 1024 if lines else 0.0
+    return float(process.memory_info().rss / 2**20)
