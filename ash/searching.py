@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from ash.capture.dataset import Capture, Pose, Split
+from ash.capture.typed import from_json
 from ash.config import TrainingConfig
 from ash.files import InputError, hash_of, hash_sources, only_one, read_json, write_json
 from ash.protocol import Avatar, StageClock, TrainingOutcome
@@ -216,6 +217,9 @@ def _key(config: Any, capture: Capture) -> str:
 def _read(path: Path) -> Choice:
     content = read_json(path)
     try:
-        return Choice(**{**content, "tried": tuple(Tried(**one) for one in content["tried"])})
-    except (KeyError, TypeError) as error:
+        choice: Choice = from_json(Choice, content)
+        if choice.name not in {candidate.name for candidate in CANDIDATES}:
+            raise ValueError(f"unknown candidate {choice.name!r:.60}")
+        return choice
+    except ValueError as error:
         raise InputError(f"{path}: expected the choice of a search ({error}); remove it") from error

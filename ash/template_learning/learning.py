@@ -11,7 +11,7 @@ from ash.capture.dataset import Capture
 from ash.capture.formats import read_template_truth
 from ash.checkpoints import load_module, read_safetensors
 from ash.config import TemplateConfig
-from ash.files import hash_of, hash_sources, only_one, write_atomic
+from ash.files import InputError, hash_of, hash_sources, only_one, write_atomic
 from ash.template.graph import EmbeddedGraph
 from ash.template.template import Deformation, Learned, RestDeformation, Template, exact_template, skinned_template
 from ash.template_learning.deforming import LinearDeformation
@@ -52,6 +52,8 @@ def learned_template(config: TemplateConfig, capture: Capture, *, seed: int) -> 
                 write_atomic(path, safetensors.torch.save(_state(deformation), metadata=facts))
             tensors, facts = read_safetensors(path)
             load_module(deformation, tensors, path)
+            if not facts.keys() >= {"seconds", "found"}:
+                raise InputError(f"{path}: expected a learned template with its facts; remove it")
     template.learned = Learned(seconds=float(facts["seconds"]), found=facts["found"])
     return template
 

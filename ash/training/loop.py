@@ -23,7 +23,7 @@ from torch import Tensor
 from ash.capture.dataset import Camera
 from ash.checkpoints import contiguous_state, load_module, read_safetensors
 from ash.config import TrainingConfig
-from ash.files import write_atomic
+from ash.files import InputError, write_atomic
 from ash.protocol import TrainingOutcome
 from ash.training.adam import Adam
 from ash.training.batches import Batch, TrainingImages, cut_batch, draw_batch
@@ -300,11 +300,25 @@ class _Run:
         return float(torch.stack([(added - mean).square().mean() for added in found]).mean().sqrt())
 
     def resume(self) -> bool:
-        """Load the checkpoint, if there is one."""
+        """Load the checkpoint, if there is one.
+
+        Raises:
+            InputError: it is damaged, or of another configuration.
+        """
         if not self.path.exists():
             return False
         tensors, facts = read_safetensors(self.path)
         load_module(self.learner.module, {n[6:]: t for n, t in tensors.items() if n.startswith("model.")}, self.path)
+        try:
+            self._take_up(tensors, facts)
+        except (KeyError, ValueError, RuntimeError, OverflowError) as error:
+            raise InputError(f"{self.path}: expected a whole checkpoint ({type(error).__name__}: {error})") from error
+        return True
+
+    def _take_up(self, tensors: dict[str, Tensor], facts: dict[str, str]) -> None:
+        """Moments, averages and the place in the course, as they were saved."""
+        if not all(torch.isfinite(tensor).all() for tensor in tensors.values()):
+            raise ValueError("NaN or infinity among its numbers")
         for index, parameter in enumerate(self.optimiser.parameters):
             if f"adam.{index}.step" not in tensors:  # It never had a gradient.
                 self.optimiser.moments[index] = None
@@ -316,8 +330,9 @@ class _Run:
             value.copy_(tensors[f"average.{name}"])
         self.step, self.seconds = int(facts["step"]), float(facts["seconds"])
         self.rate_scale, self.course = float(facts["rate_scale"]), TrainingCourse.from_json(facts["course"])
+        if self.step < 0 or not (0 <= self.seconds < math.inf and 0 < self.rate_scale <= 1):
+            raise ValueError(f"step {self.step} after {self.seconds} s at {self.rate_scale} of the rate")
         self.started = time.process_time()
-        return True
 
 
 class _sigterm:

@@ -8,6 +8,7 @@ import json
 import math
 from dataclasses import asdict, dataclass, replace
 
+from ash.capture.typed import from_json
 from ash.config import TrainingConfig
 
 FIRST_MARK = 64  # Steps after which views are scored for the first time; twice on the way to half as many more, ...
@@ -39,9 +40,13 @@ class TrainingCourse:
 
     @classmethod
     def from_json(cls, text: str) -> "TrainingCourse":
-        """What `to_json` wrote."""
-        content = json.loads(text)
-        return cls(**{**content, "scores": tuple(ReservedScore(**score) for score in content["scores"])})
+        """What `to_json` wrote.
+
+        Raises:
+            ValueError: it is something else.
+        """
+        course: TrainingCourse = from_json(cls, json.loads(text))
+        return course
 
 
 def is_mark(step: int) -> bool:

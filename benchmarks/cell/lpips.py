@@ -23,8 +23,11 @@ class Lpips:
 
     def __init__(self, backbone: Path) -> None:
         self.trunk = _trunk(_load(backbone), backbone)
-        heads = _load(_heads_file())
-        self.heads = [heads[f"lin{i}.model.1.weight"] for i in range(len(TAPS))]
+        found = _load(_heads_file())
+        try:
+            self.heads = [found[f"lin{i}.model.1.weight"] for i in range(len(TAPS))]
+        except KeyError as error:
+            raise InputError(f"{_heads_file()}: expected the heads of LPIPS, which has no {error}") from error
 
     def __call__(self, predicted: np.ndarray, truth: np.ndarray) -> float:
         """LPIPS x 1000 of uint8 images `[h, w, 3]`, whole frame."""
@@ -81,6 +84,11 @@ def _load(path: Path) -> dict[str, Tensor]:
         raise InputError(f"{path}: expected a file of tensors ({type(error).__name__})") from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a dictionary of tensors, got {type(content).__name__}")
+    for name, tensor in content.items():
+        if not isinstance(tensor, Tensor):
+            raise InputError(f"{path}: expected tensors, got {type(tensor).__name__} as {name!r:.60}")
+        if not torch.isfinite(tensor).all():
+            raise InputError(f"{path}: {name!r:.60} holds NaN or infinity, expected finite numbers")
     return content
 
 

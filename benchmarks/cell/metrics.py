@@ -70,6 +70,12 @@ METRICS = {
         Metric(key="stg3_ms", title="Stg.3", unit="ms", direction="down", worst=1e6, decimals=1, abs_tol=0.0),
         Metric(key="stg4_ms", title="Stg.4", unit="ms", direction="down", worst=1e6, decimals=1, abs_tol=0.0),
         Metric(key="train_s", title="training", unit="s", direction="down", worst=1e6, decimals=0, abs_tol=0.0),
+        Metric(
+            key="train_wall_s", title="training, clock", unit="s", direction="none", worst=1e6, decimals=0, abs_tol=0.0
+        ),
+        Metric(
+            key="train_cpu_s", title="training, CPU", unit="s", direction="none", worst=1e6, decimals=0, abs_tol=0.0
+        ),
         Metric(key="steps", title="steps", unit="", direction="none", worst=0.0, decimals=0, abs_tol=0.0),
         Metric(key="plateau", title="plateau", unit="", direction="none", worst=0.0, decimals=0, abs_tol=0.0),
         Metric(key="settled_s", title="within 0.3 dB", unit="s", direction="down", worst=1e6, decimals=0, abs_tol=0.0),

@@ -38,7 +38,7 @@ from benchmarks.cell.cells import (
 )
 from benchmarks.cell.children import adopt_orphans
 from benchmarks.cell.evaluation import _flicker_summary, _gap_summary, _image_summary, _score, draw_all, judge
-from benchmarks.cell.host import Host, Killed, MethodFailed, give_files, hosted, take_files
+from benchmarks.cell.host import WORK, Host, Killed, MethodFailed, Spent, give_files, hosted, take_files
 from benchmarks.cell.methods import ORACLES, configured, find_method
 from benchmarks.cell.sealing import seen_by_method, watched
 from benchmarks.cell.views import View
@@ -88,9 +88,14 @@ def run_cell(cell: Cell) -> CellResult:
     start = time.perf_counter()
     capture = _capture_of(cell)
     _clear(cell)
+    resumed = _has_left(cell)
     try:
         result = _train_and_evaluate(cell, capture)
     except MethodFailed as error:
+        if resumed:  # What an earlier attempt left may be damaged, and a whole training ends the same.
+            print(f"{cell.config.title}: {error.status}: {error}; once more, from nothing", file=sys.stderr)
+            shutil.rmtree(cell.folder / WORK)
+            return run_cell(cell)
         print(f"{cell.config.title}: {error.status}: {error}", file=sys.stderr)
         result = failed_result(cell.config, error.status, str(error))
     except MemoryError as error:
@@ -108,14 +113,11 @@ def evaluate_cell(cell: Cell) -> CellResult:
     """
     before = _finished(cell)
     capture = _capture_of(cell)
-    train_s = before.value("speed", "", "train_s") or 0.0
-    give_files(cell)
+    spent = _spent_before(before)
     try:
-        with _hosted(cell, capture) as host:
-            host.make()
-            host.load()
+        with trained_host(cell, capture) as host:
             drawn = draw_all(cell, capture, host)
-        result = replace(judge(cell, capture, drawn, train_s, before.training), provenance=before.provenance)
+        result = replace(judge(cell, capture, drawn, spent, before.training), provenance=before.provenance)
     except (MethodFailed, Killed) as error:
         raise InputError(f"{cell.folder}: {error or 'its process was killed'}; the result stays as it was") from error
     write_result(cell.folder, result)
@@ -123,9 +125,21 @@ def evaluate_cell(cell: Cell) -> CellResult:
 
 
 @contextmanager
-def load_avatar(cell: Cell, capture: Capture) -> Iterator[tuple[Avatar, Capture]]:
-    """A cell's trained avatar and the capture as it sees it; both hold as long as the body runs."""
-    factory = find_method(cell.config.source).load()
+def load_avatar(cell: Cell, capture: Capture, *, trust: bool = False) -> Iterator[tuple[Avatar, Capture]]:
+    """A cell's trained avatar in this process, and the capture as it sees it; both hold as long as the body runs.
+
+    Code that is loaded here can do what the user can: a method of others is refused unless it is trusted.
+
+    Raises:
+        InputError: the method is of others and not trusted, or its weights do not load.
+    """
+    method = find_method(cell.config.source)
+    if not trust and not method.is_ours:
+        raise InputError(
+            f"{cell.folder}: {cell.config.method} ({method.target}) is not ours, and its code would run here without"
+            " isolation; --trust lets it"
+        )
+    factory = method.load()
     with _seen(cell, capture) as seen:
         with watched(capture, seen):
             avatar = _make(cell.config, seen, factory)
@@ -155,23 +169,43 @@ def _train_and_evaluate(cell: Cell, capture: Capture) -> CellResult:
     """The method learns and draws in a process of its own, then ends; what it drew is scored in this one."""
     with _hosted(cell, capture) as host:
         host.make()
-        train_s = host.fit()
+        spent = host.fit()
         host.save()
         drawn = draw_all(cell, capture, host)
     take_files(cell)
-    return judge(cell, capture, drawn, train_s)
+    return judge(cell, capture, drawn, spent)
 
 
 @contextmanager
-def _hosted(cell: Cell, capture: Capture) -> Iterator[Host]:
+def trained_host(cell: Cell, capture: Capture, *, secret: tuple[Path, ...] = ()) -> Iterator[Host]:
+    """A process that holds a cell's trained avatar, to be drawn by; it sees nothing of `secret` either.
+
+    Raises:
+        MethodFailed: the method does not load any more, or what the body asks of it goes wrong.
+    """
+    give_files(cell)
+    with _hosted(cell, capture, secret=secret) as host:
+        host.make()
+        host.load()
+        yield host
+
+
+@contextmanager
+def _hosted(cell: Cell, capture: Capture, *, secret: tuple[Path, ...] = ()) -> Iterator[Host]:
     method, oracle = find_method(cell.config.source), cell.config.source in ORACLES
-    with _seen(cell, capture) as seen, hosted(cell, capture, seen, method, oracle=oracle) as host:
+    with _seen(cell, capture) as seen, hosted(cell, capture, seen, method, oracle=oracle, secret=secret) as host:
         yield host
 
 
 def _clear(cell: Cell) -> None:
     """Remove what an earlier attempt drew: nothing of it may be scored as if it were of this one."""
     shutil.rmtree(cell.folder / "images", ignore_errors=True)
+
+
+def _has_left(cell: Cell) -> bool:
+    """Whether an earlier attempt left something that training takes up."""
+    work = cell.folder / WORK
+    return work.is_dir() and any(work.iterdir())
 
 
 def _make(config: CellConfig, capture: Capture, factory: Callable[..., Avatar]) -> Avatar:
@@ -203,6 +237,12 @@ def _finished(cell: Cell) -> CellResult:
             f"{cell.folder}: expected a finished cell, got {result.status if result else 'no result.json'}"
         )
     return result
+
+
+def _spent_before(result: CellResult) -> Spent:
+    """What a finished cell's training took."""
+    clock, cpu_s, whole = (result.value("speed", "", name) for name in ("train_wall_s", "train_cpu_s", "train_s"))
+    return Spent(wall_s=clock or whole or 0.0, cpu_s=cpu_s)
 
 
 def _provenance(wall_s: float) -> Provenance:

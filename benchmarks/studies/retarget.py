@@ -9,16 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from ash.capture.dataset import Capture, Motion, Pose
+from ash.capture.dataset import Capture, Motion
 from ash.capture.formats import load_capture, read_template_truth
 from ash.files import InputError, sha256_of, write_image, write_json
-from ash.protocol import PosedGeometry, StageClock
 from benchmarks.cell import metrics
 from benchmarks.cell.cells import Cell, is_trained, result_of
+from benchmarks.cell.host import EXAM, Killed, MethodFailed
 from benchmarks.cell.methods import ORACLES
-from benchmarks.cell.process import load_avatar
-from benchmarks.cell.sealing import watched
-from benchmarks.cell.views import spread
+from benchmarks.cell.process import trained_host
+from benchmarks.cell.views import View, spread
 from benchmarks.report.pictures import on_paper
 from benchmarks.suites.progress import Progress
 from synth.capture import make_body, make_capture
@@ -92,13 +91,7 @@ def render_truth(own: Capture, motion: Path, folder: Path, *, frames: int, worke
 def score(cell: Cell, own: Capture, truth: Capture, out: Path) -> Retargeted:
     """Drive one avatar and compare it with the truth."""
     split = truth.splits["novel_pose"]
-    images, vertices = {}, {}
-    with load_avatar(cell, own) as (avatar, seen), watched(truth, seen):
-        for camera, frame in split.views:
-            drawn = avatar.render(Pose(truth.motion, frame), truth.cameras[camera], clock=StageClock())
-            images[camera, frame] = metrics.quantise(drawn)
-        if isinstance(avatar, PosedGeometry):
-            vertices = {frame: avatar.template_vertices(Pose(truth.motion, frame)) for frame in split.frames}
+    images, vertices = drawn_in_isolation(cell, own, truth)
     scores = {view: metrics.score_view(image, metrics.on_black(truth.image(*view))) for view, image in images.items()}
     write_image(out / f"strip-{own.scene}-{cell.config.method}-{cell.config.seed}.png", strip(truth, images))
     before = result_of(cell)
@@ -121,6 +114,29 @@ def score(cell: Cell, own: Capture, truth: Capture, out: Path) -> Retargeted:
             for frame in split.frames
         ),
     )
+
+
+def drawn_in_isolation(
+    cell: Cell, own: Capture, truth: Capture
+) -> tuple[dict[tuple[str, int], np.ndarray], dict[int, np.ndarray]]:
+    """What the avatar draws of the motion (uint8 `[h, w, 4]` by camera and frame), and its template by frame.
+
+    The method runs as in a cell: in a process of its own, which sees neither capture's truth.
+
+    Raises:
+        InputError: it does not load or draw any more.
+    """
+    split, vertices = truth.splits["novel_pose"], {}
+    views = [View(split="novel_pose", camera=camera, frame=frame) for camera, frame in split.views]
+    try:
+        with trained_host(cell, own, secret=(truth.folder, truth.folder.parent)) as host:
+            host.meet(cell.folder.resolve() / EXAM, truth)
+            images = {(v.camera, v.frame): metrics.quantise(host.draw(v, truth.cameras[v.camera])) for v in views}
+            if host.describe().geometry:
+                vertices = {frame: host.geometry("vertices", frame) for frame in split.frames}
+    except (MethodFailed, Killed) as error:
+        raise InputError(f"{cell.folder}: {error or 'its process was killed'}") from error
+    return images, vertices
 
 
 def novelty_deg(own: Capture, truth: Capture) -> float:

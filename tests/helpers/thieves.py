@@ -132,6 +132,16 @@ class Ends(FakeAvatar):
                 for _ in range(300):
                     print("x" * (1 << 16), flush=True)
                 print("last words", flush=True)
+            case "resumes":
+                from ash.checkpoints import read_safetensors
+
+                if (kept := folder / "checkpoint.safetensors").exists():
+                    read_safetensors(kept)
+            case "sleeps":
+                time.sleep(1.2)
+            case "works":
+                program = "import time\nwhile time.process_time() < 1: pass"
+                subprocess.run([sys.executable, "-c", program], check=True)
             case "killed":
                 os.kill(os.getpid(), signal.SIGKILL)
 
@@ -145,7 +155,7 @@ class Ends(FakeAvatar):
 
 HOW = (
     "exit_2", "exit_0", "exit_130", "os_error", "input_error", "keyboard", "leaves", "loud", "killed", "bytes",
-    "units", "negative",
+    "units", "negative", "resumes", "sleeps", "works",
 )  # fmt: skip
 
 

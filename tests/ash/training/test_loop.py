@@ -7,11 +7,13 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 from helpers.captures import tube_model_config, write_tube_capture
 
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Pose
+from ash.checkpoints import read_safetensors
 from ash.config import AshConfig, TrainingConfig
 from ash.files import InputError
 from ash.protocol import StageClock
@@ -308,6 +310,34 @@ def test_a_damaged_checkpoint_is_named(capture, tmp_path):
     (tmp_path / "weights.safetensors").write_bytes(content[: len(content) // 2])
     with pytest.raises(InputError, match=r"weights\.safetensors: expected a safetensors checkpoint"):
         avatar.load(tmp_path / "weights.safetensors")
+
+
+def test_a_checkpoint_is_taken_up_whole_or_named(capture, tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    avatar = AshAvatar(config(), capture)
+    avatar.fit(capture, folder=tmp_path)
+    whole = path.read_bytes()
+    tensors, facts = read_safetensors(path)
+    tensors = {name: tensor.clone() for name, tensor in tensors.items()}  # The file's own memory is written over below.
+    moments = next(name for name in tensors if name.endswith("exp_avg"))
+    damaged = {
+        "KeyError": ({n: t for n, t in tensors.items() if n != moments}, facts),
+        "RuntimeError": (tensors | {moments: torch.zeros(3, 5, 7)}, facts),
+        "NaN or infinity": (tensors | {moments: torch.full_like(tensors[moments], float("nan"))}, facts),
+        "KeyError: 'step'": (tensors, {n: f for n, f in facts.items() if n != "step"}),
+        "invalid literal": (tensors, facts | {"step": "many"}),
+        "of the rate": (tensors, facts | {"seconds": "nan"}),
+        "scores": (tensors, facts | {"course": '{"scores": [{"step": "x", "psnr": 1.0}]}'}),
+    }
+    for reason, (spoiled, told) in damaged.items():
+        path.write_bytes(safetensors.torch.save(spoiled, metadata=told))
+        with pytest.raises(InputError, match=rf"checkpoint\.safetensors: .*{reason}") as raised:
+            AshAvatar(config(), capture).fit(capture, folder=tmp_path)
+        assert str(raised.value).isprintable()
+    path.write_bytes(whole)
+    again = AshAvatar(config(), capture)
+    again.fit(capture, folder=tmp_path)
+    assert all(torch.equal(a, b) for a, b in zip(weights(avatar).values(), weights(again).values(), strict=True))
 
 
 def test_saved_weights_render_the_same_image(capture, tmp_path):

@@ -73,11 +73,46 @@ def test_a_thief_finds_nothing_and_scores_what_it_draws(
     assert [view.scores for view in result.views] == [view.scores for view in expected.views]
 
 
+def test_the_processor_s_time_stands_beside_the_clock_s(capture: Path, tmp_path: Path) -> None:
+    """A training that sleeps, as one that was stopped, takes time by the clock and none of the processor."""
+    sleeps, works = cell("sleeps", capture, tmp_path), cell("works", capture, tmp_path)
+    run([sleeps, works])
+    wall, cpu = {}, {}
+    for each in (sleeps, works):
+        result = read_result(each.folder)
+        assert result is not None and result.status == "done", result and result.reason
+        name = each.config.method
+        wall[name], cpu[name] = (result.value("speed", "", f"train_{clock}_s") for clock in ("wall", "cpu"))
+    assert wall["sleeps"] > 1.2 and cpu["sleeps"] < 0.6
+    assert wall["works"] > 0.9 and cpu["works"] > 0.9, "a process of the method's counts as well"
+
+
+def test_what_an_earlier_attempt_left_damaged_is_not_the_method_s_fault(capture: Path, tmp_path: Path) -> None:
+    target = cell("resumes", capture, tmp_path)
+    (target.folder / host.WORK).mkdir(parents=True)
+    (target.folder / host.WORK / "checkpoint.safetensors").write_bytes(b"half of it")
+    run([target])
+    result = read_result(target.folder)
+    assert result is not None and result.status == "done", result and result.reason
+    assert "expected a safetensors checkpoint" in (target.folder / "output.log").read_text()
+
+
 def test_a_clock_that_contradicts_ours_is_told(capture: Path, tmp_path: Path) -> None:
     cheat = cell("clock", capture, tmp_path)
     run([cheat])
     result = read_result(cheat.folder)
     assert result is not None and result.status == "crashed" and "its clock says" in result.reason
+
+
+def test_a_slow_clock_gains_nothing_and_a_busy_machine_ends_no_cell() -> None:
+    def frames(way: float) -> list[host.Timed]:
+        return [host.Timed(inside_ms=ms, stage_ms={}, outside_ms=ms + way + ms / 50) for ms in (5.0, 6.0, 9.0)]
+
+    assert host.frame_times_ms(frames(0.5)) == (5.0, 6.0, 9.0)
+    assert host.frame_times_ms(frames(6.0)) == pytest.approx((11.1, 12.12, 15.18))
+    for way in (30.0, -1.0):
+        with pytest.raises(host.MethodFailed, match="its clock says"):
+            host.frame_times_ms(frames(way))
 
 
 @pytest.mark.parametrize(
@@ -112,7 +147,7 @@ def test_printing_is_bounded_and_processes_end_with_their_cell(capture: Path, tm
         time.sleep(0.1)
     for each in (loud, leaves):
         result = read_result(each.folder)
-        assert result is not None and result.status == "done"
+        assert result is not None and result.status == "done", result.reason
 
 
 def test_without_namespaces_the_row_says_so(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

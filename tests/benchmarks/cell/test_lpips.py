@@ -83,6 +83,13 @@ def test_files_that_are_no_alexnet(tmp_path: Path) -> None:
     torch.save({"features.0.weight": torch.zeros(3)}, path)
     with pytest.raises(InputError, match="expected torchvision's AlexNet weights"):
         lpips.Lpips(path)
+    whole = alexnet().state_dict()
+    torch.save({f"features.{n}": torch.full_like(t, torch.nan) for n, t in whole.items()}, path)
+    with pytest.raises(InputError, match="holds NaN or infinity"):
+        lpips.Lpips(path)
+    torch.save({"features.0.weight": "text"}, path)
+    with pytest.raises(InputError, match="expected tensors, got str"):
+        lpips.Lpips(path)
     torch.save([1, 2], path)
     with pytest.raises(InputError, match="expected a dictionary"):
         lpips.Lpips(path)
