@@ -191,6 +191,13 @@ def test_no_two_classes_share_a_name() -> None:
     assert len(found) > 100 and {name: places for name, places in found.items() if len(places) > 1} == {}
 
 
+def test_no_source_file_passes_400_lines() -> None:
+    paths = [path for folder in (*PACKAGES, "tests") for path in (ROOT / folder).rglob("*.*")]
+    sources = [path.relative_to(ROOT) for path in paths if path.suffix in (".py", ".cpp", ".h", ".inc")]
+    long = [path.as_posix() for path in sources if len((ROOT / path).read_text().splitlines()) > 400]
+    assert len(sources) > 200 and [path for path in long if not path.startswith("benchmarks/play/")] == []
+
+
 def test_the_class_of_a_verb_has_the_verbs_name() -> None:
     for verb, target in VERBS.items():
         assert target.partition(":")[2] == f"{verb.title().replace('-', '')}Verb"

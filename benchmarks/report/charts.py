@@ -1,128 +1,18 @@
-"""The charts of a report: one declarative specification each (Vega-Lite, by Altair), as SVG and alive in the page.
-
-A `Figure` is made of panels. `svg` sets them side by side in a file for Markdown; the page shows the same panels below
-each other where it is narrow, with values on hover, zoom, and a legend whose entries hide and show a series. Colours of
-paper, ink and grid are replaced on dark pages by those of `DARK`, in the file and in the page alike.
-"""
+"""The kinds of charts in a report: one declarative specification each (Vega-Lite, by Altair), in panels."""
 
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import altair as alt
 import pandas as pd
-import vl_convert
 
-from benchmarks.analysis.names import look_of
-from benchmarks.cell.methods import is_oracle
+from benchmarks.report.vega import DIM, INK, LINE, PAPER, Series
 
-VERSION = "6.4"  # of Vega-Lite, among those that vl-convert brings
-PAPER, INK, DIM, GRID, LINE = "#fffffe", "#1f2733", "#5d6878", "#dfe4eb", "#8a94a3"
-DARK = {PAPER: "#12171f", INK: "#e6eaf0", DIM: "#9aa6b6", GRID: "#2c3543"}
-BLUE, ORANGE = "#2f6fde", "#dd6b20"
-SHAPES = ("circle", "square", "triangle-up", "diamond", "cross", "triangle-down")
 FEW = 6  # Up to so many series are named where they are drawn, if there is room.
 WIDTH = 900  # pixels of a chart in a file
 REAL_TIME_MS = 1e3 / 30
-CONFIG: dict[str, Any] = {
-    "font": "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-serif",
-    "background": PAPER,
-    "view": {"stroke": None},
-    "axis": {
-        "labelColor": DIM,
-        "titleColor": DIM,
-        "gridColor": GRID,
-        "domainColor": LINE,
-        "tickColor": LINE,
-        "labelFontSize": 12,
-        "titleFontSize": 12,
-        "titleFontWeight": "normal",
-        "labelLimit": 260,
-    },
-    "title": {"color": INK, "subtitleColor": DIM, "anchor": "start", "fontSize": 14, "subtitleFontSize": 12},
-    "legend": {
-        "labelColor": INK,
-        "labelFontSize": 12,
-        "labelLimit": 300,
-        "symbolLimit": 0,
-        "orient": "bottom",
-        "columns": 5,
-    },
-    "text": {"color": INK, "fontSize": 12},
-    "rule": {"color": LINE},
-}
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Series:
-    """How one series looks. A hollow one is a bound and no competitor."""
-
-    title: str
-    colour: str
-    hollow: bool = False
-    shape: str = "circle"
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Figure:
-    """A chart: its file is `chart_NAME.svg`. `named`: the series are named in the drawing, and need no legend there."""
-
-    name: str
-    title: str
-    caption: str
-    panels: tuple[alt.LayerChart, ...]
-    series: tuple[Series, ...] = ()
-    columns: int = 2
-    named: bool = False
-
-    @property
-    def file(self) -> str:
-        """The file's name."""
-        return f"chart_{self.name}.svg"
-
-    def svg(self) -> str:
-        """The drawing as a file: the same bytes each time, without any network."""
-        chart = alt.concat(*self.panels, columns=self.columns, spacing=24).resolve_scale(
-            fill="shared", stroke="shared", shape="shared", strokeDash="shared"
-        )
-        whole: dict[str, Any] = chart.to_dict(validate=False)
-        spec = (_without_legends(whole) if self.named else whole) | {"config": CONFIG}
-        drawn = vl_convert.vegalite_to_svg(spec, vl_version=VERSION, allowed_base_urls=[])
-        return drawn.replace(">", f"><title>{_plain(self.title)}</title><style>{dark_rules()}</style>", 1)
-
-    def specs(self) -> list[dict[str, Any]]:
-        """The panels as the page shows them."""
-        return [_alive(panel) for panel in self.panels]
-
-
-def series_of(methods: Sequence[str]) -> tuple[Series, ...]:
-    """The looks of methods; those of one colour differ in shape."""
-    found: list[Series] = []
-    for method in methods:
-        look, hollow = look_of(method), is_oracle(method)
-        alike = sum((other.colour, other.hollow) == (look.colour, hollow) for other in found)
-        title = method if any(other.title == look.title for other in found) else look.title
-        shape = SHAPES[alike % len(SHAPES)]
-        found.append(Series(title=title, colour=look.colour, hollow=hollow, shape=shape))
-    return tuple(found)
-
-
-def dark_rules(scope: str = "") -> str:
-    """CSS that repaints a chart on dark pages."""
-    rules = [
-        f'{scope}[{mark}="{light}"]{{{mark}:{dark}}}' for light, dark in DARK.items() for mark in ("fill", "stroke")
-    ]
-    return f"@media (prefers-color-scheme:dark){{{''.join(rules)}}}"
-
-
-@cache
-def library() -> str:
-    """The JavaScript that draws specifications in a page: Vega, Vega-Lite, and their interpreter of expressions."""
-    bundle: str = vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;", vl_version=VERSION)
-    return bundle
 
 
 def speed(
@@ -465,16 +355,6 @@ def _log_ticks(domain: tuple[float, float]) -> list[float]:
     return [tick for tick in ticks if domain[0] <= tick <= domain[1]]
 
 
-def _alive(panel: alt.LayerChart) -> dict[str, Any]:
-    """A panel for the page: as wide as its box, on the page's paper, with zoom, its legend left to the page."""
-    spec: dict[str, Any] = _without_legends(panel.properties(width="container").to_dict(validate=False))
-    zoom = {"type": "interval", "zoom": "wheel![event.ctrlKey || event.metaKey]"}
-    at = next(i for i, layer in enumerate(spec["layer"]) if layer["mark"]["type"] in ("point", "bar"))
-    if spec["layer"][at]["mark"]["type"] == "point" and _is_continuous(spec["layer"][at]["encoding"]):
-        spec["layer"][at]["params"] = [{"name": "zoom", "select": zoom, "bind": "scales"}]
-    return spec | {"config": {**CONFIG, "background": None}, "autosize": {"type": "fit-x", "contains": "padding"}}
-
-
 def _number_axis(values: pd.Series, title: str, *, log: bool) -> alt.X:
     """An axis with a tick at every value; a logarithmic one has those of its decades."""
     if log:
@@ -482,17 +362,3 @@ def _number_axis(values: pd.Series, title: str, *, log: bool) -> alt.X:
         scale = alt.Scale(type="log", domain=domain, nice=False)
         return alt.X("x:Q", title=title, scale=scale, axis=alt.Axis(values=_log_ticks(domain), format="~s"))
     return alt.X("x:Q", title=title, axis=alt.Axis(values=sorted(values.unique()), format="~g"))
-
-
-def _without_legends(node: Any) -> Any:
-    if isinstance(node, dict):
-        return {key: None if key == "legend" else _without_legends(value) for key, value in node.items()}
-    return [_without_legends(value) for value in node] if isinstance(node, list) else node
-
-
-def _is_continuous(encoding: dict[str, Any]) -> bool:
-    return all(encoding[axis]["type"] == "quantitative" for axis in ("x", "y"))
-
-
-def _plain(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

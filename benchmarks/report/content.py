@@ -6,7 +6,7 @@ The page and the Markdown are two templates over these; a new section is a few o
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
-from benchmarks.report.charts import Figure
+from benchmarks.report.vega import Figure
 
 Mark = Literal["", "best", "second", "strong"]
 

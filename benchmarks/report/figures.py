@@ -9,8 +9,8 @@ from benchmarks.analysis.contrasts import Contrast
 from benchmarks.analysis.names import EXACT, SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Score, Scores, foreground
 from benchmarks.cell.methods import WRONG_BY_MM
-from benchmarks.report import charts
-from benchmarks.report.charts import Figure, Series
+from benchmarks.report import charts, vega
+from benchmarks.report.vega import Figure, Series
 
 STAGES = {
     "stg1_ms": Series(title="Stg.1 template", colour="#2f6fde"),
@@ -28,7 +28,7 @@ SPAN_DB = 9.0  # that a chart shows below its best point: what lies lower would 
 def speed_figure(scores: Scores, scene: str) -> Figure | None:
     """Foreground PSNR against milliseconds per frame, for held-out views and held-out motion."""
     methods = [m for m in scores.methods(scene) if m not in PLANTED and scores.whole(scene, m)]
-    looks = dict(zip(methods, charts.series_of(methods), strict=True))
+    looks = dict(zip(methods, vega.series_of(methods), strict=True))
     points, front, links = [], [], []
     notes: dict[str, str] = {}
     for split in RANKED_SPLITS:
@@ -100,9 +100,9 @@ def _lifted(points: pd.DataFrame) -> pd.DataFrame:
 
 
 AHEAD = (
-    Series(title="ASH is ahead", colour=charts.BLUE),
-    Series(title="the row is ahead", colour=charts.ORANGE),
-    Series(title="the interval holds zero", colour=charts.LINE),
+    Series(title="ASH is ahead", colour=vega.BLUE),
+    Series(title="the row is ahead", colour=vega.ORANGE),
+    Series(title="the interval holds zero", colour=vega.LINE),
 )
 
 
@@ -138,7 +138,7 @@ def training_figure(scores: Scores, curves: pd.DataFrame, scene: str) -> Figure 
     methods = [m for m in scores.methods(scene) if (curves["method"] == m).sum() > 1]
     if not methods:
         return None
-    looks = charts.series_of(methods)
+    looks = vega.series_of(methods)
     names = {method: look.title for method, look in zip(methods, looks, strict=True)}
     points = curves[curves["method"].isin(methods)]
     points = pd.DataFrame({"series": points["method"].map(names), "x": points["seconds"], "y": points["psnr"]})

@@ -12,11 +12,11 @@ from markupsafe import Markup, escape
 
 from ash.files import InputError, write_atomic
 from benchmarks.analysis.scores import Scores, csv_of, scores_of
-from benchmarks.report import charts, content, escaping, glossary, sections, sentences, tables
-from benchmarks.report.charts import Figure
+from benchmarks.report import content, escaping, glossary, sections, sentences, tables, vega
 from benchmarks.report.content import Report, Section
 from benchmarks.report.pictures import Album
 from benchmarks.report.scene import FEW_WORST, MANY, WORST, SceneData, SceneReport, scene_report
+from benchmarks.report.vega import Figure
 from benchmarks.suites.runs import Run, results_of
 
 PUBLISHED = ("report.md", "results.csv", "tables.tex", "chart_*.svg", "pictures_*.png", "worst_*.png")
@@ -92,8 +92,8 @@ def render(report: Report, form: Literal["html", "md"], album: Album | None = No
     text = template.render(
         report=report,
         album=[] if album is None else album.pictures,
-        library=Markup(charts.library()) if form == "html" else "",
-        dark_rules=Markup(charts.dark_rules(".vega ")),
+        library=Markup(vega.library()) if form == "html" else "",
+        dark_rules=Markup(vega.dark_rules(".vega ")),
     )
     return text if form == "html" else "\n".join(_without_blank_runs(text.splitlines())) + "\n"
 

@@ -14,8 +14,7 @@ from benchmarks.analysis.names import EXACT, SPLIT_NAMES, is_ours, look_of
 from benchmarks.analysis.scores import RANKED_SPLITS, Quantity, Scores, curves_of, foreground
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS
-from benchmarks.report import charts, figures, pictures, sentences, tables
-from benchmarks.report.charts import Figure
+from benchmarks.report import charts, figures, pictures, sentences, tables, vega
 from benchmarks.report.content import (
     Block,
     Bullets,
@@ -31,6 +30,7 @@ from benchmarks.report.content import (
     texts,
 )
 from benchmarks.report.pictures import Album, Shown
+from benchmarks.report.vega import Figure
 from benchmarks.suites.runs import Run
 
 IMAGE_SPLITS = (*RANKED_SPLITS, "train_view")  # In the order of the columns.
@@ -290,7 +290,7 @@ def _picture_sections(
 
 def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Flipbook, dict[str, bytes]]:
     tracks = pictures.tracks(capture, shown, data.album, room=data.room)
-    looks = charts.series_of([each.cell.config.method for each in shown])
+    looks = vega.series_of([each.cell.config.method for each in shown])
     points = [
         {"track": index, "series": look.title, "frame": frame, "psnr": psnr}
         for index, track in enumerate(tracks)

@@ -10,11 +10,11 @@ from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Scores
 from benchmarks.analysis.statistics import Difference
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS, PROTOCOL
-from benchmarks.report import charts
-from benchmarks.report.charts import Figure, Series
+from benchmarks.report import charts, vega
 from benchmarks.report.content import Block, Bullets, Chart, Entry, Head, Mark, Row, Section, Table, Text, texts
 from benchmarks.report.glossary import GLOSSARY
 from benchmarks.report.tables import entry_of
+from benchmarks.report.vega import Figure, Series
 
 WHISKERS = "Whiskers: 95 % interval over seeds."
 
@@ -48,7 +48,7 @@ def margins(scores: Scores) -> list[Section]:
     rules = [(_place(c), 0.0, "") for c in curves]
     rules += [(_place(c), c.paper_db, f"the paper's {c.paper_db:+.1f} dB") for c in curves if c.paper_db is not None]
     looks = [Series(title=title, colour=look_of(method).colour) for method, title in margin.LEVEL_TITLES.items()]
-    pair = [Series(title=known, colour=charts.BLUE), Series(title=own, colour=charts.ORANGE, shape="square")]
+    pair = [Series(title=known, colour=vega.BLUE), Series(title=own, colour=vega.ORANGE, shape="square")]
     size = (390, 240)
     figures = (
         Figure(
@@ -94,7 +94,7 @@ def spent(results: Sequence[CellResult]) -> list[Section]:
 def _spent_figure(table: pd.DataFrame, name: str, title: str, spent: str, x_title: str) -> Figure:
     """A panel per scene and split: a line with intervals per method, over the logarithm of what was spent."""
     methods = list(table["method"].unique())
-    looks = charts.series_of(methods)
+    looks = vega.series_of(methods)
     names = {method: look.title for method, look in zip(methods, looks, strict=True)}
     samples = pd.DataFrame(
         {
@@ -216,7 +216,7 @@ def _sample(
 
 def _stability(scores: Scores, scene: str, curves: Sequence[stability.Curve]) -> Section:
     methods = [m for m in dict.fromkeys(c.method for curve in curves for c in curve.courses) if m != stability.TRIVIAL]
-    looks = charts.series_of(methods)
+    looks = vega.series_of(methods)
     names = {method: look.title for method, look in zip(methods, looks, strict=True)}
     caption = "Accuracy against severity, the clean capture at 0. A failed cell counts with the worst score."
     if any(curve.trivial is not None for curve in curves):

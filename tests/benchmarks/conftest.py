@@ -1,12 +1,25 @@
-"""Trained avatars for the tests that show them."""
+"""Captures and methods that are fakes, and trained avatars for the tests that show them."""
 
 from pathlib import Path
 
 import pytest
+from helpers import fakes
 from helpers.captures import write_tube_capture
 
 from benchmarks import cli
 from benchmarks.cell.cells import read_cell
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three boxes that swing, for methods that are fakes."""
+    return fakes.write_capture(tmp_path_factory.mktemp("capture"))
+
+
+@pytest.fixture
+def installed_fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The methods that are fakes, as an installed distribution."""
+    fakes.use(tmp_path / "plugins", monkeypatch)
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,6 @@
 import json
 import os
 import re
-import resource
 import shutil
 import signal
 import subprocess
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from helpers import fakes
+from helpers.commands import ash_bench, refused, refused_last
 from helpers.waiting import wait_for
 
 from benchmarks import cli
@@ -22,15 +22,7 @@ from benchmarks.suites.suites import CaptureSpec
 from benchmarks.verbs import arguments
 from benchmarks.verbs.captures import SynthVerb
 
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return fakes.write_capture(tmp_path_factory.mktemp("capture"))
-
-
-@pytest.fixture(autouse=True)
-def installed_fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fakes.use(tmp_path / "plugins", monkeypatch)
+pytestmark = pytest.mark.usefixtures("installed_fakes")
 
 
 @pytest.fixture
@@ -54,19 +46,6 @@ def made_once(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def finished(made_once: Path, tmp_path: Path) -> Path:
     """A copy of the finished run."""
     return Path(shutil.copytree(made_once, tmp_path / "run"))
-
-
-def refused(capsys: pytest.CaptureFixture[str], *command: str) -> str:
-    """The one line with which a command is refused."""
-    assert cli.main(list(command)) == arguments.WRONG_INPUT
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1, lines
-    assert lines[0].startswith("ash-bench: ")
-    return lines[0]
-
-
-def damaged(capture: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(capture, tmp_path / "damaged"))
 
 
 def test_a_run_leaves_its_report(finished: Path) -> None:
@@ -225,78 +204,6 @@ def test_unknown_names(capture: Path, tmp_path: Path, capsys) -> None:
     assert "expected a shard i/n" in refused(capsys, "run", "ci", "--shard", "3/2", "--dry-run")
 
 
-def test_a_missing_image(capture: Path, tmp_path: Path, capsys) -> None:
-    folder = damaged(capture, tmp_path)
-    (folder / "frames" / "cam0" / "000002.png").unlink()
-    assert "cam0/000002.png: missing" in refused(capsys, "train", "fake_good", str(folder))
-    assert cli.main(["verify", str(folder)]) == arguments.WRONG_INPUT
-
-
-def test_a_truncated_image(capture: Path, tmp_path: Path, capsys) -> None:
-    folder = damaged(capture, tmp_path)
-    image = folder / "frames" / "cam0" / "000002.png"
-    image.write_bytes(image.read_bytes()[:-200])
-    assert "cam0/000002.png: altered" in refused(capsys, "train", "fake_good", str(folder))
-
-
-def test_a_wrong_hash(capture: Path, tmp_path: Path, capsys) -> None:
-    folder = damaged(capture, tmp_path)
-    path = folder / "motion.npz"
-    content = bytearray(path.read_bytes())
-    content[-1] ^= 1  # In the archive's comment length: still readable, and still not what was made.
-    path.write_bytes(bytes(content))
-    assert cli.main(["verify", str(folder)]) == arguments.WRONG_INPUT
-    assert "motion.npz: altered (SHA-256 differs from the manifest)" in capsys.readouterr().err
-    assert cli.main(["verify", str(capture)]) == arguments.DONE
-
-
-def test_another_schema_version(capture: Path, tmp_path: Path, capsys) -> None:
-    folder = damaged(capture, tmp_path)
-    manifest = folder / "manifest.json"
-    manifest.write_text(manifest.read_text().replace('"schema": 1', '"schema": 99'))
-    assert "expected capture schema 1, got 99" in refused(capsys, "train", "fake_good", str(folder))
-
-
-def test_an_unfinished_capture_and_no_capture(capture: Path, tmp_path: Path, capsys) -> None:
-    folder = damaged(capture, tmp_path)
-    manifest = folder / "manifest.json"
-    manifest.write_text(manifest.read_text().replace('"complete": true', '"complete": false'))
-    assert "unfinished" in refused(capsys, "train", "fake_good", str(folder))
-    assert "manifest.json" in refused(capsys, "train", "fake_good", str(tmp_path / "nowhere"))
-
-
-def test_a_folder_that_cannot_be_written(capture: Path, tmp_path: Path, capsys) -> None:
-    blocked = tmp_path / "file"
-    blocked.write_text("")
-    assert "a part of the path is a file" in refused(
-        capsys, "run", "ci", "--out", str(blocked / "run"), "--data", str(tmp_path)
-    )
-
-
-def test_no_space_on_the_device(capture: Path, tmp_path: Path) -> None:
-    small = tmp_path / "small"
-    small.mkdir()
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=40k", "tmpfs", small], capture_output=True).returncode:
-        pytest.skip("mounting a small file system needs rights that this user lacks")
-    try:
-        told = ash_bench("train", "fake_good", str(capture), "--out", str(small))
-        assert told.returncode == arguments.WRONG_INPUT
-        assert told.stderr.strip().splitlines()[-1].endswith("no space left on the device")
-        assert "Traceback" not in told.stderr
-    finally:
-        subprocess.run(["umount", small], check=True)
-
-
-def test_a_file_beyond_the_systems_limit(capture: Path, tmp_path: Path) -> None:
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
-
-    told = ash_bench("train", "fake_good", str(capture), "--out", str(tmp_path / "out"), preexec_fn=limit)
-    assert told.returncode == arguments.WRONG_INPUT
-    assert "larger than the system allows" in told.stderr
-    assert "Traceback" not in told.stderr
-
-
 def test_reports_need_a_finished_cell(finished: Path, tmp_path: Path, capsys) -> None:
     assert "run.json: cannot be read" in refused(capsys, "report", str(tmp_path))
     out = finished
@@ -391,14 +298,6 @@ def test_a_shell_can_complete_verbs_and_flags(tmp_path: Path) -> None:
         assert wanted in done.stdout.split(), done
 
 
-def ash_bench(*command: str, preexec_fn=None) -> subprocess.CompletedProcess[str]:
-    whole = [sys.executable, "-m", "benchmarks.cli", *command]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.run(
-        whole, env=environment, capture_output=True, text=True, timeout=120, preexec_fn=preexec_fn, check=False
-    )
-
-
 def test_the_code_version_follows_every_deciding_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = Path(shutil.copytree(Path(cli.__file__).parents[1] / "ash", tmp_path / "ash"))
     monkeypatch.setattr(methods, "_package_folder", lambda package: root)
@@ -455,12 +354,6 @@ def test_the_gate_on_a_run(finished: Path, tmp_path: Path, capsys) -> None:
     assert "passed" in (tmp_path / "s.md").read_text() and (tmp_path / "j.xml").exists()
     baseline.write_text(baseline.read_text().replace('"params": 2', '"params": 1'))
     assert cli.main(gate) == arguments.FAILED
-
-
-def refused_last(capsys: pytest.CaptureFixture[str], *command: str) -> str:
-    """The last line of a command that is refused after others spoke."""
-    assert cli.main(list(command)) == arguments.WRONG_INPUT
-    return capsys.readouterr().err.strip().splitlines()[-1]
 
 
 def test_a_capture_of_an_older_scene_is_kept_and_the_new_one_goes_beside_it(

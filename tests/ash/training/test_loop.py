@@ -11,10 +11,11 @@ import safetensors.torch
 import torch
 from helpers.captures import tube_model_config, write_tube_capture
 
+from ash import presets
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Pose
 from ash.checkpoints import read_safetensors
-from ash.config import AshConfig, TrainingConfig
+from ash.config import AshConfig
 from ash.files import InputError
 from ash.protocol import StageClock
 from ash.training import loop, stopping
@@ -29,15 +30,7 @@ def capture(tmp_path_factory):
 
 
 def config(**changes) -> AshConfig:
-    training = TrainingConfig(
-        steps=12,
-        views_per_step=2,
-        warmup="static",
-        warmup_steps=4,
-        l1_weight=0.8,
-        ssim_weight=0.2,
-        learning_rate=2e-3,
-    )
+    training = replace(presets.ci().training, steps=12, warmup_steps=4, ema=0.0)
     return AshConfig(model=tube_model_config(), training=replace(training, **changes))
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ash import presets
 from ash.config import TrainingConfig
 from ash.training.batches import reserved_views
 from ash.training.stopping import (
@@ -17,15 +18,7 @@ from ash.training.stopping import (
     rate_factor,
 )
 
-CONFIG = TrainingConfig(
-    steps=20_000,
-    views_per_step=2,
-    warmup="static",
-    warmup_steps=200,
-    l1_weight=0.8,
-    ssim_weight=0.2,
-    learning_rate=1e-3,
-)
+CONFIG = replace(presets.ci().training, steps=20_000, warmup_steps=200, learning_rate=1e-3, ema=0.0)
 
 
 def train(curve, config: TrainingConfig, *, seconds_per_step: float = 0.0) -> tuple[TrainingCourse, list[float]]:

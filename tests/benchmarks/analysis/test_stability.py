@@ -15,7 +15,7 @@ from ash.files import InputError
 from benchmarks.analysis import margin, stability
 from benchmarks.analysis.scores import scores_of
 from benchmarks.cell.cells import CellResult, failed_result
-from benchmarks.report import charts, sections
+from benchmarks.report import sections, vega
 from benchmarks.report.content import Chart, Table
 from benchmarks.suites import captures
 from benchmarks.suites.files import find_suite
@@ -106,7 +106,7 @@ def test_charts_are_svg_with_a_mark_where_a_method_breaks() -> None:
     assert [figure.file for figure in figures] == ["chart_stability_loose_0.svg", "chart_stability_loose_1.svg"]
     for figure in figures:
         drawn = ElementTree.fromstring(figure.svg())
-        crosses = [path for path in drawn.iter("{http://www.w3.org/2000/svg}path") if path.get("stroke") == charts.INK]
+        crosses = [path for path in drawn.iter("{http://www.w3.org/2000/svg}path") if path.get("stroke") == vega.INK]
         assert drawn.tag.endswith("svg") and len(crosses) == 1
     breakdowns = next(block for block in section.blocks if isinstance(block, Table))
     assert breakdowns.rows[0].entries[0].text == "50 (19.0 dB lost at worst)"

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import psutil
 import pytest
-from helpers import fakes
 from helpers.waiting import wait_for
 
 from ash.files import InputError
@@ -23,14 +22,7 @@ from benchmarks.suites.suites import CaptureSpec, CellSpec
 LIMITS = Limits(seconds=300.0, memory_mb=4096)
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return fakes.write_capture(tmp_path_factory.mktemp("capture"))
-
-
-@pytest.fixture(autouse=True)
-def installed_fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fakes.use(tmp_path / "plugins", monkeypatch)
+pytestmark = pytest.mark.usefixtures("installed_fakes")
 
 
 def cell(method: str, capture: Path, out: Path, *, seed: int = 0) -> Cell:

@@ -1,0 +1,90 @@
+"""Captures, folders and disks that are not as they should be: each is one line, and no stack."""
+
+import resource
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from helpers.commands import ash_bench, refused
+
+from benchmarks import cli
+from benchmarks.verbs import arguments
+
+pytestmark = pytest.mark.usefixtures("installed_fakes")
+
+
+def damaged(capture: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(capture, tmp_path / "damaged"))
+
+
+def test_a_missing_image(capture: Path, tmp_path: Path, capsys) -> None:
+    folder = damaged(capture, tmp_path)
+    (folder / "frames" / "cam0" / "000002.png").unlink()
+    assert "cam0/000002.png: missing" in refused(capsys, "train", "fake_good", str(folder))
+    assert cli.main(["verify", str(folder)]) == arguments.WRONG_INPUT
+
+
+def test_a_truncated_image(capture: Path, tmp_path: Path, capsys) -> None:
+    folder = damaged(capture, tmp_path)
+    image = folder / "frames" / "cam0" / "000002.png"
+    image.write_bytes(image.read_bytes()[:-200])
+    assert "cam0/000002.png: altered" in refused(capsys, "train", "fake_good", str(folder))
+
+
+def test_a_wrong_hash(capture: Path, tmp_path: Path, capsys) -> None:
+    folder = damaged(capture, tmp_path)
+    path = folder / "motion.npz"
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1  # In the archive's comment length: still readable, and still not what was made.
+    path.write_bytes(bytes(content))
+    assert cli.main(["verify", str(folder)]) == arguments.WRONG_INPUT
+    assert "motion.npz: altered (SHA-256 differs from the manifest)" in capsys.readouterr().err
+    assert cli.main(["verify", str(capture)]) == arguments.DONE
+
+
+def test_another_schema_version(capture: Path, tmp_path: Path, capsys) -> None:
+    folder = damaged(capture, tmp_path)
+    manifest = folder / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"schema": 1', '"schema": 99'))
+    assert "expected capture schema 1, got 99" in refused(capsys, "train", "fake_good", str(folder))
+
+
+def test_an_unfinished_capture_and_no_capture(capture: Path, tmp_path: Path, capsys) -> None:
+    folder = damaged(capture, tmp_path)
+    manifest = folder / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"complete": true', '"complete": false'))
+    assert "unfinished" in refused(capsys, "train", "fake_good", str(folder))
+    assert "manifest.json" in refused(capsys, "train", "fake_good", str(tmp_path / "nowhere"))
+
+
+def test_a_folder_that_cannot_be_written(capture: Path, tmp_path: Path, capsys) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    assert "a part of the path is a file" in refused(
+        capsys, "run", "ci", "--out", str(blocked / "run"), "--data", str(tmp_path)
+    )
+
+
+def test_no_space_on_the_device(capture: Path, tmp_path: Path) -> None:
+    small = tmp_path / "small"
+    small.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=40k", "tmpfs", small], capture_output=True).returncode:
+        pytest.skip("mounting a small file system needs rights that this user lacks")
+    try:
+        told = ash_bench("train", "fake_good", str(capture), "--out", str(small))
+        assert told.returncode == arguments.WRONG_INPUT
+        assert told.stderr.strip().splitlines()[-1].endswith("no space left on the device")
+        assert "Traceback" not in told.stderr
+    finally:
+        subprocess.run(["umount", small], check=True)
+
+
+def test_a_file_beyond_the_systems_limit(capture: Path, tmp_path: Path) -> None:
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+
+    told = ash_bench("train", "fake_good", str(capture), "--out", str(tmp_path / "out"), preexec_fn=limit)
+    assert told.returncode == arguments.WRONG_INPUT
+    assert "larger than the system allows" in told.stderr
+    assert "Traceback" not in told.stderr
