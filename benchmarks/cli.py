@@ -1,6 +1,7 @@
 """The one door: `ash-bench VERB`. A verb's module is imported when it is asked for, and what is heavy when it works."""
 
 import contextlib
+import multiprocessing
 import os
 import signal
 import sys
@@ -69,6 +70,7 @@ exit codes: 0 done, 1 a cell or check failed, 2 wrong input, 130 interrupted (th
 
 def main(argv: list[str] | None = None) -> int:
     """Run a verb and return the exit code."""
+    _open_closed_streams()
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # As cells run; read when torch and FLIP are loaded, so set it first.
     try:
         with _terminate_as_interrupt():
@@ -80,13 +82,35 @@ def main(argv: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except OSError as error:
-        line = disk_problem(error)
+        line = _semaphore_problem(error) or disk_problem(error)
         if line is None:
             raise
         return _refuse(line)
     except KeyboardInterrupt:
         print("\nash-bench: interrupted; the same command goes on where it was", file=sys.stderr)
         return INTERRUPTED
+
+
+def _open_closed_streams() -> None:
+    """Give closed standard streams to nobody: else the next file that is opened would be printed into."""
+    for descriptor, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # The lowest that is free: this one.
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(descriptor, "r" if name == "stdin" else "w", closefd=False))
+
+
+def _semaphore_problem(error: OSError) -> str | None:
+    """What processes that work side by side need, and this system does not give: an error that names no file."""
+    if error.filename is not None:
+        return None
+    try:
+        multiprocessing.get_context("spawn").Lock()
+    except OSError as refused:
+        return f"/dev/shm: cannot be used for what processes share ({refused.strerror}); it wants to be writable"
+    return None
 
 
 def _parse(tokens: Sequence[str]) -> Verb | None:

@@ -14,13 +14,13 @@ from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Literal
-from xml.sax.saxutils import escape, quoteattr
 
 from ash.capture.typed import from_json
 from ash.files import InputError, read_json, write_json
 from benchmarks.analysis.statistics import Difference, holm, welch
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS, PROTOCOL
+from benchmarks.report import escaping
 
 Verdict = Literal["pass", "fail", "unexplained improvement", "not judged"]
 Kind = Literal["presence", "quality", "time", "memory", "work"]
@@ -145,7 +145,9 @@ def markdown(baseline: Baseline, head: Baseline, checks: Sequence[Check]) -> str
     bad = [check for check in checks if check.verdict not in FINE]
     title = "passed" if not bad else f"**{len(bad)} of {len(checks)} checks did not pass**"
     lines = [f"## ash-bench gate: {title}", ""]
-    lines.append(f"Suite {head.suite}, commit {head.commit} against baseline {baseline.commit}, on {head.machine}.")
+    told = (head.suite, head.commit, baseline.commit, head.machine)
+    suite, commit, before, machine = map(escaping.markdown, told)
+    lines.append(f"Suite {suite}, commit {commit} against baseline {before}, on {machine}.")
     if bad:
         lines += ["", *_rows(bad)]
     return "\n".join([*lines, "", "<details><summary>All checks</summary>", "", *_rows(checks), "", "</details>", ""])
@@ -160,14 +162,14 @@ def junit(checks: Sequence[Check]) -> str:
     lines.append(f'<testsuite name="ash-bench gate" {numbers}>')
     for check in checks:
         group, _, name = check.what.partition(": ")
-        head = f"  <testcase classname={quoteattr(group)} name={quoteattr(name)}"
+        head = f'  <testcase classname="{escaping.xml(group)}" name="{escaping.xml(name)}"'
+        detail, verdict = escaping.xml(check.detail), escaping.xml(check.verdict)
         if check.verdict == "pass":
             lines.append(f"{head}/>")
         elif check.verdict == "not judged":
-            lines.append(f"{head}><skipped message={quoteattr(check.detail)}/></testcase>")
+            lines.append(f'{head}><skipped message="{detail}"/></testcase>')
         else:
-            reason = f"<failure message={quoteattr(check.verdict)}>{escape(check.detail)}</failure>"
-            lines.append(f"{head}>{reason}</testcase>")
+            lines.append(f'{head}><failure message="{verdict}">{detail}</failure></testcase>')
     return "\n".join([*lines, "</testsuite>", ""])
 
 
@@ -321,5 +323,6 @@ def _elsewhere(base: BaselineEntry, baseline: Baseline, head: Baseline) -> Check
 
 
 def _rows(checks: Sequence[Check]) -> list[str]:
-    rows = [f"| {check.what} | {check.verdict} | {check.detail} |" for check in checks]
+    told = [(check.what, check.verdict, check.detail) for check in checks]
+    rows = ["| {} | {} | {} |".format(*map(escaping.markdown, row)) for row in told]
     return ["| check | verdict | detail |", "|---|---|---|", *rows]

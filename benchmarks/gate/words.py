@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from benchmarks.gate.gate import FINE, Baseline, Check
+from benchmarks.report import escaping
 
 # Where a moved number is made. What all methods share is looked for in other places than what one of them alone does.
 STAGES = {
@@ -34,7 +35,7 @@ def terminal(baseline: Baseline, head: Baseline, checks: Sequence[Check], change
         lines += [f"  {check.what}: {check.detail}" for check in checks]
     untold = [check for check in checks if check.verdict == "not judged"]
     lines += [f"Not judged: {untold[0].detail}." if untold else "", verdict(checks)]
-    return "\n".join(line for k, line in enumerate(lines) if line or k)
+    return "\n".join(escaping.CONTROLS.sub(" ", line) for k, line in enumerate(lines) if line or k)
 
 
 def verdict(checks: Sequence[Check]) -> str:

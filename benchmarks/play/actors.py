@@ -130,8 +130,8 @@ def on_colour(premultiplied: np.ndarray, colour: tuple[int, int, int]) -> np.nda
 class Cast:
     """The trained avatars of one capture; each is loaded when it is first wanted, and stays."""
 
-    def __init__(self, capture: Capture, cells: Sequence[Cell], exit_stack: ExitStack) -> None:
-        self.capture = capture
+    def __init__(self, capture: Capture, cells: Sequence[Cell], exit_stack: ExitStack, *, trust: bool) -> None:
+        self.capture, self.trust = capture, trust
         self.cells = dict(zip(_titles(cells), cells, strict=True))
         self._stack = exit_stack
         self._actors: dict[str, Actor] = {}
@@ -145,17 +145,19 @@ class Cast:
         """The avatar of that name, loaded now if it was not before."""
         if title not in self._actors:
             cell = self.cells[title]
-            avatar = self._stack.enter_context(_loaded(cell, self.capture))
+            avatar = self._stack.enter_context(_loaded(cell, self.capture, trust=self.trust))
             self._actors[title] = Actor(cell, title, avatar, self.capture)
         return self._actors[title]
 
 
 @contextmanager
-def open_cast(folder: Path, *, scene: str | None = None, methods: Sequence[str] = ()) -> Iterator[Cast]:
+def open_cast(
+    folder: Path, *, scene: str | None = None, methods: Sequence[str] = (), trust: bool = False
+) -> Iterator[Cast]:
     """The trained avatars of a run or of a single cell, as long as the body runs.
 
     Oracles are left out: they know their capture's motion only. Of a run with several captures, the first is taken,
-    or that of `scene`.
+    or that of `scene`. Avatars are loaded in this process: methods of others only where they are trusted.
 
     Raises:
         InputError: nothing to show, or nothing of that scene or of those methods.
@@ -174,15 +176,15 @@ def open_cast(folder: Path, *, scene: str | None = None, methods: Sequence[str] 
         raise InputError(f"method: expected one of {', '.join(known)}, got {unknown[0]!r}")
     here = [cell for cell in here if not methods or cell.config.method in methods]
     with ExitStack() as stack:
-        yield Cast(load_capture(here[0].capture_folder), here, stack)
+        yield Cast(load_capture(here[0].capture_folder), here, stack, trust=trust)
 
 
 @contextmanager
-def _loaded(cell: Cell, capture: Capture) -> Iterator[Avatar]:
+def _loaded(cell: Cell, capture: Capture, *, trust: bool) -> Iterator[Avatar]:
     """A cell's avatar, loaded in a folder of its own: others may look at the same cell at the same time."""
     with tempfile.TemporaryDirectory(dir=cell.folder, prefix=".shown-") as scratch:
         link_or_copy(cell.folder / CHECKPOINT, Path(scratch) / CHECKPOINT)
-        with load_avatar(replace(cell, folder=Path(scratch)), capture) as (avatar, _):
+        with load_avatar(replace(cell, folder=Path(scratch)), capture, trust=trust) as (avatar, _):
             yield avatar
 
 

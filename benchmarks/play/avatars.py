@@ -60,11 +60,14 @@ class TrainedAvatar:
         return np.rint(np.clip(straight, 0, 1) * 255).astype(np.uint8)
 
 
-def load_avatar(folder: Path | str) -> TrainedAvatar:
+def load_avatar(folder: Path | str, *, trust: bool = False) -> TrainedAvatar:
     """The trained avatar of a cell's folder. What it needs on disk is freed with it.
 
+    The method's code runs in this process, and can do what you can: one that is not ours wants `trust`.
+
     Raises:
-        InputError: the folder holds no trained cell, or its capture is gone or another one.
+        InputError: the folder holds no trained cell, its capture is gone or another one, or its method is of others
+            and not trusted.
     """
     folder = Path(folder)
     if not (folder / "config.json").is_file():
@@ -76,7 +79,7 @@ def load_avatar(folder: Path | str) -> TrainedAvatar:
         raise InputError(f"{folder}: {cell.config.title} left no avatar that could be loaded")
     capture = load_capture(cell.capture_folder)
     with ExitStack() as opened:
-        avatar, _ = opened.enter_context(opened_avatar(cell, capture))
+        avatar, _ = opened.enter_context(opened_avatar(cell, capture, trust=trust))
         trained = TrainedAvatar(avatar, capture)
         weakref.finalize(trained, opened.pop_all().close)
     return trained

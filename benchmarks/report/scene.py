@@ -38,6 +38,7 @@ COSTS = (
     "frame_ms",
     *figures.STAGE_METRICS,
     "train_s",
+    "train_cpu_s",
     "search_s",
     "settled_s",
     "steps",
@@ -78,14 +79,16 @@ def scene_report(data: SceneData) -> SceneReport:
     """Compute the part of one scene."""
     scores, scene = data.scores, data.scene
     capture, shown, trouble = _pictured(data)
-    quality = tables.build(scores, scene, _quality_quantities(), title=f"Accuracy on {scene}")
-    cost = tables.build(scores, scene, tables.cost_columns(COSTS), title=f"Cost on {scene}")
+    exposed = {r.config.method for r in data.results if r.isolated is False}
+    notes = [Text(text=doubt, note=True) for doubt in sentences.doubts(data.results)]
+    quality = tables.build(scores, scene, _quality_quantities(), title=f"Accuracy on {scene}", exposed=exposed)
+    cost = tables.build(scores, scene, tables.cost_columns(COSTS), title=f"Cost on {scene}", exposed=exposed)
     more = _more_tables(scores, scene)
     picture_sections, sheets = _picture_sections(data, capture, shown, trouble)
     sections = [
         Section(title=scene, headline=sentences.headline(scores, scene), blocks=tuple(_opening(data, capture))),
-        Section(title=quality.title, blocks=(_untitled(quality), Text(text=QUALITY_NOTE, note=True))),
-        Section(title=cost.title, blocks=(_untitled(cost), Text(text=COST_NOTE, note=True))),
+        Section(title=quality.title, blocks=(_untitled(quality), Text(text=QUALITY_NOTE, note=True), *notes)),
+        Section(title=cost.title, blocks=(_untitled(cost), Text(text=COST_NOTE, note=True), *notes)),
         *_contrasts(scores, scene),
         *_exact(scores, scene),
         *picture_sections,
@@ -107,8 +110,8 @@ QUALITY_NOTE = (
 )
 COST_NOTE = (
     "A frame and its stages: median over frames after warm-up, one core, while other cells may run beside it. "
-    "Training on "
-    "one core. Memory: the peak of the cell's process, Python and libraries included."
+    "Training on one core: seconds by the clock, and the CPU time that was counted from outside. Memory: the peak of "
+    "the cell's process, Python and libraries included."
 )
 
 

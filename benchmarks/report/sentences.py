@@ -1,13 +1,17 @@
 """The sentences that head a report, computed from its numbers. Differences are taken before anything is rounded."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from benchmarks.analysis import contrasts, pareto
 from benchmarks.analysis.names import EXACT, SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Scores, foreground
+from benchmarks.cell.cells import CellResult
 from benchmarks.cell.methods import is_oracle
 
 TOO_CLOSE_DB = 0.1
+CLOCKS_APART_S, CLOCKS_APART = 5.0, 0.5  # seconds, and share of the shorter: what a busy machine does not explain
 FEW_METHODS = 6
 
 
@@ -41,6 +45,24 @@ def remarks(scores: Scores, scene: str) -> list[str]:
     if scores.seeds == 1:
         found.append("One seed: a difference of a few tenths of a dB may be chance; --seeds 3 gives intervals.")
     return [remark for remark in found if remark]
+
+
+def doubts(results: Sequence[CellResult]) -> tuple[str, ...]:
+    """What could not be enforced, and clocks that contradict each other: notes under the tables."""
+    found = []
+    exposed = dict.fromkeys(look_of(r.config.method).title for r in results if r.isolated is False)
+    if exposed:
+        found.append(
+            f"Not isolated: {', '.join(exposed)}. The system had no room to lock the method in, so the truth was out of"
+            " sight, and opening it was watched, but not impossible."
+        )
+    for result in results:
+        wall, cpu = (result.value("speed", "", f"train_{clock}_s") for clock in ("wall", "cpu"))
+        if wall is None or cpu is None or abs(wall - cpu) < CLOCKS_APART_S + CLOCKS_APART * min(wall, cpu):
+            continue
+        why = "it was stopped, or shared its core" if wall > cpu else "it used more than one core"
+        found.append(f"{result.config.title} trained {wall:.0f} s by the clock and {cpu:.0f} s of CPU time: {why}.")
+    return tuple(found)
 
 
 def frontier(scores: Scores, scene: str) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
 """Tables of a scene's numbers, and tables as text for terminals and LaTeX."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import pandas as pd
@@ -30,8 +30,10 @@ def cost_columns(metrics: Sequence[str]) -> list[Quantity]:
     return [Quantity("memory" if metric in MEMORY else "speed", "", metric) for metric in metrics]
 
 
-def build(scores: Scores, scene: str, quantities: Sequence[Quantity], *, title: str, note: str = "") -> Table:
-    """The table of a scene; quantities that nobody has are left out."""
+def build(
+    scores: Scores, scene: str, quantities: Sequence[Quantity], *, title: str, exposed: Collection[str] = ()
+) -> Table:
+    """The table of a scene; quantities that nobody has are left out. `exposed`: methods that were not isolated."""
     methods = sorted(scores.methods(scene), key=is_oracle)  # Stable: the order of methods within each half.
     found = {q: {m: scores.get(scene, m, q) for m in methods} for q in quantities}
     kept = [quantity for quantity in quantities if any(found[quantity].values())]
@@ -44,11 +46,11 @@ def build(scores: Scores, scene: str, quantities: Sequence[Quantity], *, title: 
                 _entry(found[q][method], METRICS[q.metric], marks[q].get(method, ""), method in lost) for q in kept
             ),
             apart=is_oracle(method),
-            note=_note(scores, scene, method),
+            note=_note(scores, scene, method, exposed=method in exposed),
         )
         for method in methods
     ]
-    return Table(title=title, columns=tuple(map(head_of, kept)), rows=tuple(rows), note=note)
+    return Table(title=title, columns=tuple(map(head_of, kept)), rows=tuple(rows))
 
 
 def head_of(quantity: Quantity) -> Head:
@@ -122,9 +124,10 @@ def entry_of(score: Score | None, measure: Metric) -> Entry:
     return Entry(text=number(score.mean, measure), spread=f"{score.half_width:.{measure.decimals}f}", sort=score.mean)
 
 
-def _note(scores: Scores, scene: str, method: str) -> str:
+def _note(scores: Scores, scene: str, method: str, *, exposed: bool) -> str:
     failed = scores.failed(scene, method)
-    return f"{failed} of {scores.cells(scene, method)} failed" if failed else ""
+    notes = [f"{failed} of {scores.cells(scene, method)} failed"] if failed else []
+    return ", ".join([*notes, "not isolated"] if exposed else notes)
 
 
 def _entry(score: Score | None, measure: Metric, mark: Mark, lost: bool) -> Entry:

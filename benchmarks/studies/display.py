@@ -27,14 +27,14 @@ class DisplayTiming:
     agreement_db: float  # foreground
 
 
-def show(cell: Cell) -> DisplayTiming:
-    """Time both ways over the test motion, and compare their images.
+def show(cell: Cell, *, trust: bool = False) -> DisplayTiming:
+    """Time both ways over the test motion, and compare their images; in this process, so ours or trusted ones only.
 
     Raises:
         InputError: the method has no display of its own, or this machine cannot draw without a screen.
     """
     capture = load_capture(cell.capture_folder)
-    with load_avatar(cell, capture) as (avatar, _):
+    with load_avatar(cell, capture, trust=trust) as (avatar, _):
         if not isinstance(avatar, Displayed):
             raise InputError(f"{cell.folder}: {cell.config.method} has no display of its own")
         display = avatar.open_display()

@@ -1,6 +1,7 @@
 """Live progress: how much is done, what runs, how long it will still take."""
 
 import io
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -51,8 +52,8 @@ class Progress:
         """Print a line of its own above the live line."""
         if self.live:
             self._draw("")
-            self.stream.write("\r")
-        print(line, file=self.stream, flush=True)
+            line = f"\r{line}"
+        self._print(f"{line}\n")
 
     def tick(self, *, running: Sequence[str] = ()) -> None:
         """Redraw the line on a terminal."""
@@ -66,7 +67,7 @@ class Progress:
         """End the live line."""
         if self.live and self._drawn:
             self.tick()
-            print(file=self.stream, flush=True)
+            self._print("\n")
 
     def seconds_left(self) -> float:
         """Estimate: from the pace so far, or from the expectation while nothing is finished."""
@@ -79,9 +80,15 @@ class Progress:
     def _draw(self, text: str) -> None:
         text = text[:118]
         if text != self._drawn:
-            self.stream.write(f"\r{text}\x1b[K")
-            self.stream.flush()
+            self._print(f"\r{text}\x1b[K")
             self._drawn = text
+
+    def _print(self, text: str) -> None:
+        try:
+            self.stream.write(text)
+            self.stream.flush()
+        except BrokenPipeError:  # Whoever read along has left; the work goes on.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self.stream.fileno())
 
 
 def _left(seconds: float) -> str:

@@ -14,7 +14,14 @@ from typing import Annotated, Any, cast
 
 import tyro
 from tyro import _docstrings, _errors
-from tyro.conf import DisallowNone, FlagConversionOff, Positional, PositionalMetavarFromFieldName, arg
+from tyro.conf import (
+    DisallowNone,
+    FlagConversionOff,
+    FlagCreatePairsOff,
+    Positional,
+    PositionalMetavarFromFieldName,
+    arg,
+)
 from tyro.constructors import PrimitiveConstructorSpec
 
 from ash.fields import Changes, changed, flat, nearest
@@ -61,6 +68,7 @@ Natural = Annotated[int, _whole(0)]
 Count = Annotated[int, _whole(1)]
 CountIfAny = Annotated[int | None, _whole(1)]
 Names = Annotated[tuple[str, ...], _names()]  # Separated by commas.
+Trust = FlagCreatePairsOff[bool]  # Whether code of others is loaded into this process.
 Folder = Annotated[Path, arg(metavar="DIR")]
 File = Annotated[Path, arg(metavar="FILE")]
 

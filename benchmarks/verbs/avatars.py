@@ -10,7 +10,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from ash.capture.dataset import Pose
 from ash.files import InputError, write_atomic
-from benchmarks.verbs.arguments import DONE, Count, CountIfAny, File, Names, Natural
+from benchmarks.verbs.arguments import DONE, Count, CountIfAny, File, Names, Natural, Trust
 
 Stretch = Annotated[str | None, arg(metavar="A:B")]
 
@@ -27,6 +27,7 @@ class PlayVerb:
     port: Natural = 0  # default: a free one
     clients: Count = 8  # browsers at a time
     allow_origin: UseAppendAction[tuple[str, ...]] = ()  # where a forwarded port is seen: http://localhost:9000
+    trust: Trust = False  # load methods that are not ours too: their code runs here, without isolation
     expose: FlagCreatePairsOff[bool] = False  # let --host be open to other machines; nothing is encrypted
 
     def __call__(self) -> int:
@@ -42,7 +43,8 @@ class PlayVerb:
             expose=self.expose,
         )
         require_safe(doors)
-        with playing(self.run, motions=self.motion, scene=self.scene, methods=self.methods, doors=doors) as player:
+        chosen = {"scene": self.scene, "methods": self.methods, "trust": self.trust}
+        with playing(self.run, motions=self.motion, doors=doors, **chosen) as player:
             print(f"{player.url}\nopen this address in a browser; Ctrl-C ends the player", flush=True)
             if self.expose:
                 print(f"{self.host} is open to other machines, and nothing is encrypted", file=sys.stderr)
@@ -65,6 +67,7 @@ class VideoVerb:
     truth: FlagCreatePairsOff[bool] = False  # the truth beside them; rendered where it never was
     height: Count = 256  # of a picture, pixels
     fps: CountIfAny = None  # frames per second; default: the motion's
+    trust: Trust = False  # load methods that are not ours too: their code runs here, without isolation
 
     def __call__(self) -> int:
         """Film it."""
@@ -74,7 +77,7 @@ class VideoVerb:
 
         if self.out.suffix not in (".mp4", ".webp"):
             raise InputError(f"{self.out}: expected a film that ends with .mp4 or .webp")
-        with open_cast(self.run, scene=self.scene, methods=self.methods) as cast:
+        with open_cast(self.run, scene=self.scene, methods=self.methods, trust=self.trust) as cast:
             act = act_named(cast.capture, self.motion)
             rate = self.fps or act.motion.fps
             script = Script(
@@ -100,6 +103,7 @@ class ExportAvatarVerb:
     out: File  # a folder, where --frames means several
     motion: str = "test"  # test, train, walk, dance and so on, or a BVH or AMASS file
     frames: Stretch = None  # of the motion, from 0, B not included; default: 0, of a skeleton all
+    trust: Trust = False  # load methods that are not ours too: their code runs here, without isolation
 
     def __call__(self) -> int:
         """Write one frame into a file, or several into a folder; of a skeleton, the motion."""
@@ -111,7 +115,7 @@ class ExportAvatarVerb:
         from benchmarks.play.motions import act_named, frames_in
 
         suffix = suffix_of(self.form)
-        with open_cast(self.cell) as cast:
+        with open_cast(self.cell, trust=self.trust) as cast:
             if len(cast.titles) != 1:
                 found = ", ".join(cast.titles)
                 raise InputError(f"{self.cell}: expected one avatar, got {found}; give the folder of a cell")
@@ -141,6 +145,7 @@ class ShareVerb:
     out: File  # ends with .html
     motion: str = "test"  # test, train, walk, dance and so on, or a BVH or AMASS file
     frames: Stretch = None  # of the motion, from 0, B not included; default: all
+    trust: Trust = False  # load methods that are not ours too: their code runs here, without isolation
 
     def __call__(self) -> int:
         """Write the page."""
@@ -150,7 +155,7 @@ class ShareVerb:
 
         if self.out.suffix != ".html":
             raise InputError(f"{self.out}: expected a page that ends with .html")
-        with open_cast(self.cell) as cast:
+        with open_cast(self.cell, trust=self.trust) as cast:
             act = act_named(cast.capture, self.motion)
             clip = clip_of(cast, act, frames_in(act, self.frames))
         write_atomic(self.out, share_page(clip))

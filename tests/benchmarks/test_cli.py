@@ -1,4 +1,6 @@
+import errno
 import json
+import multiprocessing
 import os
 import re
 import shutil
@@ -18,6 +20,7 @@ from benchmarks import cli
 from benchmarks.cell import methods
 from benchmarks.suites import captures
 from benchmarks.suites.files import find_suite
+from benchmarks.suites.progress import Progress
 from benchmarks.suites.suites import CaptureSpec
 from benchmarks.verbs import arguments
 from benchmarks.verbs.captures import SynthVerb
@@ -388,3 +391,47 @@ def test_help_on_a_scene_and_on_a_method_lists_their_fields(capsys) -> None:
             cli.main([*command.split(), "--help"])
         assert end.value.code == 0
         assert flag in capsys.readouterr().out, command
+
+
+@pytest.mark.parametrize("closed", ["2>&-", "<&- >&- 2>&-"])
+def test_closed_streams_change_nothing(closed: str, finished: Path, boxes: str) -> None:
+    before = (finished / "results.csv").read_bytes()
+    (finished / "results.csv").unlink()
+    command = f'exec "{sys.executable}" -m benchmarks.cli run "{boxes}" --out "{finished}" {closed}'
+    assert subprocess.run(command, shell=True, check=False).returncode == arguments.DONE
+    assert (finished / "results.csv").read_bytes() == before
+
+
+def test_progress_goes_on_when_its_reader_has_left() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as stream:
+        progress = Progress("cells", 2, expected_s=1.0, workers=1, stream=stream)
+        progress.finish("one")
+        progress.finish("two")
+        assert progress.finished == 2 and progress.stream.fileno() == writing
+
+
+def test_unusable_shared_memory_is_called_that(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, capture: Path
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(multiprocessing.context.BaseContext, "Lock", refuse)
+    monkeypatch.setattr("ash.capture.manifest.read_manifest", refuse)
+    assert refused(capsys, "verify", str(capture)).startswith("ash-bench: /dev/shm: cannot be used")
+    monkeypatch.undo()
+    monkeypatch.setattr("ash.capture.manifest.read_manifest", refuse)
+    assert "the file system is read-only" in refused(capsys, "verify", str(capture))
+
+
+def test_a_format_with_a_slash_is_refused(capsys: pytest.CaptureFixture[str], capture: Path) -> None:
+    assert "unknown format 'a/b'" in refused(capsys, "export", str(capture), "--format", "a/b")
+
+
+def test_code_of_others_is_not_loaded_untrusted(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for command in (("display", str(finished)), ("share", str(finished / "cells"), "--out", "x.html")):
+        folder = next((finished / "cells").iterdir())
+        told = refused(capsys, command[0], str(folder), *command[2:])
+        assert "is not ours" in told and "--trust" in told

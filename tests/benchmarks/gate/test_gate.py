@@ -4,12 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.hostile import HOSTILE, Text
+from markdown_it import MarkdownIt
 
 from ash.files import InputError
 from benchmarks.cell.cells import CellConfig, CellResult, Summary, Timing, ViewScore, failed_result
 from benchmarks.gate.gate import Check, judge, junit, markdown, read_baseline, summarise, write_baseline
 from benchmarks.gate.words import terminal
 from benchmarks.provenance import changed_since
+from benchmarks.report import escaping
 
 
 def result(
@@ -214,3 +217,26 @@ def test_summary_and_junit() -> None:
     suite = ElementTree.fromstring(junit(checks).split("\n", 1)[1])
     assert int(suite.attrib["tests"]) == len(checks) == len(suite)
     assert int(suite.attrib["failures"]) == 3 == len(suite.findall("testcase/failure"))
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_names_and_details_are_texts_in_every_form(text: str) -> None:
+    words = " ".join(escaping.one_line(text).split())
+    machine = replace(BASE, suite=text, commit=text, machine=text)
+    checks = [Check(what=f"{text}: {text}", verdict=verdict, detail=text) for verdict in ("pass", "fail", "not judged")]
+    reader = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
+    page = Text(reader.render(markdown(machine, machine, checks)))
+    ours = {"h2", "p", "strong", "details", "summary", "table", "thead", "tbody", "tr", "th", "td"}
+    assert set(page.tags) <= ours and page.tags.count("td") == 3 * (1 + len(checks))
+    assert " ".join(page.text.split()).count(words) >= 2 * len(checks)
+    suite = ElementTree.fromstring(junit(checks).split("\n", 1)[1])
+    assert len(suite) == 3 and all(f"{e.get('classname')}: {e.get('name')}" == words_of(text) for e in suite)
+    assert suite[1][0].text == suite[2][0].get("message") == escaping.one_line(text)
+    shown = terminal(machine, machine, checks, None)
+    assert all(line.isprintable() or not escaping.CONTROLS.search(line) for line in shown.split("\n"))
+
+
+def words_of(text: str) -> str:
+    """How the title of a check is split and put together again."""
+    group, _, name = f"{text}: {text}".partition(": ")
+    return f"{escaping.one_line(group)}: {escaping.one_line(name)}"
