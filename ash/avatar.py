@@ -119,6 +119,8 @@ class AshAvatar:
             groups.append({"params": list(module.decoders.parameters()), "lr": training.learning_rate})
         if module.base.requires_grad:
             groups.append({"params": [module.base], "lr": training.base_learning_rate})
+        if module.static is not None:
+            groups.append({"params": [module.static], "lr": training.base_learning_rate})
         if module.refinement is not None:
             groups.append({"params": list(module.refinement.parameters()), "lr": training.base_learning_rate})
         if module.light is not None:
@@ -127,12 +129,26 @@ class AshAvatar:
 
     def draw_training_views(self, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
         """Stages 3 and 4 on cached conditions; the base alone while the static warm-up lasts."""
-        static = self.config.training.warmup == "static" and step < self.config.training.warmup_steps
-        conditions = self._conditions_of(frame)
-        if not static:
-            noisy = unsettled(conditions.textures, self.config.training.texture_noise, seed=self.config.seed, step=step)
-            conditions = replace(conditions, textures=noisy)
-        raw = self._decode(conditions, static=static)
+        training, conditions = self.config.training, self._conditions_of(frame)
+        if step < training.static_steps:
+            return self._drawn(self.module.refined(self.module.base), conditions, cameras, background)
+        noisy = unsettled(conditions.textures, training.texture_noise, seed=self.config.seed, step=step)
+        return self._drawn(self._decode(replace(conditions, textures=noisy)), conditions, cameras, background)
+
+    def draw_static_views(self, frame: int, cameras: list[Camera], background: Tensor) -> Tensor | None:
+        """Views of the static avatar, which counts far from the training motion."""
+        static = self.module.static
+        if static is None:
+            return None
+        return self._drawn(self.module.refined(static), self._conditions_of(frame), cameras, background)
+
+    @torch.no_grad()
+    def end_warmup(self) -> None:
+        """Let the static avatar start from what the warm-up made."""
+        if self.module.static is not None:
+            self.module.static.copy_(self.module.base)
+
+    def _drawn(self, raw: Tensor, conditions: Conditions, cameras: list[Camera], background: Tensor) -> Tensor:
         try:
             return self.module.draw(self.module.pose(raw, conditions), cameras, background).rgb
         except InputError as error:  # Cameras and background come from the capture: the Gaussians are at fault.
@@ -143,15 +159,11 @@ class AshAvatar:
         decoders = self.module.decoders
         return None if decoders is None else decoders(self._conditions_of(frame))
 
-    def fade_to(self, mean: Tensor) -> None:
-        """What counts far from the training motion in place of what the decoders say there."""
-        self.module.fade_to(mean)
-
-    def _decode(self, conditions: Conditions, *, static: bool = False) -> Tensor:
+    def _decode(self, conditions: Conditions) -> Tensor:
         """Stage 3 as it learns, in the precision of the configuration."""
         half = self.config.training.precision == "bfloat16"
         with torch.autocast("cpu", torch.bfloat16, enabled=half):
-            return self.module.decode(conditions, static=static).float()
+            return self.module.decode(conditions).float()
 
     def _conditions_of(self, frame: int) -> Conditions:
         return self._conditions[frame]

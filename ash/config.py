@@ -24,7 +24,9 @@ class AtlasConfig:
     norm: str = "none"  # of the U-Nets: "batch-as-released" (always on the statistics of its batch of 1), or "instance"
     shuffle: int = 1  # decode at 1/shuffle of the lattice's resolution and shuffle pixels up; not in the paper
     standardise: bool = False  # decoders see deviations from the mean training texture, in its units; not in the paper
-    fade: float = 0.0  # novelty of a pose, in spreads, at which corrections fade to 1/e; 0: never; not in the paper
+    fade: float = (
+        0.0  # novelty of a pose, in spreads, at which a static avatar has 1 - 1/e of it; 0: never; not in the paper
+    )
     light: bool = False  # colour times exp(SH2 of the posed normal), 27 numbers; not in the paper
 
     @property
@@ -104,6 +106,11 @@ class TrainingConfig:
     seconds: float = math.inf  # of CPU time, at most
     snapshots: bool = False  # keep the weights of half a minute, of 42 s, of a minute, ... of half an hour
     checkpoint_seconds: float = 60.0
+
+    @property
+    def static_steps(self) -> int:
+        """Steps in which the static parameters learn alone."""
+        return self.warmup_steps if self.warmup == "static" else 0
 
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""

@@ -53,9 +53,8 @@ class AshModel(nn.Module):
             )
         self.base = nn.Parameter(initial.clone(), requires_grad=config.base)
         self.decoders = decoders
-        self.mean_correction: Tensor
-        if config.fade and decoders is not None:
-            self.register_buffer("mean_correction", torch.zeros_like(initial))
+        fades = config.fade and self.textures is not None
+        self.static = nn.Parameter(initial.clone()) if fades else None  # what counts far from the training motion
         self.refinement = Refinement(template.mesh) if config.refine else None
         self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.light else None
 
@@ -79,28 +78,23 @@ class AshModel(nn.Module):
     def _textures(self, pose: Pose) -> Float[Tensor, "c r r"]:
         return torch.zeros(0, 1, 1) if self.textures is None else self.textures(self.template, pose)
 
-    def decode(
-        self, conditions: Conditions, *, static: bool = False, decoders: Decode | None = None
-    ) -> Float[Tensor, "n o"]:
-        """Stg.3: raw Gaussian parameters per texel.
+    def decode(self, conditions: Conditions, *, decoders: Decode | None = None) -> Float[Tensor, "n o"]:
+        """Stg.3: raw Gaussian parameters per texel; by other `decoders` than the model's own where they are given.
 
-        `static` leaves the decoders out (the warm-up of the base); `decoders` are others than the model's own.
+        The less the textures are trusted (`TextureDrawer.trust`), the more the static avatar counts. Not in the paper.
         """
         decoders = decoders or self.decoders
-        raw = self.base if decoders is None or static else self.base + self._faded(decoders(conditions), conditions)
+        raw = self.base if decoders is None else self.base + decoders(conditions)
+        if self.static is not None and conditions.trust < 1:
+            raw = self.static.lerp(raw, conditions.trust)
+        return self.refined(raw)
+
+    def refined(self, raw: Float[Tensor, "n o"]) -> Float[Tensor, "n o"]:
+        """Raw parameters with their offsets where the images moved the template's vertices."""
         if self.refinement is None:
             return raw
         moved = self.lattice.interpolate(self.refinement()) / self.config.offset_unit_m
         return torch.cat([raw[:, :3] + moved, raw[:, 3:]], 1)
-
-    def _faded(self, added: Float[Tensor, "n o"], conditions: Conditions) -> Float[Tensor, "n o"]:
-        """What was decoded, and the less it is trusted the more of its mean over training frames in its place."""
-        return added if conditions.trust == 1 else self.mean_correction.lerp(added, conditions.trust)
-
-    def fade_to(self, mean: Float[Tensor, "n o"]) -> None:
-        """Set what the decoders' output fades to, far from the training motion."""
-        if self.config.fade:
-            self.mean_correction.copy_(mean)
 
     def pose(self, raw: Float[Tensor, "n o"], conditions: Conditions, threads: int = 1) -> Gaussians:
         """Activate the raw parameters and carry them from canonical to posed space (Eq. 5)."""

@@ -189,8 +189,8 @@ class TextureDrawer(nn.Module):
     def trust(self, textures: Float[Tensor, "c r r"]) -> float:
         """How much of what is decoded from these textures counts: 1 in training frames, fading with their novelty.
 
-        exp(-(novelty / fade)^2). What decoders learned from some poses is false far from them, where their mean over
-        training frames is better. Not in the paper.
+        exp(-(novelty / fade)^2). What decoders learned from some poses is false far from them, where a static avatar
+        is better. Not in the paper.
         """
         return math.exp(-((self.novelty(textures) / self.fade) ** 2)) if self.fade else 1.0
 

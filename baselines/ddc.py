@@ -95,9 +95,8 @@ class DdcModel(nn.Module):
         self.uvs = torch.from_numpy(mesh.uvs).float()
         self.topology = topology_of(template.faces)
         self.texture = nn.Parameter(initial.clone())
-        self.mean_correction: Tensor
-        if config.model.fade:
-            self.register_buffer("mean_correction", torch.zeros_like(initial))
+        # What counts far from the training motion.
+        self.static_texture = nn.Parameter(initial.clone()) if config.model.fade else None
         self.refinement = Refinement(mesh) if config.refine else None
         self.network = UNet(
             6 * config.model.window,
@@ -109,12 +108,12 @@ class DdcModel(nn.Module):
         self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.model.light else None
 
     def dynamic_texture(self, conditions: Float[Tensor, "c r r"]) -> Float[Tensor, "3 t t"]:
-        """The texture of a frame; far from the training motion the mean correction counts (`TextureDrawer.trust`)."""
+        """The texture of a frame; far from the training motion a static one counts (`TextureDrawer.trust`)."""
         trust = self.textures.trust(conditions)
         if trust == 1 and self.texture.dtype == torch.float32 and self.texture.device.type == "cpu":
             return ash.native.shading.add_shuffled(self.texture, self._decoded(conditions), self.config.shuffle)
-        added = self.correction(conditions)
-        return self.texture + (added if trust == 1 else self.mean_correction.lerp(added, trust))
+        texture = self.texture + self.correction(conditions)
+        return texture if self.static_texture is None else self.static_texture.lerp(texture, trust)
 
     def correction(self, conditions: Float[Tensor, "c r r"]) -> Float[Tensor, "3 t t"]:
         """What the network adds: decoded at the resolution of the motion-aware textures and shuffled up."""
@@ -195,7 +194,8 @@ class DdcAvatar:
     def parameter_groups(self) -> list[dict[str, Any]]:
         """The network, and the texture with the light, as ASH's decoders and base."""
         training = self.config.training
-        static = [self.module.texture] + ([self.module.light] if self.module.light is not None else [])
+        module = self.module
+        static = [p for p in (module.texture, module.static_texture, module.light) if p is not None]
         moves = list(self.module.refinement.parameters()) if self.module.refinement is not None else []
         return [
             {"params": list(self.module.network.parameters()), "lr": training.learning_rate},
@@ -207,16 +207,29 @@ class DdcAvatar:
         texture = self._training_texture(frame, step)
         with torch.set_grad_enabled(torch.is_grad_enabled() and step % VERTICES_EVERY == 0):
             posed = self.module.refined(self._posed_in(frame))
+        return self._drawn(texture, posed, cameras, background)
+
+    def draw_static_views(self, frame: int, cameras: list[Camera], background: Tensor) -> Tensor | None:
+        """Views with the texture that counts far from the training motion; its vertices are not its own."""
+        static = self.module.static_texture
+        if static is None:
+            return None
+        with torch.no_grad():
+            posed = self.module.refined(self._posed_in(frame))
+        return self._drawn(static, posed, cameras, background)
+
+    @torch.no_grad()
+    def end_warmup(self) -> None:
+        """Let the static texture start from what the warm-up made."""
+        if self.module.static_texture is not None:
+            self.module.static_texture.copy_(self.module.texture)
+
+    def _drawn(self, texture: Tensor, posed: PosedTemplate, cameras: list[Camera], background: Tensor) -> Tensor:
         return torch.stack([self.module.draw(texture, posed, c, background)[..., :3] for c in cameras])
 
     def corrections(self, frame: int) -> Tensor | None:
         """What the network adds to the static texture in a training frame, `[3, t, t]`."""
         return self.module.correction(self._conditions_of(frame))
-
-    def fade_to(self, mean: Tensor) -> None:
-        """What counts far from the training motion in place of what the network says there."""
-        if self.config.model.fade:
-            self.module.mean_correction.copy_(mean)
 
     def _posed_in(self, frame: int) -> PosedTemplate:
         return self._posed[frame]
@@ -226,7 +239,7 @@ class DdcAvatar:
 
     def _training_texture(self, frame: int, step: int) -> Float[Tensor, "3 t t"]:
         training = self.config.training
-        if training.warmup == "static" and step < training.warmup_steps:
+        if step < training.static_steps:
             return self.module.texture
         seen = unsettled(self._conditions_of(frame), training.texture_noise, seed=self.config.seed, step=step)
         return self.module.texture + self.module.correction(seen)  # Noise is no novelty.

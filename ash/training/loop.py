@@ -39,6 +39,7 @@ from ash.training.stopping import (
 )
 
 LOG_EVERY = 50
+STATIC_EVERY = 6  # Steps in which what counts far from the training motion learns, too.
 COMPARED_FRAMES = 40  # Training frames, evenly taken, over which the decoders' output is averaged and compared.
 SNAPSHOT_SECONDS = tuple(round(30 * 2 ** (i / 2)) for i in range(13))  # Half a minute to half an hour of CPU time.
 
@@ -72,8 +73,11 @@ class Trainable(Protocol):
     def corrections(self, frame: int) -> Tensor | None:
         """What the decoders add to the static parameters in a training frame, in any shape; None without decoders."""
 
-    def fade_to(self, mean: Tensor) -> None:
-        """Take the mean of `corrections` over training frames: far from them it is worth more than decoding."""
+    def draw_static_views(self, frame: int, cameras: list[Camera], background: Tensor) -> Tensor | None:
+        """Views of what counts far from the training motion, whatever the pose; None where nothing does."""
+
+    def end_warmup(self) -> None:
+        """The static parameters learned alone until now."""
 
 
 def fit(
@@ -156,13 +160,20 @@ class _Run:
         for group, rate in zip(self.optimiser.groups, self.initial_rates, strict=True):
             group["lr"] = rate * factor
         self.optimiser.zero_grad()
+        if self.step == self.config.static_steps:
+            self.learner.end_warmup()
+        shown = (batch.frame, batch.cameras, batch.background)
+        with_static = self.step >= self.config.static_steps and self.step % STATIC_EVERY == 0
         try:
-            drawn = self.learner.draw_training_views(batch.frame, batch.cameras, batch.background, self.step)
+            drawn = self.learner.draw_training_views(*shown, self.step)
+            static = self.learner.draw_static_views(*shown) if with_static else None
         except FloatingPointError as error:
             self._roll_back(str(error))
             return
         loss = view_loss(drawn, batch, self.config)
         loss.backward()  # type: ignore[no-untyped-call]
+        if static is not None:
+            view_loss(static, batch, self.config).backward()  # type: ignore[no-untyped-call]
         if not (math.isfinite(loss.item()) and self.optimiser.step()):
             self._roll_back("loss or gradient not finite")
             return
@@ -271,7 +282,6 @@ class _Run:
             path = self.folder / "snapshots" / f"{seconds:06d}.safetensors"
             if seconds <= self._elapsed() and not path.exists():
                 with self._as_used():
-                    self._settle()
                     write_atomic(path, safetensors.torch.save(contiguous_state(self.learner.module)))
 
     def finish(self) -> TrainingOutcome:
@@ -283,20 +293,19 @@ class _Run:
             ended_by=self.course.ended_by,
             gained=gain_of_last_third(self.course.scores),
             reserved_psnr=self._score_of_this_step(),
-            correction_spread=self._settle(),
+            correction_spread=self._spread(),
         )
         self._append({"outcome": asdict(outcome)})
         return outcome
 
     @torch.no_grad()
-    def _settle(self) -> float | None:
-        """Tell the learner the mean of what its decoders add; how far training frames differ from it, rms."""
+    def _spread(self) -> float | None:
+        """How far what the decoders add differs between training frames, rms; None without decoders."""
         frames = self.images.frames[:: -(-len(self.images.frames) // COMPARED_FRAMES)]
         found = [added for frame in frames if (added := self.learner.corrections(frame)) is not None]
         if not found:
             return None
         mean = torch.stack(found).mean(0)
-        self.learner.fade_to(mean)
         return float(torch.stack([(added - mean).square().mean() for added in found]).mean().sqrt())
 
     def resume(self) -> bool:

@@ -200,7 +200,7 @@ def test_bfloat16_is_a_matter_of_the_decoders_alone(capture):
     rough = avatar._decode(conditions).detach()
     assert rough.dtype == torch.float32
     assert 0 < float((rough - exact).abs().max()) < 0.05 * float((exact - avatar.module.base.detach()).abs().max())
-    assert torch.equal(avatar._decode(conditions, static=True), avatar.module.base)
+    assert torch.equal(avatar.module.refined(avatar.module.base), avatar.module.base)
 
 
 def test_noise_in_the_textures_is_for_learning_alone_and_another_one_in_every_step(capture):
