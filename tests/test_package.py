@@ -139,6 +139,21 @@ def test_constraints_hold_every_package_to_one_version() -> None:
     assert all(re.fullmatch(r"[0-9][0-9A-Za-z.]*", version) for version in pinned.values()), "expected plain versions"
 
 
+def test_the_hashed_constraints_hold_the_same_versions() -> None:
+    text = (ROOT / "constraints-linux-x86_64-cp311.txt").read_text()
+    found = re.findall(r"^(\S+)==(\S+) \\\n((?:    --hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)", text, re.MULTILINE)
+    assert len(found) == len([line for line in text.splitlines() if line and line[0] not in "# "]), "each has a hash"
+    several_builds = {"torch", "torchvision"}
+    pinned = {name: version for name, version in constraints().items() if name not in several_builds}
+    assert {canonical(name): version for name, version, _ in found} == pinned
+
+
+def test_workflows_run_actions_of_one_commit() -> None:
+    text = "".join(path.read_text() for path in sorted((ROOT / ".github").rglob("*.yml")))
+    used = re.findall(r"uses: (\S+)", text)
+    assert used and all(re.fullmatch(r"\./\.github/actions/\w+|\S+@[0-9a-f]{40}", action) for action in used)
+
+
 def test_imports_follow_the_contracts() -> None:
     done = subprocess.run(
         [sys.executable, "-c", "from importlinter.cli import lint_imports_command as f; f()"],

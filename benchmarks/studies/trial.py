@@ -1,7 +1,8 @@
-"""One trial of a method for `ash-bench check-method`: `python -m benchmarks.studies.trial FOLDER`, in its own process.
+"""One trial of a method for `ash-bench check-method`, in a process of its own (`benchmarks.studies.locked`).
 
-FOLDER holds `trial.json` (what to do); `outcome.json` is left there. Nothing is scored: pictures are hashed and
-compared by `benchmarks.studies.conformance`.
+Its folder holds `trial.json` (what to do); `outcome.json` is left there. Nothing is scored: pictures are hashed and
+compared by `benchmarks.studies.conformance`. What an outcome says of arrays and bad poses is told by the process in
+which the method runs: a check for authors, no defence.
 """
 
 import hashlib
@@ -17,12 +18,13 @@ import numpy as np
 import safetensors
 
 from ash.capture.dataset import Camera, Capture, Pose
-from ash.capture.formats import load_capture
+from ash.capture.formats import load_capture, read_cameras, read_motion
 from ash.capture.manifest import verify_capture
+from ash.capture.typed import from_json
 from ash.files import InputError, read_json, write_json
 from ash.protocol import Avatar, StageClock
 from benchmarks.cell.methods import find_method
-from benchmarks.cell.sealing import Tampering, Trespass, seen_by_method, watched
+from benchmarks.cell.sealing import Tampering, Trespass, watched_folders
 from benchmarks.cell.timing import peak_memory_mb
 
 SLACK = 1e-3  # By how much values may leave 0..1, and the alpha that counts as none: rounding, not light.
@@ -34,7 +36,10 @@ class Trial:
 
     target: str  # the factory, `package.module:function`
     oracle: bool
-    capture: str
+    capture: str  # the folder of the capture, which only oracles see
+    input: str  # the folder of what the method sees
+    exam: str  # the folder with the cameras and the motion that are drawn
+    views: tuple[tuple[str, int], ...]  # camera and frame of each picture
     preset: str
     seed: int
     weights: str = ""  # load these in place of training
@@ -62,7 +67,7 @@ def main(argv: list[str] | None = None) -> int:
     """Do the trial whose folder is given."""
     folder = Path((argv or sys.argv[1:])[0])
     try:
-        trial = Trial(**read_json(folder / "trial.json"))
+        trial: Trial = from_json(Trial, read_json(folder / "trial.json"))
         outcome = perform(trial, folder)
     except InputError as error:
         print(error, file=sys.stderr)
@@ -85,21 +90,23 @@ def read_outcome(folder: Path) -> Outcome | None:
 
 def perform(trial: Trial, folder: Path) -> Outcome:
     """Build, train or load, draw, and look at what changed."""
-    capture = load_capture(Path(trial.capture))
-    views = few_views(capture)
+    seen = load_capture(Path(trial.input))
+    cameras = read_cameras(Path(trial.exam) / "cameras.json")
+    motion = read_motion(Path(trial.exam) / "motion.npz", joints=len(seen.skeleton.names))
+    drawn = replace(seen, cameras=cameras, motion=motion)
     factory = find_method(trial.target).load()
     start = time.perf_counter()
-    with seen_by_method(capture, folder / "input", oracle=trial.oracle) as seen:
-        found = Outcome()
-        try:
-            with watched(capture, seen), _untouched(seen, "capture"):
-                found = _performed(trial, folder, capture, seen, factory, views)
-        except (Changed, Tampering) as error:
-            found = replace(found, input=str(error))
-        except Trespass as error:
-            found = replace(found, held_out=str(error))
-        if not found.input and (problems := verify_capture(seen.folder)):
-            found = replace(found, input=f"a file of the capture: {problems[0]}")
+    found = Outcome()
+    try:
+        closed = [] if trial.oracle else [trial.capture]
+        with watched_folders(closed, seen.folder), _untouched(seen, "capture"):
+            found = _performed(trial, folder, drawn, seen, factory)
+    except (Changed, Tampering) as error:
+        found = replace(found, input=str(error))
+    except Trespass as error:
+        found = replace(found, held_out=str(error))
+    if not found.input and (problems := verify_capture(seen.folder)):
+        found = replace(found, input=f"a file of the capture: {problems[0]}")
     return replace(found, seconds=time.perf_counter() - start, peak_mb=peak_memory_mb())
 
 
@@ -108,9 +115,9 @@ def few_views(capture: Capture) -> list[tuple[str, int]]:
     return [*(split.views[0] for split in capture.splits.values()), list(capture.splits.values())[-1].views[-1]]
 
 
-def _performed(
-    trial: Trial, folder: Path, capture: Capture, seen: Capture, factory: Any, views: list[tuple[str, int]]
-) -> Outcome:
+def _performed(trial: Trial, folder: Path, capture: Capture, seen: Capture, factory: Any) -> Outcome:
+    views = list(trial.views)
+
     def make() -> Avatar:
         made: Avatar = factory(seen, seed=trial.seed, preset=trial.preset)
         return made
@@ -245,7 +252,3 @@ def _protocol_names() -> list[str]:
 
 def _hash(image: np.ndarray) -> str:
     return hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest()
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -43,8 +43,9 @@ class PlayVerb:
             expose=self.expose,
         )
         require_safe(doors)
-        chosen = {"scene": self.scene, "methods": self.methods, "trust": self.trust}
-        with playing(self.run, motions=self.motion, doors=doors, **chosen) as player:
+        with playing(
+            self.run, motions=self.motion, scene=self.scene, methods=self.methods, doors=doors, trust=self.trust
+        ) as player:
             print(f"{player.url}\nopen this address in a browser; Ctrl-C ends the player", flush=True)
             if self.expose:
                 print(f"{self.host} is open to other machines, and nothing is encrypted", file=sys.stderr)

@@ -10,17 +10,23 @@ import struct
 import time
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.torch
+import torch
 from helpers import fakes
 from helpers.motion_files import amass_file, bvh_file
 
 from ash.capture.formats import load_capture, read_cameras, read_motion, read_skeleton, read_template
 from ash.capture.manifest import read_manifest, verify_capture
-from ash.files import InputError, read_arrays, read_image, read_json
+from ash.checkpoints import load_module, read_safetensors
+from ash.files import InputError, read_arrays, read_image, read_json, write_json
+from ash.searching import Choice, Tried
+from ash.searching import _read as read_choice
 from benchmarks.cell.cells import read_cell, read_result
 from benchmarks.cell.curves import read_curve
 from benchmarks.gate.gate import read_baseline
@@ -76,7 +82,24 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Rea
         "result": (_result(folder), lambda path: read_result(path.parent)),
         "cell": (folder / "cell" / "config.json", lambda path: read_cell(path.parent)),
         "json": (run, read_json),
+        "weights": (_weights(folder / "model.safetensors"), _load_weights),
+        "choice": (_choice(folder / "choice.json"), read_choice),
     }
+
+
+def _weights(path: Path) -> Path:
+    path.write_bytes(safetensors.torch.save(torch.nn.Linear(3, 2).state_dict(), metadata={"step": "3"}))
+    return path
+
+
+def _load_weights(path: Path) -> None:
+    load_module(torch.nn.Linear(3, 2), read_safetensors(path)[0], path)
+
+
+def _choice(path: Path) -> Path:
+    tried = Tried(name="as the preset", parameters=10, fade=1.0, seen=20.0, left_out=19.0)
+    write_json(path, asdict(Choice(name=tried.name, fade=1.0, seconds=2.0, tried=(tried,))))
+    return path
 
 
 def _result(folder: Path) -> Path:
@@ -92,7 +115,7 @@ def _result(folder: Path) -> Path:
 
 KINDS = (
     "manifest", "cameras", "skeleton", "template", "motion", "surface", "image", "bvh", "amass", "joint map", "rig",
-    "baseline", "curve", "run", "result", "cell", "json",
+    "baseline", "curve", "run", "result", "cell", "json", "weights", "choice",
 )  # fmt: skip
 
 

@@ -24,6 +24,8 @@ from benchmarks.cell.cells import (
 )
 from benchmarks.cell.curves import read_curve
 from benchmarks.cell.metrics import METRICS
+from benchmarks.report.sentences import doubts
+from benchmarks.report.tables import build, quality_columns
 
 
 def config(method: str = "ash", seed: int = 0) -> CellConfig:
@@ -131,3 +133,25 @@ def test_a_curve_passes_over_what_is_no_point(tmp_path: Path) -> None:
     curve = read_curve(log)
     assert len(curve) <= 201 and curve[-1].seconds == 4999
     assert read_curve(tmp_path / "none") == ()
+
+
+def test_what_was_not_enforced_and_clocks_that_contradict_are_told() -> None:
+    def trained(wall: float, cpu: float, *, isolated: bool | None) -> CellResult:
+        rows = [
+            Summary(split="speed", region="", metric=name, value=value)
+            for name, value in (("train_wall_s", wall), ("train_cpu_s", cpu))
+        ]
+        return replace(result(), summary=(*result().summary, *rows), isolated=isolated)
+
+    assert doubts([trained(100.0, 98.0, isolated=True), trained(4.0, 0.5, isolated=True), result()]) == ()
+    (stopped,) = doubts([trained(160.0, 100.0, isolated=True)])
+    assert "160 s by the clock and 100 s of CPU time" in stopped and "stopped" in stopped
+    (several,) = doubts([trained(100.0, 190.0, isolated=None)])
+    assert "more than one core" in several
+    exposed, *others = doubts([trained(100.0, 98.0, isolated=False)])
+    assert exposed.startswith("Not isolated: ASH.") and not others
+    columns = quality_columns(("psnr",))
+    plain, marked = (
+        build(scores_of([result()]), "boxes", columns, title="", exposed=exposed) for exposed in ((), ("ash",))
+    )
+    assert (plain.rows[0].note, marked.rows[0].note) == ("", "not isolated")

@@ -1,4 +1,7 @@
-"""Kill a run at random moments, start it again, and compare what it ends with to an undisturbed run."""
+"""Kill a run at random moments, start it again, and compare what it ends with to an undisturbed run.
+
+`KILLS=30 ./ash-bench test -- -m slow -k kills` strikes 30 times; without a number a hundred times.
+"""
 
 import json
 import os
@@ -54,7 +57,12 @@ def strike(process: subprocess.Popen[bytes], rng: random.Random) -> None:
         process.send_signal(signal.SIGKILL)
 
 
-@pytest.mark.parametrize("kills", [3, pytest.param(100, marks=pytest.mark.slow)])
+MANY = int(os.environ.get("KILLS", "100"))
+
+
+@pytest.mark.parametrize(
+    "kills", [3, pytest.param(MANY, marks=[pytest.mark.slow, pytest.mark.timeout(120 + 20 * MANY)])]
+)
 def test_kills_at_random_moments_change_nothing(kills: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No cell is lost or doubled, and pictures and weights are the same bytes; three strikes a start."""
     fakes.use(tmp_path / "plugins", monkeypatch)
