@@ -47,13 +47,13 @@ def ci() -> AshConfig:
 
 
 def cpu() -> AshConfig:
-    """Two and a half minutes on one core, or less where nothing more is learned: the default, at 256x256."""
+    """200 seconds on one core, or less where nothing more is learned: the default, at 256x256."""
     base = ci()
     training = replace(base.training, steps=60_000, warmup_steps=200, learning_rate=1e-3, base_learning_rate=2e-2)
     return replace(
         base,
         model=replace(base.model, texels=256, shuffle=4, width=16, levels=3),
-        training=replace(training, seconds=150.0),
+        training=replace(training, seconds=200.0),
         template=TemplateConfig(kind="learned"),
     )
 
