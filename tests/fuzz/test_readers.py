@@ -36,7 +36,7 @@ from synth.motion.importing import import_motion, read_joint_map
 from synth.person.mannequin import heads
 from synth.skeleton import make_skeleton
 
-MUTANTS = int(os.environ.get("MUTANTS", "60"))
+MUTANTS = int(os.environ.get("MUTANTS", "300"))
 SECONDS, MORE_MEMORY = 10.0, 64 << 20
 ROOT = Path(__file__).parents[2]
 Reader = Callable[[Path], object]
