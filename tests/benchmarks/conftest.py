@@ -1,5 +1,6 @@
 """Captures and methods that are fakes, and trained avatars for the tests that show them."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -41,3 +42,26 @@ def tube_cells(tube_run: Path) -> dict[str, Path]:
     for config in tube_run.glob("cells/*/config.json"):
         found[read_cell(config.parent).config.method.partition("+")[0]] = config.parent
     return found
+
+
+@pytest.fixture
+def boxes(capture: Path, tmp_path: Path) -> str:
+    """The file of a suite whose capture needs no renderer."""
+    return str(fakes.write_suite(tmp_path, capture))
+
+
+@pytest.fixture(scope="module")
+def made_once(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of the suite boxes."""
+    folder = tmp_path_factory.mktemp("made")
+    with pytest.MonkeyPatch.context() as patch:
+        fakes.use(folder / "plugins", patch)
+        suite = fakes.write_suite(folder, capture)
+        assert cli.main(["run", str(suite), "--out", str(folder / "run")]) == cli.DONE
+    return folder / "run"
+
+
+@pytest.fixture
+def finished(made_once: Path, tmp_path: Path) -> Path:
+    """A copy of the finished run."""
+    return Path(shutil.copytree(made_once, tmp_path / "run"))

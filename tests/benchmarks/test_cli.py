@@ -1,6 +1,4 @@
-import errno
 import json
-import multiprocessing
 import os
 import re
 import shutil
@@ -12,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from helpers import fakes
 from helpers.commands import ash_bench, refused, refused_last
 from helpers.waiting import wait_for
 
@@ -20,35 +17,11 @@ from benchmarks import cli
 from benchmarks.cell import methods
 from benchmarks.suites import captures
 from benchmarks.suites.files import find_suite
-from benchmarks.suites.progress import Progress
 from benchmarks.suites.suites import CaptureSpec
 from benchmarks.verbs import arguments
 from benchmarks.verbs.captures import SynthVerb
 
 pytestmark = pytest.mark.usefixtures("installed_fakes")
-
-
-@pytest.fixture
-def boxes(capture: Path, tmp_path: Path) -> str:
-    """The file of a suite whose capture needs no renderer."""
-    return str(fakes.write_suite(tmp_path, capture))
-
-
-@pytest.fixture(scope="module")
-def made_once(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run of the suite boxes."""
-    folder = tmp_path_factory.mktemp("made")
-    with pytest.MonkeyPatch.context() as patch:
-        fakes.use(folder / "plugins", patch)
-        suite = fakes.write_suite(folder, capture)
-        assert cli.main(["run", str(suite), "--out", str(folder / "run")]) == arguments.DONE
-    return folder / "run"
-
-
-@pytest.fixture
-def finished(made_once: Path, tmp_path: Path) -> Path:
-    """A copy of the finished run."""
-    return Path(shutil.copytree(made_once, tmp_path / "run"))
 
 
 def test_a_run_leaves_its_report(finished: Path) -> None:
@@ -391,47 +364,3 @@ def test_help_on_a_scene_and_on_a_method_lists_their_fields(capsys) -> None:
             cli.main([*command.split(), "--help"])
         assert end.value.code == 0
         assert flag in capsys.readouterr().out, command
-
-
-@pytest.mark.parametrize("closed", ["2>&-", "<&- >&- 2>&-"])
-def test_closed_streams_change_nothing(closed: str, finished: Path, boxes: str) -> None:
-    before = (finished / "results.csv").read_bytes()
-    (finished / "results.csv").unlink()
-    command = f'exec "{sys.executable}" -m benchmarks.cli run "{boxes}" --out "{finished}" {closed}'
-    assert subprocess.run(command, shell=True, check=False).returncode == arguments.DONE
-    assert (finished / "results.csv").read_bytes() == before
-
-
-def test_progress_goes_on_when_its_reader_has_left() -> None:
-    reading, writing = os.pipe()
-    os.close(reading)
-    with os.fdopen(writing, "w") as stream:
-        progress = Progress("cells", 2, expected_s=1.0, workers=1, stream=stream)
-        progress.finish("one")
-        progress.finish("two")
-        assert progress.finished == 2 and progress.stream.fileno() == writing
-
-
-def test_unusable_shared_memory_is_called_that(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, capture: Path
-) -> None:
-    def refuse(*_: object) -> None:
-        raise OSError(errno.EROFS, "Read-only file system")
-
-    monkeypatch.setattr(multiprocessing.context.BaseContext, "Lock", refuse)
-    monkeypatch.setattr("ash.capture.manifest.read_manifest", refuse)
-    assert refused(capsys, "verify", str(capture)).startswith("ash-bench: /dev/shm: cannot be used")
-    monkeypatch.undo()
-    monkeypatch.setattr("ash.capture.manifest.read_manifest", refuse)
-    assert "the file system is read-only" in refused(capsys, "verify", str(capture))
-
-
-def test_a_format_with_a_slash_is_refused(capsys: pytest.CaptureFixture[str], capture: Path) -> None:
-    assert "unknown format 'a/b'" in refused(capsys, "export", str(capture), "--format", "a/b")
-
-
-def test_code_of_others_is_not_loaded_untrusted(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for command in (("display", str(finished)), ("share", str(finished / "cells"), "--out", "x.html")):
-        folder = next((finished / "cells").iterdir())
-        told = refused(capsys, command[0], str(folder), *command[2:])
-        assert "is not ours" in told and "--trust" in told

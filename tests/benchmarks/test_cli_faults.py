@@ -1,14 +1,19 @@
 """Captures, folders and disks that are not as they should be: each is one line, and no stack."""
 
+import errno
+import multiprocessing
+import os
 import resource
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from helpers.commands import ash_bench, refused
 
 from benchmarks import cli
+from benchmarks.suites.progress import Progress
 from benchmarks.verbs import arguments
 
 pytestmark = pytest.mark.usefixtures("installed_fakes")
@@ -88,3 +93,47 @@ def test_a_file_beyond_the_systems_limit(capture: Path, tmp_path: Path) -> None:
     assert told.returncode == arguments.WRONG_INPUT
     assert "larger than the system allows" in told.stderr
     assert "Traceback" not in told.stderr
+
+
+@pytest.mark.parametrize("closed", ["2>&-", "<&- >&- 2>&-"])
+def test_closed_streams_change_nothing(closed: str, finished: Path, boxes: str) -> None:
+    before = (finished / "results.csv").read_bytes()
+    (finished / "results.csv").unlink()
+    command = f'exec "{sys.executable}" -m benchmarks.cli run "{boxes}" --out "{finished}" {closed}'
+    assert subprocess.run(command, shell=True, check=False).returncode == arguments.DONE
+    assert (finished / "results.csv").read_bytes() == before
+
+
+def test_progress_goes_on_when_its_reader_has_left() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as stream:
+        progress = Progress("cells", 2, expected_s=1.0, workers=1, stream=stream)
+        progress.finish("one")
+        progress.finish("two")
+        assert progress.finished == 2 and progress.stream.fileno() == writing
+
+
+def test_unusable_shared_memory_is_called_that(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, capture: Path
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(multiprocessing.context.BaseContext, "Lock", refuse)
+    monkeypatch.setattr("ash.capture.manifest.read_manifest", refuse)
+    assert refused(capsys, "verify", str(capture)).startswith("ash-bench: /dev/shm: cannot be used")
+    monkeypatch.undo()
+    monkeypatch.setattr("ash.capture.manifest.read_manifest", refuse)
+    assert "the file system is read-only" in refused(capsys, "verify", str(capture))
+
+
+def test_a_format_with_a_slash_is_refused(capsys: pytest.CaptureFixture[str], capture: Path) -> None:
+    assert "unknown format 'a/b'" in refused(capsys, "export", str(capture), "--format", "a/b")
+
+
+def test_code_of_others_is_not_loaded_untrusted(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for command in (("display", str(finished)), ("share", str(finished / "cells"), "--out", "x.html")):
+        folder = next((finished / "cells").iterdir())
+        told = refused(capsys, command[0], str(folder), *command[2:])
+        assert "is not ours" in told and "--trust" in told
