@@ -28,7 +28,7 @@ def ci() -> AshConfig:
         shuffle=2,
         sh_degree=0,
         standardise=True,
-        fade=1.5,
+        fade=0.4,
         base=True,
         light=True,
         dilation=0.05,

@@ -39,7 +39,7 @@ from ash.training.stopping import (
 )
 
 LOG_EVERY = 50
-STATIC_EVERY = 6  # Steps in which what counts far from the training motion learns, too.
+STATIC_EVERY = 4  # Steps in which what counts far from the training motion learns, too.
 COMPARED_FRAMES = 40  # Training frames, evenly taken, over which the decoders' output is averaged and compared.
 SNAPSHOT_SECONDS = tuple(round(30 * 2 ** (i / 2)) for i in range(13))  # Half a minute to half an hour of CPU time.
 

@@ -12,6 +12,7 @@ from ash.capture.typed import from_json
 from ash.config import TrainingConfig
 
 FIRST_MARK = 64  # Steps after which views are scored for the first time; twice on the way to half as many more, ...
+LEAST_STEPS = 1000  # Before that a lull is chance: static Gaussians rest at 200 steps and gain 0.5 dB afterwards.
 GAIN_DB = 0.1  # Less than that, gained over the last third of the steps, is a plateau.
 RAMP_STEPS = 20  # Over which the learning rates rise.
 DECAY = 0.25  # Of the steps before they fall, hence the last fifth of all.
@@ -78,7 +79,8 @@ def decided(course: TrainingCourse, config: TrainingConfig, *, step: int, second
         return replace(course, decay_from=step, ended_by="steps")
     if seconds >= share * config.seconds:
         return replace(course, decay_from=step, ended_by="seconds")
-    if course.scores and course.scores[-1].step == step and gain is not None and gain < GAIN_DB:
+    scored = step >= LEAST_STEPS and course.scores and course.scores[-1].step == step
+    if scored and gain is not None and gain < GAIN_DB:
         return replace(course, decay_from=step, ended_by="plateau")
     return course
 

@@ -9,6 +9,7 @@ from ash.config import TrainingConfig
 from ash.training.batches import reserved_views
 from ash.training.stopping import (
     FINAL_LEARNING_RATE,
+    LEAST_STEPS,
     ReservedScore,
     TrainingCourse,
     decided,
@@ -62,8 +63,11 @@ def test_a_level_warm_up_is_no_plateau():
     """While the base alone is trained nothing is learned about motion: twice the warm-up passes before it counts."""
     course, _ = train(lambda step: 20.0, replace(CONFIG, warmup_steps=1000))
     assert course.decay_from >= 3 * 1000 * 0.99
+
+
+def test_a_lull_of_the_first_thousand_steps_is_no_plateau():
     course, _ = train(lambda step: 20.0, CONFIG)
-    assert course.decay_from < 1000
+    assert course.ended_by == "plateau" and LEAST_STEPS <= course.decay_from < 1.25 * LEAST_STEPS
 
 
 def test_a_limit_in_seconds_leaves_a_fifth_of_them_for_the_decay():
