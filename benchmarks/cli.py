@@ -34,7 +34,7 @@ VERBS = {
     "play": "avatars:Play",
     "video": "avatars:Video",
     "export-avatar": "avatars:ExportAvatar",
-    "share": "avatars:Share",
+    "share": "avatars:SharePage",
     "gate": "gate:Gate",
     "gate-rates": "gate:GateRates",
     "speed": "checkout:Speed",

@@ -195,11 +195,12 @@ def _cells_in(folder: Path) -> Sequence[Cell]:
 
 
 def _titles(cells: Sequence[Cell]) -> list[str]:
-    """Short and different names: the method, and its preset and seed where several have the same."""
+    """Short and different names: the method, and its changes, preset and seed where several have the same."""
+    plain = [look_of(cell.config.method.partition("+")[0]).title for cell in cells]
     short = [look_of(cell.config.method).title for cell in cells]
     middle = [f"{name} · {cell.config.preset}" for name, cell in zip(short, cells, strict=True)]
     full = [f"{name} · seed {cell.config.seed}" for name, cell in zip(middle, cells, strict=True)]
-    for names in (short, middle, full):
+    for names in (plain, short, middle, full):
         if len(set(names)) == len(names):
             return names
     return [f"{name} · {cell.folder.name[:6]}" for name, cell in zip(full, cells, strict=True)]

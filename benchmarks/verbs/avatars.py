@@ -76,7 +76,7 @@ class Video:
             raise InputError(f"{self.out}: expected a film that ends with .mp4 or .webp")
         with open_cast(self.run, scene=self.scene, methods=self.methods) as cast:
             act = act_named(cast.capture, self.motion)
-            rate = self.fps or act.motion.fps
+            rate = float(self.fps or act.motion.fps)
             script = Script(
                 act=act,
                 frames=frames_in(act, self.frames),
@@ -134,7 +134,7 @@ class ExportAvatar:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Share:
+class SharePage:
     """Write one page that plays a clip of an avatar without a server."""
 
     cell: Positional[Path]  # a cell's folder, or a run's with one avatar
