@@ -22,7 +22,7 @@ from ash.model import image_of, views_of
 from ash.protocol import Avatar, PosedGeometry, PosesGaussians, StageClock
 from benchmarks.analysis.names import look_of
 from benchmarks.cell.cells import CHECKPOINT, Cell, is_trained, read_cell
-from benchmarks.cell.methods import ORACLES
+from benchmarks.cell.methods import is_oracle
 from benchmarks.cell.process import load_avatar
 from benchmarks.suites.runs import RUN_FILE, read_run
 
@@ -162,7 +162,7 @@ def open_cast(
     Raises:
         InputError: nothing to show, or nothing of that scene or of those methods.
     """
-    cells = [cell for cell in _cells_in(folder) if is_trained(cell) and cell.config.method not in ORACLES]
+    cells = [cell for cell in _cells_in(folder) if is_trained(cell) and not is_oracle(cell.config.method)]
     if not cells:
         raise InputError(f"{folder}: expected a run or a cell with a trained avatar (oracles cannot be played)")
     places = list(dict.fromkeys(cell.config.place for cell in cells))
@@ -197,11 +197,12 @@ def _cells_in(folder: Path) -> Sequence[Cell]:
 
 
 def _titles(cells: Sequence[Cell]) -> list[str]:
-    """Short and different names: the method, and its preset and seed where several have the same."""
+    """Short and different names: the method, and its changes, preset and seed where several have the same."""
+    plain = [look_of(cell.config.method.partition("+")[0]).title for cell in cells]
     short = [look_of(cell.config.method).title for cell in cells]
     middle = [f"{name} · {cell.config.preset}" for name, cell in zip(short, cells, strict=True)]
     full = [f"{name} · seed {cell.config.seed}" for name, cell in zip(middle, cells, strict=True)]
-    for names in (short, middle, full):
+    for names in (plain, short, middle, full):
         if len(set(names)) == len(names):
             return names
     return [f"{name} · {cell.folder.name[:6]}" for name, cell in zip(full, cells, strict=True)]

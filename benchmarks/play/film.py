@@ -65,7 +65,7 @@ def cameras_of(capture: Capture, script: Script, step: int) -> list[Camera]:
     first = next(iter(capture.cameras.values()))
     size = {"height": script.height, "width": round(script.height * first.width / first.height)}
     if script.camera == SPIRAL:
-        return [spiral_camera(capture, step, **size)]
+        return [spiral_camera(capture, float(step), **size)]
     if script.camera == RIG:
         split = capture.splits.get("novel_view", capture.splits["train"])
         return [resized(capture.cameras[name], **size) for name in split.cameras[:RIG_CAMERAS]]

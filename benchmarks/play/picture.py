@@ -16,7 +16,7 @@ from benchmarks.play.actors import Actor, Cast, on_colour
 from benchmarks.play.cameras import resized, spiral_camera
 from benchmarks.play.motions import Act, bent, joint_heads
 from benchmarks.play.shelf import TruthPicture, TruthShelf
-from benchmarks.play.state import ABSOLUTE, FREE, NO_ERROR, NOTHING, SPIRAL, TRUTH, State
+from benchmarks.play.state import ABSOLUTE, FREE, NO_ERROR, NOTHING, SPIRAL, TRUTH, ViewState
 
 LIGHT, DARK = (236, 236, 236), (24, 26, 30)  # behind the subject
 INK = {False: (20, 25, 35), True: (235, 238, 242)}
@@ -27,7 +27,7 @@ SCORES_KEPT = 256
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Drawn:
+class Painting:
     """A picture and what is to be said about it."""
 
     pixels: np.ndarray  # uint8 [h, w, 3]
@@ -44,7 +44,7 @@ class Painter:
         self._bent: tuple[tuple, Motion] | None = None
         self._scores: OrderedDict[tuple, tuple[float, float, np.ndarray | None]] = OrderedDict()
 
-    def draw(self, state: State, *, width: int, height: int, careful: bool) -> Drawn:
+    def draw(self, state: ViewState, *, width: int, height: int, careful: bool) -> Painting:
         """The picture at a size. `careful`: the viewer stands still, and there is time for scores.
 
         Raises:
@@ -75,9 +75,9 @@ class Painter:
         score = ""
         if truth is not None and careful:
             score = self._score(state, Pose(motion, frame), truth)
-        return Drawn(pixels=pixels, stage_ms=dict(clock.ms), score=score, note=note)
+        return Painting(pixels=pixels, stage_ms=dict(clock.ms), score=score, note=note)
 
-    def camera(self, state: State, *, width: int, height: int) -> Camera:
+    def camera(self, state: ViewState, *, width: int, height: int) -> Camera:
         """The camera that the viewer looks through, in pixels of the picture."""
         own = self.cast.capture.cameras.get(state.camera)
         if own is not None:
@@ -87,7 +87,7 @@ class Painter:
         assert state.camera == FREE and state.eye is not None
         return state.eye.camera(width=width, height=height)
 
-    def motion(self, act: Act, state: State) -> Motion:
+    def motion(self, act: Act, state: ViewState) -> Motion:
         """The act's motion, with the viewer's bends; the last one is kept."""
         if not state.bends:
             return act.motion
@@ -96,13 +96,13 @@ class Painter:
             self._bent = key, bent(act.motion, dict(state.bends))
         return self._bent[1]
 
-    def _avatar(self, state: State, title: str, pose: Pose, camera: Camera, clock: StageClock) -> np.ndarray:
+    def _avatar(self, state: ViewState, title: str, pose: Pose, camera: Camera, clock: StageClock) -> np.ndarray:
         actor = self.cast.actor(title)
         draw = actor.ellipsoids if state.ellipsoids else actor.view
         return draw(pose, camera, clock, DARK if state.dark else LIGHT)
 
     def _compared(
-        self, state: State, title: str, pose: Pose, truth: TruthPicture
+        self, state: ViewState, title: str, pose: Pose, truth: TruthPicture
     ) -> tuple[float, float, np.ndarray | None]:
         """PSNR and FLIP on the foreground in the truth's own pixels, as the protocol has them; the error's map."""
         key = (title, truth.key, state.error)
@@ -112,12 +112,12 @@ class Painter:
                 self._scores.popitem(last=False)
         return self._scores[key]
 
-    def _score(self, state: State, pose: Pose, truth: TruthPicture) -> str:
+    def _score(self, state: ViewState, pose: Pose, truth: TruthPicture) -> str:
         titles = [state.left, *([state.right] if state.right in self.cast.titles else [])]
         rows = [(title, *self._compared(state, title, pose, truth)[:2]) for title in titles]
         return " · ".join(f"{title} {psnr:.1f} dB, FLIP {flip:.3f}" for title, psnr, flip in rows)
 
-    def _error(self, state: State, title: str, pose: Pose, truth: TruthPicture, camera: Camera) -> np.ndarray:
+    def _error(self, state: ViewState, title: str, pose: Pose, truth: TruthPicture, camera: Camera) -> np.ndarray:
         error = self._compared(state, title, pose, truth)[2]
         assert error is not None
         alpha = np.where(truth.on_black[..., 3:] > 0, 255, 0).astype(np.uint8)
@@ -125,7 +125,7 @@ class Painter:
         shown = TruthPicture(camera=truth.camera, on_black=metrics.on_black(heat))
         return _fit(shown, camera, state)
 
-    def _overlaid(self, pixels: np.ndarray, state: State, pose: Pose, camera: Camera) -> tuple[np.ndarray, str]:
+    def _overlaid(self, pixels: np.ndarray, state: ViewState, pose: Pose, camera: Camera) -> tuple[np.ndarray, str]:
         """With the template's triangles and the skeleton on top, and what of it is not there."""
         missing = ""
         if state.mesh:
@@ -164,27 +164,30 @@ def _visible(error: np.ndarray) -> np.ndarray:
     return np.where(error > 0.02, 255, 0).astype(np.uint8)[..., None]
 
 
-def _fit(picture: TruthPicture, camera: Camera, state: State) -> np.ndarray:
+def _fit(picture: TruthPicture, camera: Camera, state: ViewState) -> np.ndarray:
     """A picture taken by one camera, in the pixels of another that stands and looks alike."""
     scale = camera.K[0, 0] / picture.camera.K[0, 0]
     size = (max(1, round(picture.camera.width * scale)), max(1, round(picture.camera.height * scale)))
     left, top = np.rint(camera.K[:2, 2] - scale * picture.camera.K[:2, 2]).astype(int).tolist()
-    small = Image.fromarray(picture.on_black).resize(size, Image.Resampling.BICUBIC)
-    sheet = Image.new("RGBA", (camera.width, camera.height))
-    sheet.paste(small, (left, top))
-    premultiplied = np.asarray(sheet, dtype=np.float32) / 255
-    return on_colour(premultiplied, DARK if state.dark else LIGHT)
+    sheet = np.zeros((camera.height, camera.width, 4), dtype=np.float32)
+    for channel in range(4):  # Each by itself: as RGBA, colours would be taken for straight ones.
+        whole = Image.fromarray(picture.on_black[..., channel].astype(np.float32) / 255)
+        page = Image.new("F", (camera.width, camera.height))
+        page.paste(whole.resize(size, Image.Resampling.BICUBIC), (left, top))
+        sheet[..., channel] = np.asarray(page)
+    return on_colour(sheet, DARK if state.dark else LIGHT)
 
 
-def _blank(camera: Camera, state: State, text: str) -> np.ndarray:
+def _blank(camera: Camera, state: ViewState, text: str) -> np.ndarray:
     sheet = Image.new("RGB", (camera.width, camera.height), DARK if state.dark else LIGHT)
     place = (camera.width * (1 + state.divider) / 2, camera.height / 2)
-    font = ImageFont.load_default(max(10, camera.height // 32))
+    room = round((1 - state.divider) * camera.width)
+    font = ImageFont.load_default(max(10, min(camera.height // 32, 2 * room // len(text))))
     ImageDraw.Draw(sheet).text(place, text, fill=INK[state.dark], font=font, anchor="mm")
     return np.asarray(sheet)
 
 
-def _divided(left: np.ndarray, right: np.ndarray, state: State) -> np.ndarray:
+def _divided(left: np.ndarray, right: np.ndarray, state: ViewState) -> np.ndarray:
     """The left picture, the right one, a line between them, and their names."""
     height, width = left.shape[:2]
     column = round(state.divider * width)
@@ -219,7 +222,7 @@ def _with_mesh(pixels: np.ndarray, vertices: np.ndarray, faces: np.ndarray, came
 
 
 def _with_skeleton(
-    pixels: np.ndarray, heads: np.ndarray, parents: np.ndarray, camera: Camera, state: State
+    pixels: np.ndarray, heads: np.ndarray, parents: np.ndarray, camera: Camera, state: ViewState
 ) -> np.ndarray:
     sheet = Image.fromarray(pixels)
     pen, size = ImageDraw.Draw(sheet), max(2, pixels.shape[0] // 150)

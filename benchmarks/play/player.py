@@ -17,7 +17,7 @@ from benchmarks.play.motions import acts_of
 from benchmarks.play.page import LABEL, Page
 from benchmarks.play.picture import Painter
 from benchmarks.play.shelf import TruthShelf, truth_from
-from benchmarks.play.state import State
+from benchmarks.play.state import ViewState
 from benchmarks.play.truth import TruthStudio, Wanted
 from benchmarks.play.viewer import Stream, Viewer
 from benchmarks.provenance import cores
@@ -26,7 +26,7 @@ TRUTH_PIXELS = 384 * 384  # of a rendered truth: some seconds on two cores
 STAGE_SHARE = {"starting the renderer": 0.1, "posing the body and its clothes": 0.3, "tracing light": 0.6}
 
 
-class Player:
+class PlayServer:
     """Everything that runs while people watch."""
 
     def __init__(self, cast: Cast, motions: Sequence[str], doors: DoorOptions) -> None:
@@ -61,7 +61,7 @@ class Player:
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
 
     def _arrive(self, client: viser.ClientHandle) -> None:
-        state = State(left=self.cast.titles[0], act=min(1, len(self.acts) - 1))
+        state = ViewState(left=self.cast.titles[0], act=min(1, len(self.acts) - 1))
         viewer = Viewer(client, self.acts, state, self.stream.wake)
         page = Page(viewer, self.painter, self._render_truth)
         with self._lock:
@@ -114,7 +114,7 @@ def playing(
     methods: Sequence[str] = (),
     doors: DoorOptions | None = None,
     trust: bool = False,
-) -> Iterator[Player]:
+) -> Iterator[PlayServer]:
     """A player for as long as the body runs; methods of others are loaded only where they are trusted.
 
     Raises:
@@ -125,7 +125,7 @@ def playing(
     try:
         with open_cast(run, scene=scene, methods=methods, trust=trust) as cast:
             cast.actor(cast.titles[0])  # A run that cannot be played says so before a browser opens.
-            player = Player(cast, motions, doors or DoorOptions())
+            player = PlayServer(cast, motions, doors or DoorOptions())
             try:
                 yield player
             finally:

@@ -16,7 +16,7 @@ from ash.capture.dataset import Pose
 from ash.files import InputError
 from ash.gaussians.gaussians import Gaussians
 from ash.harmonics import SH_C0
-from ash.protocol import PosesGaussians, StageClock
+from ash.protocol import PosesGaussians
 from benchmarks.play.actors import Cast
 from benchmarks.play.cameras import middle_of
 from benchmarks.play.motions import Act
@@ -25,11 +25,11 @@ HERE = Path(__file__).parent
 LIBRARY = HERE / "vendor" / "splats.min.js.gz"
 LICENCES = ("LICENSE-spark", "LICENSE-three", "LICENSE-fflate")
 LEAST_SCALE = 1e-4  # metres: a tenth of a millimetre is seen as nothing
-COLUMNS = 17  # bytes of a Gaussian: position 6, scale 3, rotation 4, colour 3, opacity 1
+COLUMNS = 17  # bytes of a Gaussian: position 6, scale 3, rotation 4, colour 3, opacity 1; then harmonics, if any
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Clip:
+class SharedClip:
     """What a shared page plays."""
 
     frames: tuple[Gaussians, ...]
@@ -48,9 +48,10 @@ class Bounds:
     low: list[float]  # of positions, metres
     high: list[float]
     log_scale: tuple[float, float]
+    harmonics: float  # the largest coefficient above degree 0
 
 
-def clip_of(cast: Cast, act: Act, frames: Sequence[int]) -> Clip:
+def clip_of(cast: Cast, act: Act, frames: Sequence[int]) -> SharedClip:
     """Frames of an act, played by the one avatar of a cast, seen as by the capture's cameras.
 
     Raises:
@@ -63,8 +64,8 @@ def clip_of(cast: Cast, act: Act, frames: Sequence[int]) -> Clip:
         raise InputError(f"{actor.title}: has no Gaussians; expected an avatar made of them")
     middle, first = middle_of(cast.capture), next(iter(cast.capture.cameras.values()))
     x, y, z = middle.tolist()
-    return Clip(
-        frames=tuple(actor.gaussians(Pose(act.motion, frame), StageClock()) for frame in frames),
+    return SharedClip(
+        frames=tuple(actor.avatar.gaussians(Pose(act.motion, frame)) for frame in frames),
         fps=act.motion.fps,
         title=f"{actor.title}: {act.title}",
         dilation=actor.avatar.dilation,
@@ -74,8 +75,8 @@ def clip_of(cast: Cast, act: Act, frames: Sequence[int]) -> Clip:
     )
 
 
-def share_page(clip: Clip) -> bytes:
-    """The page. Colours are those of degree 0: the browser's splats look alike from all sides.
+def share_page(clip: SharedClip) -> bytes:
+    """The page. Colours that depend on the view are computed in the browser for where its camera stands.
 
     Raises:
         InputError: the clip has no frame, or frames differ in their number of Gaussians.
@@ -95,6 +96,8 @@ def share_page(clip: Clip) -> bytes:
         "low": bounds.low,
         "high": bounds.high,
         "logScale": list(bounds.log_scale),
+        "bands": 3 * (clip.frames[0].sh.shape[1] - 1),
+        "harmonics": bounds.harmonics,
     }
     content = {
         "TITLE": html.escape(clip.title),
@@ -110,7 +113,7 @@ def share_page(clip: Clip) -> bytes:
 
 def packed(frames: Sequence[Gaussians], bounds: Bounds) -> bytes:
     """All frames, byte by byte as differences to the frame before, in columns, deflated."""
-    before = np.zeros((len(frames[0].means), COLUMNS), dtype=np.uint8)
+    before = np.zeros((len(frames[0].means), COLUMNS + 3 * (frames[0].sh.shape[1] - 1)), dtype=np.uint8)
     quats = np.zeros((len(before), 4), dtype=np.float32)
     squeeze, parts = zlib.compressobj(9), []
     for frame in frames:
@@ -124,15 +127,17 @@ def packed(frames: Sequence[Gaussians], bounds: Bounds) -> bytes:
 def _bounds(frames: Sequence[Gaussians]) -> Bounds:
     means = torch.cat([frame.means for frame in frames])
     scales = torch.cat([frame.scales for frame in frames]).clamp(min=LEAST_SCALE).log()
+    above = [float(frame.sh[:, 1:].abs().max()) for frame in frames if frame.sh.shape[1] > 1]
     return Bounds(
         low=means.amin(0).tolist(),
         high=(means.amax(0) + 1e-6).tolist(),
         log_scale=(float(scales.min()), float(scales.max()) + 1e-6),
+        harmonics=max(above, default=0.0) + 1e-6,
     )
 
 
 def _rows(frame: Gaussians, quats: np.ndarray, bounds: Bounds) -> np.ndarray:
-    """A frame as bytes `[n, 17]`, a number's high byte beside its low one."""
+    """A frame as bytes `[n, 17 + bands]`, a number's high byte beside its low one."""
     low, high = np.array(bounds.low), np.array(bounds.high)
     place = _steps((frame.means.numpy() - low) / (high - low), 65535)
     first, last = bounds.log_scale
@@ -140,7 +145,8 @@ def _rows(frame: Gaussians, quats: np.ndarray, bounds: Bounds) -> np.ndarray:
     colours = _steps(0.5 + SH_C0 * frame.sh[:, 0].numpy(), 255)
     turns = np.rint(127 * quats).astype(np.int64) & 255
     opacities = _steps(frame.opacities.numpy()[:, None], 255)
-    columns = [place >> 8, place & 255, scales, turns, colours, opacities]
+    above = np.rint(127 * frame.sh[:, 1:].reshape(len(place), -1).numpy() / bounds.harmonics).astype(np.int64) & 255
+    columns = [place >> 8, place & 255, scales, turns, colours, opacities, above]
     return np.concatenate(columns, axis=1).astype(np.uint8)
 
 

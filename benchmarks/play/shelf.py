@@ -10,7 +10,7 @@ from ash.capture.dataset import Camera, Capture
 from benchmarks.cell import metrics
 from benchmarks.play.film import capture_image
 from benchmarks.play.motions import Act
-from benchmarks.play.state import State
+from benchmarks.play.state import ViewState
 
 KEPT = 64
 SAME_PLACE_M = 1e-3
@@ -37,13 +37,13 @@ class TruthShelf:
         self.capture = capture
         self._rendered: OrderedDict[tuple, list[TruthPicture]] = OrderedDict()
 
-    def put(self, act: Act, state: State, picture: TruthPicture) -> None:
+    def put(self, act: Act, state: ViewState, picture: TruthPicture) -> None:
         """Keep a rendered picture of the pose that the state shows."""
         self._rendered.setdefault(_pose_key(act, state), []).append(picture)
         while len(self._rendered) > KEPT:
             self._rendered.popitem(last=False)
 
-    def find(self, act: Act, state: State) -> TruthPicture | None:
+    def find(self, act: Act, state: ViewState) -> TruthPicture | None:
         """The truth of this pose as this camera sees it, if it is known."""
         frame = act.frames[state.step]
         own = self.capture.cameras.get(state.camera)
@@ -70,5 +70,5 @@ def truth_from(camera: Camera, straight: np.ndarray) -> TruthPicture:
     return TruthPicture(camera=camera, on_black=metrics.on_black(straight))
 
 
-def _pose_key(act: Act, state: State) -> tuple:
+def _pose_key(act: Act, state: ViewState) -> tuple:
     return act.name, act.frames[state.step], state.bends

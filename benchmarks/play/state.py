@@ -34,7 +34,7 @@ class Eye:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class State:
+class ViewState:
     """Everything that decides a viewer's picture."""
 
     act: int = 0
@@ -55,7 +55,7 @@ class State:
     angle: float = 0.0  # steps along the spiral
     eye: Eye | None = field(default=None, compare=False)  # None until the browser has told
 
-    def with_bend(self, joint: int, bend: Bend) -> "State":
+    def with_bend(self, joint: int, bend: Bend) -> "ViewState":
         """With one joint turned; no turn at all is not remembered."""
         others = {j: b for j, b in self.bends if j != joint}
         kept = others | ({joint: bend} if any(bend) else {})
@@ -65,7 +65,7 @@ class State:
         """How far a joint is turned."""
         return dict(self.bends).get(joint, (0.0, 0.0, 0.0))
 
-    def stepped(self, steps: int, length: int) -> "State":
+    def stepped(self, steps: int, length: int) -> "ViewState":
         """So many frames further; at the ends, around again or stopped, as `loop` says."""
         wanted = self.step + steps
         if self.loop:

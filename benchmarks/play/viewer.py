@@ -12,21 +12,23 @@ import viser
 from benchmarks.play import pace
 from benchmarks.play.cameras import STEPS_PER_SECOND
 from benchmarks.play.motions import Act
-from benchmarks.play.picture import Drawn, Painter
-from benchmarks.play.state import SPIRAL, State
+from benchmarks.play.picture import Painter, Painting
+from benchmarks.play.state import SPIRAL, ViewState
 
-Change = Callable[[State], State]
+Change = Callable[[ViewState], ViewState]
 NEVER = float("inf")
 
 
 class Viewer:
-    """State and timing. Changed from the server's threads, drawn from one other."""
+    """What it looks at, and when it is drawn. Changed from the server's threads, drawn from one other."""
 
-    def __init__(self, client: viser.ClientHandle, acts: Sequence[Act], state: State, wake: Callable[[], None]) -> None:
+    def __init__(
+        self, client: viser.ClientHandle, acts: Sequence[Act], state: ViewState, wake: Callable[[], None]
+    ) -> None:
         self.client, self.acts, self._wake = client, acts, wake
         self.pace = pace.Pace()
         self.served = 0.0  # when its last picture was sent
-        self.show: Callable[[State, Drawn | None, str], None] = lambda state, drawn, words: None
+        self.show: Callable[[ViewState, Painting | None, str], None] = lambda state, drawn, words: None
         self._state, self._lock = state, threading.Lock()
         self._dirty, self._sharp = True, False
         self._touched = self._advanced = time.perf_counter()
@@ -34,11 +36,11 @@ class Viewer:
         self._sent: deque[float] = deque(maxlen=30)
 
     @property
-    def state(self) -> State:
+    def state(self) -> ViewState:
         """What it looks at now."""
         return self._state
 
-    def change(self, change: Change) -> State:
+    def change(self, change: Change) -> ViewState:
         """Replace the state; the next picture shows it, and what came between is never drawn."""
         with self._lock:
             self._state = change(self._state)
@@ -98,7 +100,7 @@ class Viewer:
         with gone_is_fine(self.client):
             self.show(state, drawn, self._words(drawn, ms))
 
-    def _advance(self, now: float) -> State:
+    def _advance(self, now: float) -> ViewState:
         """Let the motion and the spiral go on by the time that has passed."""
         elapsed, self._advanced = min(now - self._advanced, 0.5), now
         with self._lock:
@@ -117,7 +119,7 @@ class Viewer:
         with self._lock:
             self._state = replace(self._state, playing=False)
 
-    def _words(self, drawn: Drawn, ms: float) -> str:
+    def _words(self, drawn: Painting, ms: float) -> str:
         height, width = drawn.pixels.shape[:2]
         times = [t for t in self._sent if self.served - t < 1.5]
         rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 2 else 0.0

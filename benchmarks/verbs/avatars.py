@@ -80,7 +80,7 @@ class VideoVerb:
             raise InputError(f"{self.out}: expected a film that ends with .mp4 or .webp")
         with open_cast(self.run, scene=self.scene, methods=self.methods, trust=self.trust) as cast:
             act = act_named(cast.capture, self.motion)
-            rate = self.fps or act.motion.fps
+            rate = float(self.fps or act.motion.fps)
             script = Script(
                 act=act,
                 frames=frames_in(act, self.frames),

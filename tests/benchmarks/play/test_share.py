@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.chromium import chromium
+from helpers.browser import Visitor
 from PIL import Image
 
 from ash.capture.dataset import Pose
@@ -19,8 +19,6 @@ from ash.protocol import StageClock
 from benchmarks import cli
 from benchmarks.play.actors import open_cast
 from benchmarks.play.share import COLUMNS
-
-pytestmark = pytest.mark.slow  # Trains, and drives a browser: a minute and more.
 
 PAPER = (236, 236, 236)
 PATIENCE = 120_000  # milliseconds: software graphics on a busy machine
@@ -33,14 +31,10 @@ def page(tube_cells: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) 
     return out
 
 
-def test_the_page_draws_in_a_browser_what_we_draw(page: Path, tube_cells: dict[str, Path]) -> None:
-    problems: list[str] = []
-    asked: list[str] = []
-    with chromium() as browser, open_cast(tube_cells["ash"]) as cast:
-        tab = browser.new_page(viewport={"width": 200, "height": 200})
-        tab.on("pageerror", lambda error: problems.append(str(error)))
-        tab.on("request", lambda request: asked.append(request.url))
-        tab.goto(page.as_uri())
+def test_the_page_draws_in_a_browser_what_we_draw(page: Path, tube_cells: dict[str, Path], visit: Visitor) -> None:
+    seen = visit(page, size=(200, 200))
+    tab = seen.page
+    with open_cast(tube_cells["ash"]) as cast:
         tab.wait_for_function("window.avatar", timeout=PATIENCE)
         tab.keyboard.press(" ")
         assert not tab.evaluate("window.avatar.playing")
@@ -57,31 +51,35 @@ def test_the_page_draws_in_a_browser_what_we_draw(page: Path, tube_cells: dict[s
             ours = actor.view(Pose(capture.motion, frame), camera, StageClock(), PAPER) / 255
             alpha = actor.picture(Pose(capture.motion, frame), camera, StageClock())[..., 3]
             assert theirs.shape == ours.shape and (alpha > 0.5).mean() > 0.05
-            assert psnr(theirs, ours, alpha) > 25 and psnr(theirs, ours, np.ones_like(alpha)) > 25
+            assert psnr(theirs, ours, alpha) > 40 and psnr(theirs, ours, np.ones_like(alpha)) > 40
         tab.keyboard.press("ArrowRight")
         assert tab.evaluate("window.avatar.shown") == 0, "after the last frame comes the first"
-    assert problems == []
-    assert [url for url in asked if not url.startswith(("file:", "blob:", "data:"))] == [], "it needs no network"
+    assert seen.errors == [] and seen.requests == [], "it needs no network"
 
 
 def test_the_page_holds_every_frame_to_its_bytes(page: Path, tube_cells: dict[str, Path]) -> None:
     text = page.read_text()
     clip = json.loads(re.search(r'id="clip">(.*?)</script>', text)[1])
     packed = zlib.decompress(base64.b64decode(re.search(r'id="frames">(.*?)</script>', text)[1]))
-    size = clip["count"] * COLUMNS
+    columns_of_all = COLUMNS + 3 * 8  # degree 2
+    size = clip["count"] * columns_of_all
     steps = np.frombuffer(packed, dtype=np.uint8).reshape(clip["frames"], size)
-    bytes_of = np.cumsum(steps, axis=0, dtype=np.uint64).astype(np.uint8).reshape(clip["frames"], COLUMNS, -1)
+    bytes_of = np.cumsum(steps, axis=0, dtype=np.uint64).astype(np.uint8).reshape(clip["frames"], columns_of_all, -1)
     high, low = np.array(clip["high"])[:, None], np.array(clip["low"])[:, None]
     with open_cast(tube_cells["ash"]) as cast:
         actor, capture = cast.actor(cast.titles[0]), cast.capture
         for frame, columns in enumerate(bytes_of):
-            wanted = actor.gaussians(Pose(capture.motion, frame), StageClock())
+            wanted = actor.avatar.gaussians(Pose(capture.motion, frame))
             place = low + (high - low) * (256.0 * columns[:3] + columns[3:6]) / 65535
             np.testing.assert_allclose(place.T, wanted.means, atol=1e-4)
             turns = columns[9:13].astype(np.int8).T / 127
             unit = torch.nn.functional.normalize(wanted.quats, dim=-1).numpy()
             assert np.abs((turns * unit).sum(1)).min() > 0.985
             np.testing.assert_allclose(columns[16] / 255, wanted.opacities, atol=0.51 / 255)
+            above = columns[17:].astype(np.int8).T / 127 * clip["harmonics"]
+            np.testing.assert_allclose(
+                above, wanted.sh[:, 1:].reshape(len(above), -1), atol=0.51 * clip["harmonics"] / 127
+            )
 
 
 def test_the_page_names_its_libraries_licences_and_loads_nothing(page: Path) -> None:
