@@ -16,6 +16,7 @@ import numpy as np
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture, Pose, Split
 from ash.capture.formats import load_capture
+from ash.capture.typed import from_json
 from ash.config import TrainingConfig
 from ash.files import InputError, read_json, write_atomic, write_json
 from ash.presets import named
@@ -23,7 +24,6 @@ from ash.protocol import Avatar, StageClock
 from baselines.ddc import DdcAvatar, ddc_config
 from benchmarks import provenance
 from benchmarks.cell import metrics
-from benchmarks.cell.curves import read_curve
 from benchmarks.cell.views import spread
 
 AS_IT_IS = "preset"
@@ -146,7 +146,7 @@ def _train(method: str, folder: str, out: str, preset: str, seed: int, index: in
     setting = settings(method, preset, seed=seed)[index]
     place = Path(out) / f"{method}-{seed}-{setting.name.replace(' ', '_')}-{setting.value or 'as_it_is'}"
     if (place / "found.json").exists():
-        return SearchResult(**read_json(place / "found.json"))
+        return _read(place / "found.json")
     import torch
 
     torch.set_num_threads(1)
@@ -154,16 +154,33 @@ def _train(method: str, folder: str, out: str, preset: str, seed: int, index: in
     capture = replace(capture, store=Path(out) / "templates")
     avatar = AshAvatar(setting.config, capture) if method == "ash" else DdcAvatar(setting.config, capture)
     avatar.fit(capture, folder=place)
+    outcome = avatar.outcome()
+    assert outcome is not None, "it has just been trained"
     found = SearchResult(
         name=setting.name,
         value=setting.value,
         seed=seed,
         psnr=_psnr(avatar, capture, apart),
-        train_s=max(point.seconds for point in read_curve(place / "log.jsonl")),
+        train_s=outcome.seconds,
         params=avatar.parameter_count(),
     )
     write_json(place / "found.json", asdict(found))
     return found
+
+
+def _read(path: Path) -> SearchResult:
+    """A training's result, where an earlier search left it.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    try:
+        found: SearchResult = from_json(SearchResult, read_json(path))
+        return found
+    except ValueError as error:
+        raise InputError(
+            f"{path}: expected the result of a search ({error}); without it a search makes it anew"
+        ) from error
 
 
 def _psnr(avatar: Avatar, capture: Capture, split: Split) -> float:

@@ -62,6 +62,9 @@ def test_a_setting_is_trained_once_and_taken_from_its_file_afterwards(method: st
         place / "found.json", {"name": AS_IT_IS, "value": "", "seed": 0, "psnr": 1.5, "train_s": 2.0, "params": 3}
     )
     assert search._train(*arguments).psnr == 1.5
+    write_json(place / "found.json", {"name": AS_IT_IS, "psnr": "1.5"})
+    with pytest.raises(InputError, match=r"found.json: expected what a search found"):
+        search._train(*arguments)
 
 
 def test_the_table_says_what_each_setting_is_worth() -> None:
