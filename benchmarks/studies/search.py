@@ -178,9 +178,7 @@ def _read(path: Path) -> SearchResult:
         found: SearchResult = from_json(SearchResult, read_json(path))
         return found
     except ValueError as error:
-        raise InputError(
-            f"{path}: expected the result of a search ({error}); without it a search makes it anew"
-        ) from error
+        raise InputError(f"{path}: expected what a search found ({error}); deleted, it is made anew") from error
 
 
 def _psnr(avatar: Avatar, capture: Capture, split: Split) -> float:
