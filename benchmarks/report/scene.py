@@ -79,7 +79,7 @@ def scene_report(data: SceneData) -> SceneReport:
     """Compute the part of one scene."""
     scores, scene = data.scores, data.scene
     capture, shown, trouble = _pictured(data)
-    exposed = {r.config.method for r in data.results if r.isolated is False}
+    exposed = sentences.exposed(data.results)
     notes = [Text(text=doubt, note=True) for doubt in sentences.doubts(data.results)]
     quality = tables.build(scores, scene, _quality_quantities(), title=f"Accuracy on {scene}", exposed=exposed)
     cost = tables.build(scores, scene, tables.cost_columns(COSTS), title=f"Cost on {scene}", exposed=exposed)

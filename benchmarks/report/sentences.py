@@ -47,13 +47,18 @@ def remarks(scores: Scores, scene: str) -> list[str]:
     return [remark for remark in found if remark]
 
 
+def exposed(results: Sequence[CellResult]) -> tuple[str, ...]:
+    """Methods that could not be locked in; oracles are not meant to be."""
+    found = (r.config.method for r in results if r.isolated is False and not is_oracle(r.config.method))
+    return tuple(dict.fromkeys(found))
+
+
 def doubts(results: Sequence[CellResult]) -> tuple[str, ...]:
     """What could not be enforced, and clocks that contradict each other: notes under the tables."""
     found = []
-    exposed = dict.fromkeys(look_of(r.config.method).title for r in results if r.isolated is False)
-    if exposed:
+    if titles := [look_of(method).title for method in exposed(results)]:
         found.append(
-            f"Not isolated: {', '.join(exposed)}. The system had no room to lock the method in, so the truth was out of"
+            f"Not isolated: {', '.join(titles)}. The system had no room to lock the method in, so the truth was out of"
             " sight, and opening it was watched, but not impossible."
         )
     for result in results:

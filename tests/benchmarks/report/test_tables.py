@@ -150,6 +150,8 @@ def test_what_was_not_enforced_and_clocks_that_contradict_are_told() -> None:
     assert "more than one core" in several
     exposed, *others = doubts([trained(100.0, 98.0, isolated=False)])
     assert exposed.startswith("Not isolated: ASH.") and not others
+    oracle = replace(result(), config=replace(result().config, method="ash_truth"), isolated=False)
+    assert doubts([oracle]) == (), "an oracle is given the truth"
     columns = quality_columns(("psnr",))
     plain, marked = (
         build(scores_of([result()]), "boxes", columns, title="", exposed=exposed) for exposed in ((), ("ash",))
