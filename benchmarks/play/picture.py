@@ -62,7 +62,7 @@ class Painter:
             note = "No truth of this view yet: press *Render truth here*, or look through one of the capture's cameras."
         pixels = left
         if state.right == TRUTH:
-            shown = _blank(camera, state, "No truth of this view yet") if truth is None else _fit(truth, camera, state)
+            shown = _blank(camera, state, "No truth of\nthis view yet") if truth is None else _fit(truth, camera, state)
             pixels = _divided(left, shown, state)
         elif state.right != NOTHING:
             other = self._avatar(state, state.right, Pose(motion, frame), camera, StageClock())
@@ -180,10 +180,10 @@ def _fit(picture: TruthPicture, camera: Camera, state: ViewState) -> np.ndarray:
 
 def _blank(camera: Camera, state: ViewState, text: str) -> np.ndarray:
     sheet = Image.new("RGB", (camera.width, camera.height), DARK if state.dark else LIGHT)
-    place = (camera.width * (1 + state.divider) / 2, camera.height / 2)
-    room = round((1 - state.divider) * camera.width)
-    font = ImageFont.load_default(max(10, min(camera.height // 32, 2 * room // len(text))))
-    ImageDraw.Draw(sheet).text(place, text, fill=INK[state.dark], font=font, anchor="mm")
+    place = (camera.width * (1 + state.divider) / 2, camera.height / 3)  # Above the divider's handle.
+    room, longest = (1 - state.divider) * camera.width, max(map(len, text.splitlines()))
+    font = ImageFont.load_default(max(10, min(camera.height / 32, 1.5 * room / longest)))
+    ImageDraw.Draw(sheet).text(place, text, fill=INK[state.dark], font=font, anchor="mm", align="center")
     return np.asarray(sheet)
 
 
