@@ -114,3 +114,17 @@ def test_the_network_is_sized_as_the_presets_decoders_and_fills_its_texture():
         replaced(config, {"width": 8}, of="ddc")
     with pytest.raises(InputError, match=r"unknown key 'model\.sh_degree'"):  # A mesh has none.
         replaced(config, {"model.sh_degree": 1}, of="ddc")
+
+
+def test_far_from_training_a_static_texture_is_what_counts(capture, tmp_path, monkeypatch):
+    mesh = avatar(capture, steps=40)
+    mesh.fit(capture, folder=tmp_path)
+    module, seen = mesh.module, mesh._conditions_of(1)
+    with torch.no_grad():
+        near = module.dynamic_texture(seen)
+        torch.testing.assert_close(near, module.texture + module.correction(seen))
+        assert not torch.equal(module.static_texture, module.texture), "each has learned for itself since the warm-up"
+        for trust in (0.0, 0.25):
+            monkeypatch.setattr(module.textures, "trust", lambda _, trust=trust: trust)
+            expected = (1 - trust) * module.static_texture + trust * near
+            torch.testing.assert_close(module.dynamic_texture(seen), expected)
