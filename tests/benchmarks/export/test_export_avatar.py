@@ -25,12 +25,12 @@ from synth.posing import bone_frames, rotvec_to_rotmat
 @pytest.mark.parametrize(("form", "reader"), [("ply", read_ply), ("gltf", read_gltf)])
 def test_exported_gaussians_draw_the_frame_that_the_avatar_renders(form, reader, tube_cells, tmp_path: Path) -> None:
     out = tmp_path / "frame"
-    command = ["export-avatar", str(tube_cells["ash"]), "--format", form, "--frames", "1", "--out", str(out)]
-    assert cli.main(command) == cli.DONE
+    command = ["export-avatar", str(tube_cells["ash"]), "--format", form, "--motion", "train", "--frames", "1"]
+    assert cli.main([*command, "--out", str(out)]) == cli.DONE
     read = reader(out.read_bytes())
     with open_cast(tube_cells["ash"]) as cast:
         capture, avatar = cast.capture, cast.actor(cast.titles[0]).avatar
-        frame = capture.splits["novel_pose"].frames[1]
+        frame = capture.splits["train"].frames[1]
         for camera in capture.cameras.values():
             ours = avatar.render(Pose(capture.motion, frame), camera, clock=StageClock())
             theirs = image_of(splat(read, **views_of([camera]), dilation=avatar.dilation))
