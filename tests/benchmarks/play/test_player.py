@@ -133,7 +133,7 @@ def test_eight_viewers_are_all_served_within_bounds(player: PlayServer, seconds:
     assert grown < 128e6, "what is not yet sent is replaced, not piled up"
 
 
-@pytest.mark.parametrize("times", [3, pytest.param(10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("times", [10])
 def test_browsers_that_are_killed_leave_nothing_behind(player: PlayServer, tmp_path: Path, times: int) -> None:
     path = find_chromium()
     if path is None:
