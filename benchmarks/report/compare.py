@@ -17,9 +17,10 @@ from ash.files import InputError, write_atomic
 from benchmarks.analysis.names import SPLIT_NAMES
 from benchmarks.analysis.scores import RANKED_SPLITS
 from benchmarks.cell.cells import Cell, CellResult, ViewScore, read_result, stored_prediction
-from benchmarks.cell.metrics import METRICS, occupied, on_black
+from benchmarks.cell.metrics import METRICS, on_black
 from benchmarks.cell.views import View
 from benchmarks.report.page import environment
+from benchmarks.report.pictures import crop_of, on_paper
 from benchmarks.suites.runs import Run, results_of
 
 Verdict = Literal["better", "worse", "identical", "no change seen", "one seed", "only before", "only after"]
@@ -33,7 +34,6 @@ QUANTITIES = (
     ("speed", "", "train_s"),
 )
 WORST = 2  # Frames of each run that are shown of a row.
-GREY, MARGIN = 236, 6  # Behind the subject, and pixels around it.
 
 Rows = dict[tuple[str, str], list[tuple[Cell, CellResult]]]
 
@@ -236,15 +236,13 @@ def _pixels(before: Cell, after: Cell, key: tuple[str, str, int]) -> tuple[str, 
     images += [stored_prediction(cell, load_capture(cell.capture_folder), view) for cell in (before, after)]
     if len({image.shape for image in images}) > 1:
         raise InputError(f"{after.folder}: its pictures have another size than those of {before.folder}")
-    covered = np.any([image[..., 3] > 8 for image in images], axis=0)
-    crop = occupied(covered, MARGIN) or (slice(None), slice(None))
+    crop = crop_of(images)
     truth, *drawn = (_uri(image[crop]) for image in images)
     return truth, drawn
 
 
 def _uri(image: np.ndarray) -> str:
-    """RGBA on black as a data URI, over grey."""
-    shown = image[..., :3] + GREY * (1 - image[..., 3:].astype(float) / 255)
+    """RGBA on black as a data URI, on the report's paper."""
     buffer = io.BytesIO()
-    Image.fromarray(np.clip(np.rint(shown), 0, 255).astype(np.uint8)).save(buffer, format="PNG")
+    Image.fromarray(on_paper(image)).save(buffer, format="PNG")
     return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"

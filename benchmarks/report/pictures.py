@@ -126,7 +126,7 @@ def worst(capture: Capture, shown: Shown, *, count: int) -> list[Frames]:
     found = []
     for cause in worst_frames(capture, shown.cell, shown.result, count=count):
         view, truth, prediction = cause.view, cause.truth, cause.predicted
-        crop = _crop([truth, prediction])
+        crop = crop_of([truth, prediction])
         flip = view.scores["foreground", "flip"]
         images = (
             Frame(caption="Truth", score="", pixels=on_paper(truth[crop])),
@@ -173,7 +173,7 @@ def _track(
     capture: Capture, shown: Sequence[Shown], album: Album, split: str, camera: str, frames: list[int], *, room: int
 ) -> dict[str, Any]:
     truths = {frame: metrics.on_black(capture.image(camera, frame)) for frame in frames}
-    crop = _crop(list(truths.values()))
+    crop = crop_of(list(truths.values()))
     scores = [{v.frame: psnr_of(v) for v in s.result.views if (v.split, v.camera) == (split, camera)} for s in shown]
     kept, keys = [frames[0]], {}
     before = album.size
@@ -216,7 +216,7 @@ def _compare(capture: Capture, shown: Sequence[Shown], view: ViewScore) -> Frame
     truth = metrics.on_black(capture.image(view.camera, view.frame))
     place = View(split=view.split, camera=view.camera, frame=view.frame)
     predictions = [stored_prediction(s.cell, capture, place) for s in shown]
-    crop = _crop([truth, *predictions])
+    crop = crop_of([truth, *predictions])
     ceiling = view.scores.get(("foreground", "noise_ceiling"))
     noise = "" if ceiling is None else f"noise ceiling {ceiling:.1f} dB"
     images, errors = [Frame(caption="Truth", score=noise, pixels=on_paper(truth[crop]))], []
@@ -234,7 +234,7 @@ def _compare(capture: Capture, shown: Sequence[Shown], view: ViewScore) -> Frame
     )
 
 
-def _crop(images: Sequence[np.ndarray]) -> tuple[slice, slice]:
+def crop_of(images: Sequence[np.ndarray]) -> tuple[slice, slice]:
     """The rows and columns that any image covers, with a margin."""
     covered = np.any([image[..., 3] > 8 for image in images], axis=0)
     extent = max(covered.any(axis).sum() for axis in (0, 1))

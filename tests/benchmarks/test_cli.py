@@ -197,7 +197,7 @@ def test_ctrl_c_exits_with_130_and_the_same_command_goes_on(capture: Path, tmp_p
     command = [sys.executable, "-m", "benchmarks.cli", "train", "fake_sleeping", str(capture), "--out", str(tmp_path)]
     for number in (signal.SIGINT, signal.SIGTERM):
         process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-        wait_for(lambda: list(tmp_path.glob("cells/*/work/log.jsonl")))
+        wait_for(lambda: list(tmp_path.glob("cells/*/*/log.jsonl")))
         time.sleep(0.5)
         process.send_signal(number)
         _, told = process.communicate(timeout=20)
