@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from ash.blendshapes import LocalBlendshapes
-from ash.capture.dataset import Camera, Capture, Pose, fewer_cameras
+from ash.capture.dataset import Camera, Capture, Pose, fewer_views
 from ash.checkpoints import contiguous_state, load_module, read_safetensors
-from ash.config import AshConfig, ModelConfig
+from ash.config import AshConfig, ModelConfig, TrainingConfig
 from ash.decoders import Decoders
 from ash.files import InputError, write_atomic
 from ash.gaussians.gaussians import Gaussians
@@ -24,15 +24,15 @@ from ash.protocol import StageClock, TrainingOutcome
 from ash.searching import Build, Candidate, Choice, at_size, brief_training, sufficient, with_choice, write_choice
 from ash.template.motion import normalised_motion
 from ash.template.template import Template
-from ash.template_learning.learning import template_of
+from ash.template_learning.learning import template_of, with_template
+from ash.template_learning.refining import refined_template
 from ash.textures import Conditions, TexelLattice, TextureDrawer, build_lattice, unsettled
 from ash.training.adam import Adam
-from ash.training.batches import TrainingImages, draw_batch, load_training_images
+from ash.training.batches import TrainingImages, draw_batch, load_training_images, over
 from ash.training.loop import fit, view_loss
 
-WARMUP_OPACITY_WEIGHT = 0.1  # As in the release.
-FITTED_FRAMES = 4
-FITTED_STEPS = 100
+RELEASED_OPACITY_WEIGHT = 0.1  # In the release's warm-up.
+FITTED_LOOK, FITTED_GAIN = 100, 0.01  # A frame is fitted until so many steps lower its loss by less than this share.
 
 MakeDecoders = Callable[[ModelConfig, TexelLattice], torch.nn.Module]
 
@@ -49,14 +49,16 @@ class AshAvatar:
         template: Template | None = None,
     ) -> None:
         """`template`: one to stand on, where it exists already."""
-        capture = fewer_cameras(capture, config.training.camera_share)
+        capture = _seen(capture, config.training)
         self.template = template or template_of(config.template, capture, seed=config.seed)
         self.choice: Choice | None = None
         if config.search and config.model.motion and config.model.head == "unet" and make_decoders is None:
             self.choice = sufficient(self._brief(config), config, capture)
-            config = _sized(config, self.choice.candidate, self.choice.fade)
+            config = at_size(config, self.choice.candidate, self.choice.fade)
         torch.manual_seed(config.seed)
         self.config = config
+        if config.model.refine:
+            self.template, _ = refined_template(self.template, config.template)
         self.lattice = build_lattice(capture.template, config.model.texels)
         self.analytic = initial_gaussians(config.model, capture, self.template, self.lattice)
         decoders = None
@@ -68,7 +70,7 @@ class AshAvatar:
         if isinstance(decoders, LocalBlendshapes):
             window, frames = config.model.window, capture.splits["train"].frames
             decoders.observe([normalised_motion(Pose(capture.motion, frame), window=window) for frame in frames])
-        self._conditions = Kept(self._make_conditions)  # The template is frozen while ASH learns.
+        self._conditions = Kept(self._make_conditions)  # A template that images do not move is frozen.
         self._motion = capture.motion
         self._outcome: TrainingOutcome | None = None
 
@@ -76,7 +78,7 @@ class AshAvatar:
         """How the search builds its candidates: on this template."""
 
         def build(candidate: Candidate, capture: Capture) -> AshAvatar:
-            sized = _sized(config, candidate, config.model.fade)
+            sized = at_size(config, candidate, config.model.fade)
             return AshAvatar(replace(sized, training=brief_training(sized.training)), capture, template=self.template)
 
         return build
@@ -99,7 +101,7 @@ class AshAvatar:
 
     def fit(self, capture: Capture, *, folder: Path) -> None:
         """Warm up and train; see `ash.training.loop.fit`."""
-        images = load_training_images(fewer_cameras(capture, self.config.training.camera_share))
+        images = load_training_images(_seen(capture, self.config.training))
         if self.choice is not None:
             write_choice(self.choice, folder / "log.jsonl")
         self._outcome = fit(
@@ -110,28 +112,25 @@ class AshAvatar:
             folder=folder,
             before_start=lambda: self._warm_up(images),
         )
+        self.template.forget()
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """The decoders, the base and the light, each with its own learning rate."""
+        """Networks, and what is learned directly: static texels, light, a displacement of the template."""
         training, module = self.config.training, self.module
-        groups: list[dict[str, Any]] = []
-        if module.decoders is not None:
-            groups.append({"params": list(module.decoders.parameters()), "lr": training.learning_rate})
-        if module.base.requires_grad:
-            groups.append({"params": [module.base], "lr": training.base_learning_rate})
-        if module.static is not None:
-            groups.append({"params": [module.static], "lr": training.base_learning_rate})
+        nets = list(module.decoders.parameters()) if module.decoders is not None else []
+        slow, fast = [], [p for p in (module.base, module.static, module.light) if p is not None]
         if module.refinement is not None:
-            groups.append({"params": list(module.refinement.parameters()), "lr": training.base_learning_rate})
-        if module.light is not None:
-            groups.append({"params": [module.light], "lr": training.base_learning_rate})
-        return groups
+            slow, shared = module.refinement.nets.networks(), module.refinement.shared.parameters()
+            fast += shared
+        groups = [(nets + slow, training.learning_rate), (fast, training.base_learning_rate)]
+        learned = [([p for p in group if p.requires_grad], rate) for group, rate in groups]
+        return [{"params": group, "lr": rate} for group, rate in learned if group]
 
     def draw_training_views(self, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
         """Stages 3 and 4 on cached conditions; the base alone while the static warm-up lasts."""
         training, conditions = self.config.training, self._conditions_of(frame)
         if step < training.static_steps:
-            return self._drawn(self.module.refined(self.module.base), conditions, cameras, background)
+            return self._drawn(self.module.base, conditions, cameras, background)
         noisy = unsettled(conditions.textures, training.texture_noise, seed=self.config.seed, step=step)
         return self._drawn(self._decode(replace(conditions, textures=noisy)), conditions, cameras, background)
 
@@ -140,7 +139,7 @@ class AshAvatar:
         static = self.module.static
         if static is None:
             return None
-        return self._drawn(self.module.refined(static), self._conditions_of(frame), cameras, background)
+        return self._drawn(static, self._conditions_of(frame), cameras, background)
 
     @torch.no_grad()
     def end_warmup(self) -> None:
@@ -149,15 +148,17 @@ class AshAvatar:
             self.module.static.copy_(self.module.base)
 
     def _drawn(self, raw: Tensor, conditions: Conditions, cameras: list[Camera], background: Tensor) -> Tensor:
+        flat = background.ndim == 1
         try:
-            return self.module.draw(self.module.pose(raw, conditions), cameras, background).rgb
+            drawn = self.module.draw(self.module.pose(raw, conditions), cameras, background if flat else None)
+            return drawn.rgb if flat else over(drawn.rgb, drawn.alpha, background)
         except InputError as error:  # Cameras and background come from the capture: the Gaussians are at fault.
             raise FloatingPointError(f"Gaussians that cannot be drawn ({error})") from error
 
     def corrections(self, frame: int) -> Tensor | None:
         """What the decoders add to the base in a training frame, raw parameters `[n, o]`."""
         decoders = self.module.decoders
-        return None if decoders is None else decoders(self._conditions_of(frame))
+        return None if decoders is None else self.module.corrections(decoders(self._conditions_of(frame)))
 
     def _decode(self, conditions: Conditions) -> Tensor:
         """Stage 3 as it learns, in the precision of the configuration."""
@@ -166,7 +167,10 @@ class AshAvatar:
             return self.module.decode(conditions).float()
 
     def _conditions_of(self, frame: int) -> Conditions:
-        return self._conditions[frame]
+        if self.module.refinement is None:
+            return self._conditions[frame]
+        self.template.forget()  # It moves with every step: all that is drawn from it is drawn anew.
+        return self.module.conditions(Pose(self._motion, frame))
 
     @torch.no_grad()
     def _make_conditions(self, frame: int) -> Conditions:
@@ -176,9 +180,9 @@ class AshAvatar:
         """ASH Eq. 8: regress the decoders to known Gaussians before anything is rendered through them."""
         training = self.config.training
         if training.warmup == "analytic":
-            self._regress(images.frames, self._released_target)
+            self._regress(images.frames, self._released_target, opacity=RELEASED_OPACITY_WEIGHT)
         elif training.warmup == "fitted":
-            chosen = images.frames[:: max(1, len(images.frames) // FITTED_FRAMES)]
+            chosen = images.frames[:: training.fitted_every]
             fitted = {frame: self._fit_frame(images, frame) for frame in chosen}
             self._regress(chosen, fitted.__getitem__)
 
@@ -190,22 +194,27 @@ class AshAvatar:
         alone = replace(images, frames=(frame,))
         raw = self.analytic.clone().requires_grad_()
         optimiser = Adam([{"params": [raw], "lr": self.config.training.base_learning_rate}])
-        conditions = self._conditions_of(frame)
-        for step in range(FITTED_STEPS):
+        with torch.no_grad():
+            conditions = self._conditions_of(frame)
+        losses: list[float] = []
+        while not _is_fitted(losses, self.config.training.fitted_steps):
+            step = len(losses)
             batch = draw_batch(alone, self.config.training, self.config.seed, step)
             fixed = torch.cat([torch.zeros_like(raw[:, :3]), raw[:, 3:]], 1)
-            drawn = self.module.draw(self.module.pose(fixed, conditions), batch.cameras, batch.background).rgb
+            drawn = self._drawn(fixed, conditions, batch.cameras, batch.background)
+            loss = view_loss(drawn, batch, self.config.training)
             optimiser.zero_grad()
-            view_loss(drawn, batch, self.config.training).backward()  # type: ignore[no-untyped-call]
+            loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
+            losses.append(float(loss.detach()))
         return torch.cat([torch.zeros_like(raw[:, :3]), raw[:, 3:]], 1).detach()
 
-    def _regress(self, frames: Sequence[int], target: Callable[[int], Tensor]) -> None:
+    def _regress(self, frames: Sequence[int], target: Callable[[int], Tensor], *, opacity: float = 1.0) -> None:
         assert self.module.decoders is not None
         training = self.config.training
         optimiser = Adam([{"params": list(self.module.decoders.parameters()), "lr": training.learning_rate}])
         weights = torch.ones(self.analytic.shape[1])
-        weights[10] = WARMUP_OPACITY_WEIGHT
+        weights[10] = opacity
         for step in range(training.warmup_steps):
             frame = frames[step % len(frames)]
             raw = self._decode(self._conditions_of(frame))
@@ -221,15 +230,11 @@ class AshAvatar:
 
     def template_vertices(self, pose: Pose) -> np.ndarray:
         """The posed template, `[v, 3]` metres."""
-        posed, refinement = self.template.pose(pose), self.module.refinement
-        if refinement is None:
-            return posed.vertices.numpy()
-        with torch.no_grad():
-            return posed.transforms.apply(posed.canonical + refinement()).numpy()
+        return self.template.pose(pose).vertices.numpy()
 
     def outcome(self) -> TrainingOutcome | None:
         """How training ended; None before it did."""
-        return with_choice(self._outcome, self.choice)
+        return with_template(with_choice(self._outcome, self.choice), self.template)
 
     def template_seconds(self) -> float | None:
         """What learning the template took, once for all methods that stand on it; None where it was not learned."""
@@ -265,10 +270,19 @@ class AshAvatar:
     def load(self, path: Path) -> None:
         """Read the weights that `save` wrote."""
         load_module(self.module, read_safetensors(path)[0], path)
+        self.template.forget()
 
 
-def _sized(config: AshConfig, candidate: Candidate, fade: float) -> AshConfig:
-    """The configuration at a candidate's size; its search is over."""
-    sized: AshConfig = at_size(config, candidate, fade)
-    place = config.model.global_features and candidate.place
-    return replace(sized, model=replace(sized.model, global_features=place))
+def _seen(capture: Capture, training: TrainingConfig) -> Capture:
+    """The capture with as many views as the configuration trains on."""
+    return fewer_views(capture, cameras=training.camera_share, frames=training.frame_share)
+
+
+def _is_fitted(losses: Sequence[float], steps: int) -> bool:
+    """Whether a frame's fit gains nothing more, or has had its steps."""
+    if len(losses) >= steps:
+        return True
+    if len(losses) < 2 * FITTED_LOOK or len(losses) % FITTED_LOOK:
+        return False
+    before, after = sum(losses[-2 * FITTED_LOOK : -FITTED_LOOK]), sum(losses[-FITTED_LOOK:])
+    return before - after < FITTED_GAIN * before

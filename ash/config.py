@@ -28,6 +28,9 @@ class AtlasConfig:
         0.0  # novelty of a pose, in spreads, at which a static avatar has 1 - 1/e of it; 0: never; not in the paper
     )
     light: bool = False  # colour times exp(SH2 of the posed normal), 27 numbers; not in the paper
+    base: bool = False  # learned static texels with the decoders as residual; not in the paper
+    global_features: bool = True  # Phi, from the root translation, at the bottleneck of the U-Net that makes colours
+    global_mlp: str = "paper"  # Phi's layers: 32, 32, 16 wide; "released": 64, 32, 16 on the translation over 1.2
 
     @property
     def decoded_texels(self) -> int:
@@ -37,6 +40,7 @@ class AtlasConfig:
     def __post_init__(self) -> None:
         """Refuse what cannot be built."""
         one_of("norm", self.norm, ("none", "batch-as-released", "instance"))
+        one_of("global_mlp", self.global_mlp, ("paper", "released"))
         if self.shuffle < 1 or self.texels < 4 or self.texels % (self.shuffle * 2**self.levels):
             unit = f"shuffle {self.shuffle} times 2^levels {2**self.levels}"
             raise InputError(f"texels: expected a multiple of {unit}, got {self.texels}")
@@ -46,6 +50,8 @@ class AtlasConfig:
             raise InputError(f"fade: expected a finite novelty of at least 0, got {self.fade}")
         if self.fade and not (self.standardise and self.decoded_texels % 4 == 0):
             raise InputError("fade compares standardised textures: it needs standardise=True and 4 texels")
+        if self.fade and not self.base:
+            raise InputError("fade lets static texels take over: it needs base=True")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -53,24 +59,23 @@ class ModelConfig(AtlasConfig):
     """The avatar. Fields that the paper does not have say so."""
 
     motion: bool = True  # False: one static set of Gaussians, skinned only (w/o mot.)
-    offset: bool = True  # False: no learned canonical offset d (w/o disp.)
+    offset: bool = True  # False: no learned canonical offset d at all
+    motion_offset: bool = True  # False: d is the same in all frames, that of the static texels (w/o disp.)
     head: str = "unet"  # "unet": the paper's decoders; "blendshapes": local low-rank correctives, not in the paper
     rank: int = 6  # correctives per body region of the head "blendshapes"
     shared_trunk: bool = False  # one U-Net for E_geo and E_app together; not in the paper
     sh_degree: int = 3
-    global_features: bool = True  # Phi, from the root translation, at the bottleneck of E_app
-    global_mlp: str = "paper"  # Phi's layers: 32, 32, 16 wide; "released": 64, 32, 16 on the translation over 1.2
     offset_unit_m: float = 0.01  # metres per unit of a decoded offset; the release decodes metres
     quat_frame: str = "canonical"  # "canonical": rotations and SH turn with the surface; "world": as released
-    base: bool = False  # learned static texels with the decoders as residual; not in the paper
-    refine: bool = False  # images also move the template's vertices, alike in all frames; the paper's future work
+    anchor: str = "blended"  # texels follow their corners' blended transforms (Eq. 5); "surface": the posed triangle
+    refine: bool = False  # what is drawn also trains networks of Stg.1 on top of the template; the paper's future work
     dilation: float = 0.3  # px^2 added to the projected covariance
 
     def __post_init__(self) -> None:
         """Refuse what cannot be built."""
         AtlasConfig.__post_init__(self)  # `super()` does not know a class that slots made anew.
         one_of("head", self.head, ("unet", "blendshapes"))
-        one_of("global_mlp", self.global_mlp, ("paper", "released"))
+        one_of("anchor", self.anchor, ("blended", "surface"))
         one_of("quat_frame", self.quat_frame, ("canonical", "world"))
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
@@ -78,8 +83,6 @@ class ModelConfig(AtlasConfig):
             raise InputError("rank must be at least 1, dilation at least 0, offset_unit_m positive")
         if self.fade and self.head != "unet":
             raise InputError("fade compares what U-Nets see: it needs head='unet'")
-        if self.refine and not self.offset:
-            raise InputError("refine moves Gaussians by their canonical offset and needs offset=True")
         if not (self.motion or self.base):
             raise InputError("without motion the Gaussians are the static base: motion=False needs base=True")
 
@@ -96,13 +99,18 @@ class TrainingConfig:
     ssim_weight: float  # lambda_str
     learning_rate: float  # of the networks
     base_learning_rate: float = 1e-2  # of the static texels
-    background: str = "random"  # "random": a new colour every step, so that opacity is learned; "black": the paper's
+    # "random": a new colour every step, so that opacity is learned; "black": the paper's; "studio": as random, but
+    # inside the mask the camera's picture of the empty studio, for masks that are too large
+    background: str = "random"
     schedule: str = "open"  # learning rates fall once a plateau or a limit is near; "constant": never, as released
     crop: bool = True  # draw only around the subject; the release draws whole frames
     precision: str = "float32"  # of the decoders while they learn; "bfloat16": autocast
     ema: float = 0.0  # decay of an average of the weights, which is then the result; 0: none
     texture_noise: float = 0.0  # in the standardised motion-aware textures while decoders learn; not in the paper
     camera_share: float = 1.0  # of the training cameras, evenly spread
+    frame_share: float = 1.0  # of the training frames, from the first on
+    fitted_every: int = 10  # frames, of which the first is fitted alone in the paper's warm-up,
+    fitted_steps: int = 2000  # in at most so many steps: less where nothing more is gained
     seconds: float = math.inf  # of CPU time, at most
     snapshots: bool = False  # keep the weights of half a minute, of 42 s, of a minute, ... of half an hour
     checkpoint_seconds: float = 60.0
@@ -115,7 +123,7 @@ class TrainingConfig:
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
         one_of("warmup", self.warmup, ("static", "analytic", "fitted", "none"))
-        one_of("background", self.background, ("random", "black"))
+        one_of("background", self.background, ("random", "black", "studio"))
         one_of("schedule", self.schedule, ("open", "constant"))
         one_of("precision", self.precision, ("float32", "bfloat16"))
         if not 0 <= self.ema < 1:
@@ -124,10 +132,16 @@ class TrainingConfig:
             raise InputError(f"seconds: expected more than 0, got {self.seconds}")
         if not 0 <= self.texture_noise < math.inf:
             raise InputError(f"texture_noise: expected a finite standard deviation, got {self.texture_noise}")
-        if not 0 < self.camera_share <= 1:
-            raise InputError(f"camera_share: expected more than 0 and at most 1, got {self.camera_share}")
+        for name in ("camera_share", "frame_share"):
+            if not 0 < getattr(self, name) <= 1:
+                raise InputError(f"{name}: expected more than 0 and at most 1, got {getattr(self, name)}")
+        if min(self.fitted_every, self.fitted_steps) < 1:
+            raise InputError("fitted_every and fitted_steps: expected at least 1")
         if self.steps < 1 or self.views_per_step < 1 or not 0 <= self.warmup_steps <= self.steps:
             raise InputError("expected steps >= 1, views_per_step >= 1 and 0 <= warmup_steps <= steps")
+
+
+SUPERVISIONS = ("images", "scans", "surface", "vertices")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -136,7 +150,10 @@ class TemplateConfig:
 
     kind: str = "skinned"  # "skinned": rest mesh, skinned; "learned": deformed as training frames were; "exact"
     error_mm: float = 0.0  # rms of a smooth error that is planted in the exact surface
-    supervision: str = "chamfer"  # a surface per frame; "vertices": an oracle's; "images": nothing but the videos
+    error_static: float = 0.25  # share of its square that is the same in all frames; learned: 0.15 loose, 0.39 tight
+    error_lag: float = 0.5  # correlation of the rest from frame to frame; learned from images: 0.35 loose, 0.70 tight
+    supervision: str = "images"  # nothing but the videos; "scans": of a scanner; "surface", "vertices": for oracles
+    passes: int = 4  # over all training images, where they supervise
     network: str = "linear"  # a map per node of the embedded graph; "graph": the paper's graph convolutions
     skinning: str = "direct"  # "graph": the nodes' transforms, blended, as released
     nodes: int = 400  # of the embedded graph
@@ -150,7 +167,7 @@ class TemplateConfig:
     def __post_init__(self) -> None:
         """Refuse what does not exist."""
         one_of("template", self.kind, ("skinned", "learned", "exact"))
-        one_of("template supervision", self.supervision, ("chamfer", "vertices", "images"))
+        one_of("template supervision", self.supervision, SUPERVISIONS)
         one_of("template network", self.network, ("linear", "graph"))
         one_of("template skinning", self.skinning, ("direct", "graph"))
         one_of("template weights", self.weights, ("shared", "per-node"))
@@ -158,8 +175,11 @@ class TemplateConfig:
             raise InputError(f"template error_mm: expected 0 to 1000 mm, got {self.error_mm}")
         if self.error_mm > 0 and self.kind != "exact":
             raise InputError(f"template error_mm: a planted error needs the exact surface, got {self.kind!r}")
-        if min(self.nodes, self.window, self.width, self.blocks, self.steps) < 1:
-            raise InputError("template: nodes, window, width, blocks and steps must be at least 1")
+        if not (0 <= self.error_static <= 1 and -1 < self.error_lag < 1):
+            given = f"{self.error_static} and {self.error_lag}"
+            raise InputError(f"template error_static, error_lag: expected 0 to 1 and above -1 and below 1, got {given}")
+        if min(self.nodes, self.window, self.passes, self.width, self.blocks, self.steps) < 1:
+            raise InputError("template: nodes, window, passes, width, blocks and steps must be at least 1")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -1,6 +1,8 @@
 """Stg.3: from motion-aware textures to the canonical texel Gaussians' raw parameters (ASH Eq. 6 and 7)."""
 
+from collections.abc import Iterable
 from itertools import pairwise
+from typing import cast
 
 import torch
 from jaxtyping import Float, Int
@@ -65,6 +67,24 @@ class UNet(nn.Module):
         """
         if not self._takes_natively(texture):
             return self.forward_naive(texture, features)
+        return self._native(texture, features, None)[None]
+
+    def picked(
+        self, texture: Float[Tensor, "1 c h w"], features: Float[Tensor, " p"] | None, rows: "TexelRows"
+    ) -> Float[Tensor, "n o"]:
+        """Of `forward`'s result the texels' rows: nothing is shuffled or kept that will not be used."""
+        width = self.head.out_channels // rows.of_pixel
+        if self._takes_natively(texture):
+            return self._native(texture, features, ash.native.unet.Picks(rows.places, rows.lines, width))
+        # In the network's own memory order a pixel's channels are its texels', one after the other.
+        return self.forward_naive(texture, features).permute(0, 2, 3, 1).reshape(-1, width).index_select(0, rows.rows)
+
+    def _native(
+        self,
+        texture: Float[Tensor, "1 c h w"],
+        features: Float[Tensor, " p"] | None,
+        picks: ash.native.unet.Picks | None,
+    ) -> Tensor:
         height, width = texture.shape[2:]
         shape = ash.native.unet.UNetShape(
             height,
@@ -75,7 +95,7 @@ class UNet(nn.Module):
             len(self.down),
             self.bottleneck_features,
         )
-        return ash.native.unet.unet(shape, texture[0], features, self._layers(), torch.get_num_threads())[None]
+        return ash.native.unet.unet(shape, texture[0], features, self._layers(), torch.get_num_threads(), picks)
 
     def _takes_natively(self, texture: Tensor) -> bool:
         levels = len(self.down)
@@ -147,14 +167,12 @@ class Decoders(nn.Module):
 
     def __init__(self, config: ModelConfig, lattice: TexelLattice) -> None:
         super().__init__()
-        self.rows: Tensor
-        self.register_buffer("rows", _rows_of_texels(lattice, config.shuffle), persistent=False)
+        self.texels = TexelRows(lattice, config.shuffle)
         features = GLOBAL_FEATURES if config.global_features else 0
         outputs = [GEOMETRY_CHANNELS, raw_channels(config) - GEOMETRY_CHANNELS]
         if config.shared_trunk:
             outputs = [sum(outputs)]
-        phi_inputs = [0] * (len(outputs) - 1) + [features]  # E_geo does not see Phi, unless the trunk is shared.
-        self.outputs = outputs
+        phi_inputs = [0] * (len(outputs) - 1) + [features]
         self.nets = nn.ModuleList(
             UNet(
                 6 * config.window,
@@ -173,19 +191,27 @@ class Decoders(nn.Module):
         """Decode one frame."""
         x = conditions.textures[None].contiguous(memory_format=torch.channels_last)
         phi = self.phi(conditions.root_translation) if self.phi is not None else None
-        decoded = [net(x) for net in self.nets[:-1]] + [self.nets[-1](x, phi)]
-        return torch.cat([self._texels_of(part, count) for part, count in zip(decoded, self.outputs, strict=True)], 1)
-
-    def _texels_of(self, decoded: Float[Tensor, "1 c r r"], count: int) -> Float[Tensor, "n o"]:
-        """The covered texels' outputs. A pixel's channels are its `shuffle x shuffle` texels, `count` values each.
-
-        In the networks' own memory order these are rows to pick from: nothing is shuffled that will not be used.
-        """
-        return decoded.permute(0, 2, 3, 1).reshape(-1, count).index_select(0, self.rows)
+        seen_by = [None] * (len(self.nets) - 1) + [phi]  # E_geo does not see Phi, unless the trunk is shared.
+        nets = cast(Iterable[UNet], self.nets)
+        decoded = [net.picked(x, features, self.texels) for net, features in zip(nets, seen_by, strict=True)]
+        return decoded[0] if len(decoded) == 1 else torch.cat(decoded, 1)
 
 
-def _rows_of_texels(lattice: TexelLattice, shuffle: int) -> Int[Tensor, " n"]:
-    """Where the texels of the lattice lie in a texture decoded at 1/shuffle of its resolution."""
-    row, column = lattice.texels // lattice.resolution, lattice.texels % lattice.resolution
-    pixel = (row // shuffle) * (lattice.resolution // shuffle) + column // shuffle
-    return pixel * shuffle**2 + (row % shuffle) * shuffle + column % shuffle
+class TexelRows(nn.Module):
+    """Where the texels of the lattice lie in a texture decoded at 1/shuffle of its resolution.
+
+    A decoded pixel's channels are its `shuffle x shuffle` texels, equally many each: rows of a table.
+    """
+
+    def __init__(self, lattice: TexelLattice, shuffle: int) -> None:
+        super().__init__()
+        self.of_pixel = shuffle**2
+        side = lattice.resolution // shuffle
+        row, column = lattice.texels // lattice.resolution, lattice.texels % lattice.resolution
+        within = column // shuffle * shuffle**2 + row % shuffle * shuffle + column % shuffle
+        self.rows: Int[Tensor, " n"]
+        self.places: Int[Tensor, " n"]  # the same within its line of decoded pixels
+        self.lines: Int[Tensor, " l"]  # which texels belong to each of those: the lattice lists them from top to bottom
+        self.register_buffer("rows", row // shuffle * side * shuffle**2 + within, persistent=False)
+        self.register_buffer("places", within.int(), persistent=False)
+        self.register_buffer("lines", torch.searchsorted(row // shuffle, torch.arange(side + 1)), persistent=False)

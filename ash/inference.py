@@ -11,7 +11,9 @@ import warnings
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
 import torch
@@ -103,7 +105,6 @@ class _OfTensors(nn.Module):
 
 def _in_openvino(decoders: Decoders, conditions: Conditions) -> Decode:
     """The decoders compiled by OpenVINO, in the precision that it takes for this processor's best."""
-    import openvino  # Optional, and half a second that training does not need.
     from openvino.frontend import FrontEndManager
     from openvino.frontend.pytorch.ts_decoder import TorchScriptPythonDecoder
 
@@ -116,12 +117,25 @@ def _in_openvino(decoders: Decoders, conditions: Conditions) -> Decode:
     source = TorchScriptPythonDecoder(traced)
     frontend = FrontEndManager().load_by_framework("pytorch")
     options = {"INFERENCE_NUM_THREADS": torch.get_num_threads(), "PERFORMANCE_HINT": "LATENCY"}
-    compiled = openvino.Core().compile_model(frontend.convert(frontend.load(source)), "CPU", options)
+    compiled = _openvino().compile_model(frontend.convert(frontend.load(source)), "CPU", options)
 
     def decode(seen: Conditions) -> Tensor:
         return torch.from_numpy(compiled([tensor.numpy() for tensor in inputs(seen)])[0])
 
     return decode
+
+
+@cache
+def _openvino() -> Any:
+    """One core for the whole process, for good.
+
+    Where the processor has AMX each core takes a stack for signals of its own, and gives the one before back when it
+    goes: of two that go in the order in which they came, the second gives back memory that is gone, and the next
+    signal ends the process.
+    """
+    import openvino  # Optional, and half a second that training does not need.
+
+    return openvino.Core()
 
 
 def _fastest_ms(decode: Callable[[Conditions], Tensor], conditions: Conditions) -> float:

@@ -37,11 +37,13 @@ class Kept(Generic[Key, Value]):
 
 
 def size_of(value: Any) -> int:
-    """Bytes of an array, a tensor, or of all of them in a dataclass."""
+    """Bytes of an array, a tensor, or of all of them in a dataclass or a list."""
     if isinstance(value, np.ndarray):
         return value.nbytes
     if isinstance(value, Tensor):
         return value.numel() * value.element_size()
     if is_dataclass(value):
         return sum(size_of(getattr(value, field.name)) for field in fields(value))
+    if isinstance(value, list | tuple):
+        return sum(map(size_of, value))
     return 0

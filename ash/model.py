@@ -16,8 +16,8 @@ from ash.gaussians.splatting import Splatted, splat
 from ash.gaussians.texels import LIGHT_COEFFICIENTS, place, pose
 from ash.protocol import StageClock
 from ash.template.motion import normalised_motion
-from ash.template.refining import Refinement
 from ash.template.template import Template
+from ash.template_learning.refining import MotionRefinement, RefinedDeformation
 from ash.textures import Conditions, TexelLattice, TextureDrawer, build_lattice
 
 Decode = Callable[[Conditions], Tensor]  # to raw parameters [n, o]
@@ -55,15 +55,18 @@ class AshModel(nn.Module):
         self.decoders = decoders
         fades = config.fade and self.textures is not None
         self.static = nn.Parameter(initial.clone()) if fades else None  # what counts far from the training motion
-        self.refinement = Refinement(template.mesh) if config.refine else None
+        self.refinement: MotionRefinement | None = None
+        if isinstance(template.deformation, RefinedDeformation):
+            self.refinement = template.deformation.refinement
         self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.light else None
 
     def conditions(self, pose: Pose, clock: StageClock | None = None, threads: int = 1) -> Conditions:
         """Stg.1 and Stg.2: pose the template, and draw what the decoders see."""
         with _stage(clock, "stg1"):
-            posed = self.template.pose(pose)
+            learns = self.refinement is not None and torch.is_grad_enabled()
+            posed = self.template.pose_anew(pose) if learns else self.template.pose(pose)
         with _stage(clock, "stg2"):
-            canonical, normals, transforms = place(self.lattice, posed, threads=threads)
+            canonical, normals, transforms = place(self.lattice, posed, self.config.anchor, threads=threads)
             textures = self._textures(pose)
             return Conditions(
                 textures=textures,
@@ -81,20 +84,22 @@ class AshModel(nn.Module):
     def decode(self, conditions: Conditions, *, decoders: Decode | None = None) -> Float[Tensor, "n o"]:
         """Stg.3: raw Gaussian parameters per texel; by other `decoders` than the model's own where they are given.
 
-        The less the textures are trusted (`TextureDrawer.trust`), the more the static avatar counts. Not in the paper.
+        The less the textures are trusted (`TextureDrawer.trust`), the more the static avatar counts; where they are not
+        trusted at all, nothing is decoded. Not in the paper.
         """
+        if self.static is not None and conditions.trust == 0:
+            return self.static
         decoders = decoders or self.decoders
-        raw = self.base if decoders is None else self.base + decoders(conditions)
+        raw = self.base if decoders is None else self.base + self.corrections(decoders(conditions))
         if self.static is not None and conditions.trust < 1:
             raw = self.static.lerp(raw, conditions.trust)
-        return self.refined(raw)
+        return raw
 
-    def refined(self, raw: Float[Tensor, "n o"]) -> Float[Tensor, "n o"]:
-        """Raw parameters with their offsets where the images moved the template's vertices."""
-        if self.refinement is None:
-            return raw
-        moved = self.lattice.interpolate(self.refinement()) / self.config.offset_unit_m
-        return torch.cat([raw[:, :3] + moved, raw[:, 3:]], 1)
+    def corrections(self, decoded: Float[Tensor, "n o"]) -> Float[Tensor, "n o"]:
+        """What of the decoders' output counts: all of it, or all but the offsets."""
+        if self.config.motion_offset:
+            return decoded
+        return torch.cat([torch.zeros_like(decoded[:, :3]), decoded[:, 3:]], 1)
 
     def pose(self, raw: Float[Tensor, "n o"], conditions: Conditions, threads: int = 1) -> Gaussians:
         """Activate the raw parameters and carry them from canonical to posed space (Eq. 5)."""

@@ -6,12 +6,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from ash.capture.dataset import Camera, Capture, Pose
-from ash.gaussians.gaussians import Gaussians
+
+if TYPE_CHECKING:  # torch takes more than a second, and the harness needs none of it.
+    from ash.gaussians.gaussians import Gaussians
 
 # Raw parameters and texture values alike are visible from a hundredth on; dead decoders differ by nothing at all.
 NO_CORRECTION = 1e-3
@@ -111,7 +113,7 @@ class PosesGaussians(Protocol):
 
     dilation: float  # px^2 that its pictures add to both axes of every projected Gaussian
 
-    def gaussians(self, pose: Pose) -> Gaussians:
+    def gaussians(self, pose: Pose) -> "Gaussians":
         """The posed Gaussians in frame `frame` of `motion`: world, metres, colours as seen from anywhere."""
 
 
@@ -142,7 +144,10 @@ class TrainingOutcome:
     reserved_psnr: float | None = None  # at the end; None: the capture is too small to reserve views
     choice: str = ""  # of a search for what the scene needs, and the CPU seconds that it took when it was made
     search_seconds: float = 0.0
+    template: str = ""  # what the template was learned from, and what that settled on; empty where it was not learned
     correction_spread: float | None = None  # of what decoders add, between frames, rms; None: there are no decoders
+    cameras: int = 0  # that training saw; 0: unknown
+    frames: int = 0
 
     @property
     def carries_nothing(self) -> bool:

@@ -107,6 +107,7 @@ def at_size(config: Any, candidate: Candidate, fade: float) -> Any:
         config.model,
         width=max(1, config.model.width >> candidate.halvings),
         window=config.model.window if candidate.history else 1,
+        global_features=config.model.global_features and candidate.place,
         fade=fade,
     )
     training = replace(config.training, texture_noise=candidate.noise or config.training.texture_noise)

@@ -24,6 +24,7 @@ from ash.template.template import Template
 NOISE_GRID = 4
 POOL = 4  # Texels per side that are one when frames are compared: poses differ over limbs, not over texels.
 COMPARED_FRAMES = 512  # Training frames, evenly taken, that a new frame is compared with.
+LEAST_TRUST = 0.02  # Of exp(-(novelty / fade)^2): below it nothing that is decoded counts, and nothing need be decoded.
 BOUND = 3.0  # Of standardised textures: what lies farther out was hardly ever learned from, or never.
 
 
@@ -187,12 +188,16 @@ class TextureDrawer(nn.Module):
         return float((nearest / covered).sqrt())
 
     def trust(self, textures: Float[Tensor, "c r r"]) -> float:
-        """How much of what is decoded from these textures counts: 1 in training frames, fading with their novelty.
+        """How much of what is decoded from these textures counts: 1 in training frames, fading with their novelty to 0.
 
-        exp(-(novelty / fade)^2). What decoders learned from some poses is false far from them, where a static avatar
-        is better. Not in the paper.
+        t = exp(-(novelty / fade)^2), of which the least part is cut off without a step: (t - LEAST_TRUST) / (1 -
+        LEAST_TRUST), at least 0. What decoders learned from some poses is false far from them, where a static avatar is
+        better. Not in the paper.
         """
-        return math.exp(-((self.novelty(textures) / self.fade) ** 2)) if self.fade else 1.0
+        if not self.fade:
+            return 1.0
+        whole = math.exp(-((self.novelty(textures) / self.fade) ** 2))
+        return max(0.0, (whole - LEAST_TRUST) / (1 - LEAST_TRUST))
 
     def _coarse(self, textures: Float[Tensor, "c r r"]) -> Float[Tensor, " d"]:
         return nn.functional.avg_pool2d(textures[:6], POOL).flatten()

@@ -1,9 +1,9 @@
 """A DDC-style mesh avatar: the animatable template with a dynamic texture, rasterised.
 
 Habermann et al., "Real-time Deep Dynamic Characters" (SIGGRAPH 2021), as ASH describes its competitor: the same learned
-template as ASH, and a texture predicted from the motion-aware normal texture. The mesh decides which surface point a
-pixel sees; texture and light are learned through perspective-correct bilinear sampling and antialiased coverage, and
-so is a displacement of the template's vertices.
+template as ASH, and a texture predicted from the motion-aware textures and the root translation. The mesh decides which
+surface point a pixel sees; texture and light are learned through perspective-correct bilinear sampling and antialiased
+coverage, and so is where its vertices lie: one displacement for all frames, and their deformation networks.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -20,30 +20,31 @@ from torch import Tensor, nn
 import ash.native.shading
 from ash.capture.dataset import Camera, Capture, Pose, TemplateMesh
 from ash.checkpoints import contiguous_state, load_module, read_safetensors
-from ash.config import AshConfig, AtlasConfig, TemplateConfig, TrainingConfig
-from ash.decoders import UNet
+from ash.config import AshConfig, AtlasConfig, TemplateConfig, TrainingConfig, one_of
+from ash.decoders import GLOBAL_FEATURES, GlobalFeatures, UNet
 from ash.files import InputError, write_atomic
 from ash.gaussians.initialising import initial_texture
 from ash.gaussians.texels import LIGHT_COEFFICIENTS
 from ash.harmonics import sh_basis
 from ash.kept import Kept
-from ash.mesh.drawing import draw_mesh, textured, topology_of
+from ash.mesh.drawing import draw_mesh_views, textured, topology_of
 from ash.presets import Recipe, named
 from ash.protocol import Display, DressedMesh, StageClock, TrainingOutcome
+from ash.rotations import RigidTransforms
 from ash.searching import Build, Candidate, Choice, at_size, brief_training, sufficient, with_choice, write_choice
-from ash.template.refining import Refinement
 from ash.template.template import PosedTemplate, Template
-from ash.template_learning.learning import template_of
+from ash.template_learning.learning import template_of, with_template
+from ash.template_learning.refining import MotionRefinement, Refinement
 from ash.textures import TextureDrawer, build_lattice, unsettled
-from ash.training.batches import load_training_images
+from ash.training.batches import load_training_images, over
 from ash.training.loop import fit
 from baselines.display import MeshDisplay
 
 # Texture pixels per Gaussian of ASH's lattice, per side: the mesh must not be starved. At 256x256 a body's pixel is
 # 9 mm wide, twice 256 texels are 3 mm apart and more shows nothing; at full size pixels of 2.5 mm ask for four times.
 TEXTURE_FACTOR = 2
+GREY = 0.5  # Of a texture that starts from nothing.
 TEXTURE_FACTORS = {"paper": 4, "official": 4}
-VERTICES_EVERY = 4  # Steps: with a gradient in the vertices a picture takes three times as long.
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -55,13 +56,17 @@ class DdcConfig:
     search: bool
     training: TrainingConfig
     template: TemplateConfig
-    refine: bool  # let images move the vertices; an exact surface has nothing to gain
+    refine: str  # images move the vertices: "static", alike in all frames; "motion", as a frame moves, too; "none"
+    vertices_every: int = 4  # steps, of which one has a gradient in the vertices: its pictures take thrice as long
     seed: int
 
     def __post_init__(self) -> None:
         """Refuse a texture that what is decoded cannot be shuffled up to."""
         if self.texture < 1 or self.texture % self.model.decoded_texels:
             raise InputError(f"texture: expected a multiple of {self.model.decoded_texels}, got {self.texture}")
+        one_of("refine", self.refine, ("none", "static", "motion"))
+        if self.vertices_every < 1:
+            raise InputError(f"vertices_every: expected at least 1, got {self.vertices_every}")
 
     @property
     def shuffle(self) -> int:
@@ -77,13 +82,23 @@ def ddc_config(ash: AshConfig, *, seed: int, template: TemplateConfig) -> DdcCon
         search=ash.search,
         training=ash.training,
         template=template,
-        refine=template.kind != "exact" or template.error_mm > 0,
+        refine="static" if template.kind != "exact" or template.error_mm > 0 else "none",
         seed=seed,
     )
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class MeshConditions:
+    """What the networks see of a frame; nothing in it is learned with the avatar."""
+
+    textures: Float[Tensor, "c r r"]  # motion-aware textures
+    trust: float  # in 0..1: how much of what follows the motion counts
+    root_translation: Float[Tensor, " 3"]  # metres
+    window: list[RigidTransforms]  # for the vertices' networks
+
+
 class DdcModel(nn.Module):
-    """A static texture plus a residual that is predicted from the motion-aware textures."""
+    """A static texture plus a residual that is predicted from the motion-aware textures; moved vertices."""
 
     def __init__(
         self, config: DdcConfig, mesh: TemplateMesh, template: Template, textures: TextureDrawer, initial: Tensor
@@ -94,50 +109,76 @@ class DdcModel(nn.Module):
         self.uv_faces = torch.from_numpy(mesh.uv_faces)
         self.uvs = torch.from_numpy(mesh.uvs).float()
         self.topology = topology_of(template.faces)
-        self.texture = nn.Parameter(initial.clone())
+        self.texture = nn.Parameter(initial.clone(), requires_grad=config.model.base)
         # What counts far from the training motion.
         self.static_texture = nn.Parameter(initial.clone()) if config.model.fade else None
-        self.refinement = Refinement(mesh) if config.refine else None
+        self.refinement: Refinement | MotionRefinement | None = None
+        if config.refine == "motion":
+            self.refinement = MotionRefinement(config.template, mesh, template.skeleton)
+        elif config.refine == "static":
+            self.refinement = Refinement(mesh)
+        self.phi = GlobalFeatures(config.model.global_mlp) if config.model.global_features else None
         self.network = UNet(
             6 * config.model.window,
             3 * config.shuffle**2,
             width=config.model.width,
             levels=config.model.levels,
             norm=config.model.norm,
+            bottleneck_features=GLOBAL_FEATURES if config.model.global_features else 0,
         )
         self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.model.light else None
 
-    def dynamic_texture(self, conditions: Float[Tensor, "c r r"]) -> Float[Tensor, "3 t t"]:
-        """The texture of a frame; far from the training motion a static one counts (`TextureDrawer.trust`)."""
-        trust = self.textures.trust(conditions)
-        if trust == 1 and self.texture.dtype == torch.float32 and self.texture.device.type == "cpu":
-            return ash.native.shading.add_shuffled(self.texture, self._decoded(conditions), self.config.shuffle)
-        texture = self.texture + self.correction(conditions)
-        return texture if self.static_texture is None else self.static_texture.lerp(texture, trust)
+    @torch.no_grad()
+    def conditions(self, pose: Pose) -> MeshConditions:
+        """Stg.2: draw what the networks see."""
+        textures = self.textures(self.template, pose)
+        return MeshConditions(
+            textures=textures,
+            trust=self.textures.trust(textures),
+            root_translation=torch.from_numpy(pose.dofs[:3]).float(),
+            window=self.refinement.window(pose) if isinstance(self.refinement, MotionRefinement) else [],
+        )
 
-    def correction(self, conditions: Float[Tensor, "c r r"]) -> Float[Tensor, "3 t t"]:
+    def dynamic_texture(self, conditions: MeshConditions) -> Float[Tensor, "3 t t"]:
+        """The texture of a frame; far from the training motion a static one counts (`TextureDrawer.trust`)."""
+        trust = conditions.trust
+        if self.static_texture is not None and trust == 0:
+            return self.static_texture
+        texture = self.corrected_texture(conditions)
+        return texture if self.static_texture is None or trust == 1 else self.static_texture.lerp(texture, trust)
+
+    def corrected_texture(self, conditions: MeshConditions) -> Float[Tensor, "3 t t"]:
+        """The texture with what the network adds."""
+        if self.texture.dtype == torch.float32 and self.texture.device.type == "cpu":
+            return ash.native.shading.add_shuffled(self.texture, self._decoded(conditions), self.config.shuffle)
+        return self.texture + self.correction(conditions)
+
+    def correction(self, conditions: MeshConditions) -> Float[Tensor, "3 t t"]:
         """What the network adds: decoded at the resolution of the motion-aware textures and shuffled up."""
         return nn.functional.pixel_shuffle(self._decoded(conditions), self.config.shuffle)
 
-    def _decoded(self, conditions: Float[Tensor, "c r r"]) -> Float[Tensor, "o r r"]:
-        return self.network(conditions[None].contiguous(memory_format=torch.channels_last))[0]  # type: ignore[no-any-return]
+    def _decoded(self, conditions: MeshConditions) -> Float[Tensor, "o r r"]:
+        seen = conditions.textures[None].contiguous(memory_format=torch.channels_last)
+        phi = self.phi(conditions.root_translation) if self.phi is not None else None
+        return self.network(seen, phi).squeeze(0)  # type: ignore[no-any-return]
 
     def draw(
-        self, texture: Float[Tensor, "3 t t"], posed: PosedTemplate, camera: Camera, background: Tensor
-    ) -> Float[Tensor, "h w 4"]:
+        self, texture: Float[Tensor, "3 t t"], posed: PosedTemplate, cameras: list[Camera], background: Tensor
+    ) -> Float[Tensor, "c h w 4"]:
         """Rgb over `background`, and coverage. Differentiable in the texture, the light and the posed vertices.
 
         Outlines are blended while vertices learn, for the gradient's sake; what is shown counts samples.
         """
         shade = textured(texture, self.uvs, self.uv_faces, posed.normals, self.template.faces, self.light)
         learns = posed.vertices.requires_grad
-        return draw_mesh(posed.vertices, self.topology, camera, shade, background, outlines=learns)
+        return draw_mesh_views(posed.vertices, self.topology, cameras, shade, background, outlines=learns)
 
-    def refined(self, posed: PosedTemplate) -> PosedTemplate:
+    def refined(self, posed: PosedTemplate, conditions: MeshConditions) -> PosedTemplate:
         """The template with its vertices where the images moved them. The light keeps the normals that it had."""
         if self.refinement is None:
             return posed
-        canonical = posed.canonical + self.refinement()
+        seen = (conditions.window, conditions.trust) if isinstance(self.refinement, MotionRefinement) else ()
+        canonical = posed.canonical + self.refinement(*seen)
         return replace(posed, canonical=canonical, vertices=posed.transforms.apply(canonical))
 
 
@@ -153,7 +194,9 @@ class DdcAvatar:
             config = at_size(config, self.choice.candidate, self.choice.fade)
         torch.manual_seed(config.seed)
         self.config = config
-        initial = initial_texture(capture, self.template, build_lattice(capture.template, config.texture))
+        initial = torch.full((3, config.texture, config.texture), GREY)
+        if config.model.base:
+            initial = initial_texture(capture, self.template, build_lattice(capture.template, config.texture))
         textures = TextureDrawer(
             build_lattice(capture.template, config.model.decoded_texels),
             window=config.model.window,
@@ -166,8 +209,8 @@ class DdcAvatar:
         self._motion = capture.motion
         self._outcome: TrainingOutcome | None = None
         # The template is frozen: each training frame is posed once, as far as there is room.
-        self._conditions: Kept[int, Tensor] = Kept(
-            lambda frame: self.module.textures(self.template, Pose(capture.motion, frame))
+        self._conditions: Kept[int, MeshConditions] = Kept(
+            lambda frame: self.module.conditions(Pose(capture.motion, frame))
         )
         self._posed: Kept[int, PosedTemplate] = Kept(lambda frame: self.template.pose(Pose(capture.motion, frame)))
 
@@ -192,21 +235,26 @@ class DdcAvatar:
         self._outcome = fit(self, images, self.config.training, seed=self.config.seed, folder=folder)
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """The network, and the texture with the light, as ASH's decoders and base."""
+        """Networks, and what is learned directly: texture, light, a displacement of the vertices; as ASH has it."""
         training = self.config.training
         module = self.module
-        static = [p for p in (module.texture, module.static_texture, module.light) if p is not None]
-        moves = list(self.module.refinement.parameters()) if self.module.refinement is not None else []
+        nets = [*module.network.parameters(), *(module.phi.parameters() if module.phi is not None else ())]
+        static = [p for p in (module.texture, module.static_texture, module.light) if p is not None and p.requires_grad]
+        if isinstance(module.refinement, MotionRefinement):
+            nets += module.refinement.nets.networks()
+            static.append(module.refinement.shared.rough)
+        elif module.refinement is not None:
+            static.append(module.refinement.rough)
         return [
-            {"params": list(self.module.network.parameters()), "lr": training.learning_rate},
-            {"params": static + moves, "lr": training.base_learning_rate},
+            {"params": nets, "lr": training.learning_rate},
+            {"params": static, "lr": training.base_learning_rate},
         ]
 
     def draw_training_views(self, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
         """The texture of the frame, drawn into each camera; the static texture alone while the warm-up lasts."""
         texture = self._training_texture(frame, step)
-        with torch.set_grad_enabled(torch.is_grad_enabled() and step % VERTICES_EVERY == 0):
-            posed = self.module.refined(self._posed_in(frame))
+        with torch.set_grad_enabled(torch.is_grad_enabled() and step % self.config.vertices_every == 0):
+            posed = self._refined(frame)
         return self._drawn(texture, posed, cameras, background)
 
     def draw_static_views(self, frame: int, cameras: list[Camera], background: Tensor) -> Tensor | None:
@@ -215,7 +263,7 @@ class DdcAvatar:
         if static is None:
             return None
         with torch.no_grad():
-            posed = self.module.refined(self._posed_in(frame))
+            posed = self._refined(frame)
         return self._drawn(static, posed, cameras, background)
 
     @torch.no_grad()
@@ -225,31 +273,31 @@ class DdcAvatar:
             self.module.static_texture.copy_(self.module.texture)
 
     def _drawn(self, texture: Tensor, posed: PosedTemplate, cameras: list[Camera], background: Tensor) -> Tensor:
-        return torch.stack([self.module.draw(texture, posed, c, background)[..., :3] for c in cameras])
+        flat = background if background.ndim == 1 else torch.zeros(3)
+        drawn = self.module.draw(texture, posed, cameras, flat)
+        return drawn[..., :3] if background.ndim == 1 else over(drawn[..., :3], drawn[..., 3], background)
 
     def corrections(self, frame: int) -> Tensor | None:
         """What the network adds to the static texture in a training frame, `[3, t, t]`."""
-        return self.module.correction(self._conditions_of(frame))
+        return self.module.correction(self._conditions[frame])
 
-    def _posed_in(self, frame: int) -> PosedTemplate:
-        return self._posed[frame]
-
-    def _conditions_of(self, frame: int) -> Float[Tensor, "c r r"]:
-        return self._conditions[frame]
+    def _refined(self, frame: int) -> PosedTemplate:
+        return self.module.refined(self._posed[frame], self._conditions[frame])
 
     def _training_texture(self, frame: int, step: int) -> Float[Tensor, "3 t t"]:
         training = self.config.training
         if step < training.static_steps:
             return self.module.texture
-        seen = unsettled(self._conditions_of(frame), training.texture_noise, seed=self.config.seed, step=step)
-        return self.module.texture + self.module.correction(seen)  # Noise is no novelty.
+        conditions = self._conditions[frame]
+        noisy = unsettled(conditions.textures, training.texture_noise, seed=self.config.seed, step=step)
+        return self.module.corrected_texture(replace(conditions, textures=noisy))
 
     @torch.no_grad()
     def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
         """Premultiplied RGBA, float32 `[h, w, 4]`."""
         posed, texture = self.dress(pose, clock)
         with clock.stage("stg4"):
-            return self.module.draw(texture, posed, camera, torch.zeros(3)).clamp(0, 1).numpy()
+            return self.module.draw(texture, posed, [camera], torch.zeros(3))[0].clamp(0, 1).numpy()
 
     @torch.no_grad()
     def dress(self, pose: Pose, clock: StageClock) -> tuple[PosedTemplate, Float[Tensor, "3 t t"]]:
@@ -259,11 +307,11 @@ class DdcAvatar:
         without them.
         """
         with clock.stage("stg1"):
-            posed = self.module.refined(self.template.pose(pose))
+            posed = self.template.pose(pose)
         with clock.stage("stg2"):
-            conditions = self.module.textures(self.template, pose)
+            conditions = self.module.conditions(pose)
         with clock.stage("stg3"):
-            return posed, self.module.dynamic_texture(conditions).clamp(min=0)
+            return self.module.refined(posed, conditions), self.module.dynamic_texture(conditions).clamp(min=0)
 
     @torch.no_grad()
     def dressed_mesh(self, pose: Pose) -> DressedMesh:
@@ -303,11 +351,14 @@ class DdcAvatar:
 
     def template_vertices(self, pose: Pose) -> np.ndarray:
         """The posed template, `[v, 3]` metres."""
-        return self.module.refined(self.template.pose(pose)).vertices.detach().numpy()
+        posed = self.template.pose(pose)
+        if self.module.refinement is None:
+            return posed.vertices.numpy()
+        return self.module.refined(posed, self.module.conditions(pose)).vertices.detach().numpy()
 
     def outcome(self) -> TrainingOutcome | None:
         """How training ended; None before it did."""
-        return with_choice(self._outcome, self.choice)
+        return with_template(with_choice(self._outcome, self.choice), self.template)
 
     def template_seconds(self) -> float | None:
         """What learning the template took, once for all methods that stand on it; None where it was not learned."""

@@ -1,7 +1,5 @@
 """The paper's ablation w/ MLP: Gaussian parameters straight from 3D, without the texture space (ASH appendix B)."""
 
-from dataclasses import replace
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -9,18 +7,12 @@ from torch import Tensor, nn
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture
 from ash.config import AshConfig, ModelConfig
-from ash.files import InputError
 from ash.gaussians.gaussians import raw_channels
 from ash.presets import Recipe, named
 from ash.textures import Conditions
 
 LAYERS, WIDTH = 8, 256
 OCTAVES = 6
-
-# How many of ASH's training steps take as long as one of the MLP's: fastest steps of either, side by side in one
-# process on one core, on the mannequin (ci) and on `loose` at size quick. The processor multiplies matrices of bfloat16
-# (AMX); where it cannot, the MLP takes four times as long.
-ASH_STEPS_PER_STEP = {"ci": 2.6, "brief": 4.5, "cpu": 4.5}
 
 
 class MlpDecoder(nn.Module):
@@ -60,14 +52,6 @@ def _with_mlp(config: AshConfig, capture: Capture) -> AshAvatar:
     return AshAvatar(config, capture, make_decoders=lambda model, _: MlpDecoder(model, dofs=dofs))
 
 
-def _in_equal_time(preset: str) -> AshConfig:
-    config = named(preset)
-    if preset not in ASH_STEPS_PER_STEP:
-        raise InputError(f"preset: equal time is known for {', '.join(ASH_STEPS_PER_STEP)}, got {preset!r}")
-    slower, training = ASH_STEPS_PER_STEP[preset], config.training
-    fewer = replace(training, steps=round(training.steps / slower), warmup_steps=round(training.warmup_steps / slower))
-    return replace(config, training=fewer)
-
-
-mlp = Recipe(config=named, build=_with_mlp)  # In place of the 2D decoders; its limits of training as the preset says.
-mlp_time = Recipe(config=_in_equal_time, build=_with_mlp)  # As many fewer steps as each takes longer than ASH's.
+mlp_base = Recipe(config=named, build=_with_mlp)  # In place of the 2D decoders, on ASH's learned texels.
+# The paper's row: Gaussians straight from 3D, so no learned texels beneath; its limits of training as the preset says.
+mlp = mlp_base.but({"model.base": False, "model.fade": 0.0, "training.warmup": "fitted"})

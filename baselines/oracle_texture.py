@@ -35,8 +35,7 @@ class OracleTexture(DdcAvatar):
         """The texture, drawn into each camera."""
         if frame not in self._surfaces:
             self._surfaces[frame] = self.template.pose(Pose(self._motion, frame))
-        texture, posed = self.module.texture, self._surfaces[frame]
-        return torch.stack([self.module.draw(texture, posed, camera, background)[..., :3] for camera in cameras])
+        return self._drawn(self.module.texture, self._surfaces[frame], cameras, background)
 
     def corrections(self, frame: int) -> None:
         """There is nothing that could differ between frames."""
@@ -51,7 +50,7 @@ class OracleTexture(DdcAvatar):
 def _on_exact(preset: str) -> DdcConfig:
     config = named(preset)
     mesh = ddc_config(config, seed=0, template=TemplateConfig(kind="exact"))
-    model = replace(mesh.model, fade=0.0)
+    model = replace(mesh.model, fade=0.0, global_features=False)
     return replace(mesh, texture=TEXTURE_FACTOR * config.model.texels, model=model, search=False)
 
 

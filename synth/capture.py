@@ -9,16 +9,15 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from multiprocessing.connection import wait as wait_for_end
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ash.capture.dataset import Split, image_path, pixels_path, surface_path
+from ash.capture.dataset import image_path, scan_path, surface_path
 from ash.capture.formats import (
-    read_cameras,
     read_motion,
     read_skeleton,
     write_cameras,
@@ -27,11 +26,9 @@ from ash.capture.formats import (
     write_template,
 )
 from ash.capture.manifest import Manifest, hash_files, is_capture, read_manifest
-from ash.files import InputError, read_arrays, read_image, write_arrays, write_image
-from synth.camera.render import Picture, Renderer, Studio, probe
-from synth.camera.rig import held_out, make_cameras
-from synth.camera.rig import names as camera_names
-from synth.camera.shutter import shutter_poses
+from ash.files import InputError, write_arrays, write_image
+from synth.camera.render import Renderer, probe
+from synth.camera.rig import make_cameras
 from synth.cloth import surface
 from synth.cloth.checks import penetrations, stretch
 from synth.code import code_version, source_version
@@ -39,19 +36,14 @@ from synth.cost import require_space
 from synth.motion.clips import make_motion, pose_novelty
 from synth.person import texture
 from synth.person.bare import bare_template
-from synth.person.body import Body, Surface
+from synth.person.body import Body
+from synth.person.cast import subject
 from synth.person.mannequin import mannequin
 from synth.scene import Scene, stream
+from synth.shooting import render_plates, render_views
+from synth.views import WantedView, by_frame, is_scanned, splits, wanted_views
 
 Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class WantedView:
-    """One image to make."""
-
-    camera: str
-    frame: int
 
 
 def make_capture(
@@ -78,14 +70,14 @@ def make_capture(
     renderer = probe()
     if not renderer.libllvm:
         print(renderer.note, file=sys.stderr)
-    _begin(scene, folder, alone=shard[1] == 1)
+    _begin(scene, folder, renderer, alone=shard[1] == 1)
     views = wanted_views(scene)
     own = None if executor else _pool(max(1, min(workers, scene.frames)))
     try:
         describe(scene, folder, executor or own)
-        share = [view for frame in _by_frame(views)[shard[0] - 1 :: shard[1]] for view in frame]
-        missing = [view for view in share if not image_path(folder, view.camera, view.frame).is_file()]
-        tasks = _by_frame(missing)
+        share = [view for frame in by_frame(views)[shard[0] - 1 :: shard[1]] for view in frame]
+        missing = missing_views(scene, folder, share)
+        tasks = by_frame(missing)
         done = len(share) - len(missing)
         if progress:
             progress(done, len(share))
@@ -93,6 +85,9 @@ def make_capture(
             done += count
             if progress:
                 progress(done, len(share))
+        if not missing_views(scene, folder, views):
+            assert executor or own
+            (executor or own).submit(render_plates, scene, folder, renderer).result()  # type: ignore[union-attr]
     except BaseException:
         if own:  # Files are whole or absent, so nobody needs to wait for the frames that are under way.
             for process in list((own._processes or {}).values()):
@@ -101,7 +96,7 @@ def make_capture(
     finally:
         if own:
             own.shutdown(wait=True, cancel_futures=True)
-    if all(image_path(folder, view.camera, view.frame).is_file() for view in views):
+    if not missing_views(scene, folder, views):
         finish(scene, folder, renderer)
     return folder
 
@@ -135,7 +130,7 @@ def why_stale(scene: Scene, folder: Path) -> str:
     return ""
 
 
-def _begin(scene: Scene, folder: Path, *, alone: bool) -> None:
+def _begin(scene: Scene, folder: Path, renderer: Renderer, *, alone: bool) -> None:
     """Claim the folder: sweep what a killed run left half-written, and write a manifest that says unfinished.
 
     Where other shards may be at work (not `alone`), half-written files may be theirs and stay.
@@ -151,9 +146,17 @@ def _begin(scene: Scene, folder: Path, *, alone: bool) -> None:
         for path in folder.rglob(".*.*") if alone else ():
             path.unlink()
         require_space(scene, folder)
-        replace(_manifest(scene), complete=False).write(folder)
+        _require_same_renderer(folder, renderer)
+        replace(_manifest(scene), complete=False, made_with={"variant": renderer.variant}).write(folder)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror})") from error
+
+
+def _require_same_renderer(folder: Path, renderer: Renderer) -> None:
+    """A capture is drawn by one of Mitsuba's variants: their noise differs, and its manifest names one."""
+    begun = read_manifest(folder).made_with.get("variant", renderer.variant) if is_capture(folder) else renderer.variant
+    if begun != renderer.variant:
+        raise InputError(f"{folder}: was begun with {begun}, this machine has {renderer.variant}; remove the folder")
 
 
 def _manifest(scene: Scene) -> Manifest:
@@ -171,35 +174,24 @@ def _manifest(scene: Scene) -> Manifest:
     )
 
 
-def splits(scene: Scene) -> dict[str, Split]:
-    """Training views; held-out cameras on some training frames; held-out cameras on the test motion."""
-    names = camera_names(scene.rig)
-    apart = tuple(names[k] for k in held_out(scene.rig))
-    training = sum(clip.frames for clip in scene.train)
-    return {
-        "train": Split(cameras=tuple(name for name in names if name not in apart), frames=tuple(range(training))),
-        "novel_view": Split(
-            cameras=apart, frames=tuple(range(scene.novel_view_stride // 2, training, scene.novel_view_stride))
-        ),
-        "novel_pose": Split(cameras=apart, frames=tuple(range(training, scene.frames))),
-    }
+def _is_made(scene: Scene, folder: Path, view: WantedView) -> bool:
+    """Whether the image of a view is there, and the scan of its frame."""
+    scanned = not is_scanned(scene, view.frame) or scan_path(folder, view.frame).is_file()
+    return scanned and image_path(folder, view.camera, view.frame).is_file()
 
 
-def wanted_views(scene: Scene) -> list[WantedView]:
-    """Every image of the capture, frame by frame."""
-    pairs = {pair for split in splits(scene).values() for pair in split.views}
-    return [
-        WantedView(camera=camera, frame=frame) for camera, frame in sorted(pairs, key=lambda pair: (pair[1], pair[0]))
-    ]
+def missing_views(scene: Scene, folder: Path, views: list[WantedView]) -> list[WantedView]:
+    """Those whose image, or whose frame's scan, is not there yet."""
+    return [view for view in views if not _is_made(scene, folder, view)]
 
 
 def make_body(scene: Scene) -> Body:
-    """The scene's clothed body."""
+    """The scene's clothed body. A mannequin is built alike for every subject."""
     if scene.body == "mannequin":
         return mannequin(skirt=scene.outfit.skirt)
     from synth.person.dressing import anny_body
 
-    return anny_body(skirt=scene.outfit.skirt)
+    return anny_body(skirt=scene.outfit.skirt, number=scene.subject)
 
 
 def describe(scene: Scene, folder: Path, executor: Executor | None = None) -> None:
@@ -247,15 +239,9 @@ def describe(scene: Scene, folder: Path, executor: Executor | None = None) -> No
 
 def paint(scene: Scene, folder: Path) -> None:
     """Write the texture."""
-    image = texture.paint(make_body(scene), size=scene.texture, seed=stream(scene, "texture"))
+    seed, person = stream(scene, "texture"), subject(scene.subject)
+    image = texture.paint(make_body(scene), size=scene.texture, seed=seed, subject=person)
     write_image(folder / "truth" / "texture.png", image)
-
-
-def _by_frame(views: list[WantedView]) -> list[list[WantedView]]:
-    frames: dict[int, list[WantedView]] = {}
-    for view in views:
-        frames.setdefault(view.frame, []).append(view)
-    return list(frames.values())
 
 
 def _pool(workers: int) -> ProcessPoolExecutor:
@@ -290,69 +276,6 @@ def _run(
         finished, running = wait(running, return_when=FIRST_COMPLETED)
         for future in finished:
             yield future.result()
-
-
-_STUDIOS: dict[tuple[str, str], Studio] = {}  # One per process and capture: it is costly to build and never changes.
-
-
-def _studio(scene: Scene, folder: Path, renderer: Renderer) -> Studio:
-    key = (scene.identity, str(folder))
-    if key not in _STUDIOS:
-        _STUDIOS.clear()
-        arrays = read_arrays(folder / "truth" / "surface.npz", expected=("rest", "faces", "uvs", "uv_faces", "part"))
-        surface = Surface(
-            vertices=arrays["rest"],
-            faces=arrays["faces"].astype(np.int64),
-            uvs=arrays["uvs"],
-            uv_faces=arrays["uv_faces"].astype(np.int64),
-            part=arrays["part"].astype(np.int64),
-        )
-        image = read_image(folder / "truth" / "texture.png", shape=(scene.texture, scene.texture, 3))
-        _STUDIOS[key] = Studio(renderer, surface, image, scene.light, depth=scene.depth)
-    return _STUDIOS[key]
-
-
-def render_views(scene: Scene, folder: Path, renderer: Renderer, views: list[WantedView]) -> int:
-    """Render the views of one frame and write them; the image last, so that its presence means that all is there."""
-    studio = _studio(scene, folder, renderer)
-    cameras = read_cameras(folder / "cameras.json")
-    pose, during = _poses(scene, folder, views[0].frame)
-    # With an open shutter the person moves once for all cameras; else every image is written as soon as it is there.
-    for group in [[view] for view in views] if len(during) == 1 else [views]:
-        pictures = studio.shoot(
-            pose,
-            [cameras[view.camera] for view in group],
-            samples=scene.samples,
-            seeds=[stream(scene, "pixels", view.camera, view.frame) for view in group],
-            during=during,
-        )
-        for view, picture in zip(group, pictures, strict=True):
-            _write_view(folder, view, picture)
-    return len(views)
-
-
-def _poses(scene: Scene, folder: Path, frame: int) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The surface in a frame, and while the shutter is open around it."""
-    first = 0
-    for clip in scene.train + scene.test:
-        if frame < first + clip.frames:
-            break
-        first += clip.frames
-    # The curve between two frames is bent by the frames beside them.
-    wanted = range(max(first, frame - 2), min(first + clip.frames, frame + 3)) if scene.rig.shutter else [frame]
-    surfaces = [read_arrays(surface_path(folder, k), expected=("vertices",))["vertices"] for k in wanted]
-    at = frame - wanted[0]
-    return surfaces[at], shutter_poses(np.stack(surfaces), at, shutter=scene.rig.shutter)
-
-
-def _write_view(folder: Path, view: WantedView, picture: Picture) -> None:
-    write_arrays(
-        pixels_path(folder, view.camera, view.frame),
-        triangle=picture.triangle,
-        barycentric=picture.barycentric.astype(np.float16),
-        noise=picture.noise.astype(np.float16),
-    )
-    write_image(image_path(folder, view.camera, view.frame), picture.rgba)
 
 
 def finish(scene: Scene, folder: Path, renderer: Renderer) -> None:

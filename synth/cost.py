@@ -33,7 +33,7 @@ def estimate(scene: Scene) -> Estimate:
     images = train_views + novel_views + rig.held_out * (scene.frames - training)
     pixels = rig.width * rig.height
     per_image = 0.07 + 1.6e-7 * pixels * scene.samples
-    fixed = (40.0 if scene.body == "anny" else 6.0) + 0.25 * scene.frames
+    fixed = (40.0 if scene.body == "anny" else 6.0) + 0.25 * scene.frames + 0.5 * training * (scene.scanner.rms_mm > 0)
     size = int(images * pixels * 1.1 + scene.frames * 1.2e6 + 3 * scene.texture**2)
     return Estimate(images=images, core_seconds=fixed + images * per_image, bytes=size)
 

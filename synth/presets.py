@@ -128,8 +128,8 @@ SCENES: dict[str, Callable[..., Scene]] = {
 }
 
 
-def scene(name: str, *, size: str, seed: int = 0) -> Scene:
-    """The named scene at a size (`ci`, `quick`, `table`, `paper`).
+def scene(name: str, *, size: str, seed: int = 0, subject: int = 0) -> Scene:
+    """The named scene of a subject at a size (`ci`, `quick`, `table`, `paper`).
 
     Raises:
         InputError: an unknown name or size; the message lists the known ones.
@@ -138,7 +138,7 @@ def scene(name: str, *, size: str, seed: int = 0) -> Scene:
         raise InputError(f"unknown scene {name!r}, expected one of {', '.join(sorted(SCENES))}")
     if not 0 <= seed < 2**31:
         raise InputError(f"seed {seed}, expected 0 to 2^31 - 1")
-    return SCENES[name](size=size, seed=seed)
+    return replace(SCENES[name](size=size, seed=seed), subject=subject)
 
 
 def with_motion(

@@ -125,6 +125,19 @@ class Rig:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class Scanner:
+    """How well the studio reconstructs the surface of each training frame."""
+
+    rms_mm: float = 1.0  # of its error along the normal; 0: there are no scans
+    bump_share: float = 0.5  # of the error's square that is smooth over the surface; the rest is grain
+    bump_mm: float = 60.0  # points nearer than this are off alike
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.rms_mm <= 100 and 0 <= self.bump_share <= 1 and 1 <= self.bump_mm <= 10_000):
+            raise InputError(f"scanner: {self}, expected 0 to 100 mm, a share of 0 to 1, bumps of 1 to 10000 mm")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class Scene:
     """A whole scene. Equal scenes make equal captures."""
 
@@ -138,10 +151,12 @@ class Scene:
     train: tuple[Clip, ...]
     test: tuple[Clip, ...]
     novel_view_stride: int  # novel views are judged on every so many training frames
+    scanner: Scanner = Scanner()
     fps: float = 12.0
     samples: int = 48  # per pixel, in two halves
     depth: int = 2  # of light paths: 2 is direct light, 3 adds a bounce
     texture: int = 2048  # side of the texture in texels
+    subject: int = 0  # who it is: body, skin, hair, clothes and prints follow, see `synth.person.cast`
 
     def __post_init__(self) -> None:
         if self.body not in BODIES:
@@ -152,6 +167,8 @@ class Scene:
             raise InputError("a scene of more than a million frames")
         if not 2 <= self.samples <= 65536 or self.samples % 2:
             raise InputError(f"{self.samples} samples per pixel, expected an even number from 2 to 65536")
+        if not 0 <= self.subject < 2**31:
+            raise InputError(f"subject {self.subject}, expected 0 to 2^31 - 1")
 
     @property
     def frames(self) -> int:
@@ -162,6 +179,8 @@ class Scene:
     def parameters(self) -> dict[str, Any]:
         """Everything, as JSON. Where a user's files lie is no part of what a scene is; their contents are."""
         parameters = asdict(self)
+        if not self.subject:
+            del parameters["subject"]
         for clip in (*parameters["train"], *parameters["test"]):
             del clip["path"]
             if clip["take"] == asdict(Take()):
@@ -175,5 +194,6 @@ class Scene:
 
 
 def stream(scene: Scene, *purpose: str | int) -> int:
-    """Seed of a random stream: the hash of the root seed and what the stream is for. Independent of any order."""
-    return int(hash_of([scene.seed, *purpose])[:8], 16)
+    """Seed of a random stream: the hash of the root seed, the subject and what the stream is for, in any order."""
+    who = [scene.seed, "subject", scene.subject] if scene.subject else [scene.seed]
+    return int(hash_of([*who, *purpose])[:8], 16)

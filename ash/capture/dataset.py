@@ -10,6 +10,8 @@ A capture is a folder:
     body.npz             the same of the body without clothes, as a fitted body model would give it; may be absent
     motion.npz           degrees of freedom per frame, and the sequence each frame belongs to
     frames/CAM/FRAME.png RGBA, uint8 sRGB, straight alpha
+    scans/FRAME.npz      vertices [n, 3] and faces [f, 3] of what a scanner made of a training frame: noise and holes;
+                         may be absent
     truth/               what no real capture knows; only oracles and the evaluation may read it
         template.npz     vertices [t, v, 3]: where the template's vertices really are, per frame
         surface.npz      faces, uvs, uv_faces, part (label per face) of the rendered surface
@@ -155,6 +157,11 @@ class Capture:
         """SHA-256 over the manifest: two captures with equal identity hold equal bytes."""
         return sha256_of(self.folder / NAME)
 
+    def plate(self, camera: str) -> np.ndarray | None:
+        """The camera's picture of the empty studio, sRGB uint8 `[h, w, 3]`; None where the capture has none."""
+        path, known = plate_path(self.folder, camera), self.cameras[camera]
+        return read_image(path, shape=(known.height, known.width, 3)) if path.is_file() else None
+
     def image(self, camera: str, frame: int) -> np.ndarray:
         """RGBA of a view, uint8 `[h, w, 4]`, sRGB, straight alpha."""
         view = self.cameras[camera]
@@ -192,24 +199,31 @@ def require_pose(pose: Pose, skeleton: Skeleton) -> None:
         raise InputError(f"frame {frame}: expected a pose of finite numbers, got NaN or infinity")
 
 
-def fewer_cameras(capture: Capture, share: float) -> Capture:
-    """The capture with an evenly spread share (0..1] of its training cameras, at least one; other splits keep theirs.
+def fewer_views(capture: Capture, *, cameras: float = 1.0, frames: float = 1.0) -> Capture:
+    """The capture with shares (0..1] of its training cameras and frames, at least one; other splits keep theirs.
 
-    Cameras are added one by one, each the farthest from those chosen so far: a smaller share is a part of a larger.
+    Cameras are spread evenly: they are added one by one, each the farthest from those chosen so far, so that a smaller
+    share is a part of a larger. Frames are the first ones.
     """
     train = capture.splits["train"]
     positions = np.stack([capture.cameras[name].position for name in train.cameras])
     chosen = [0]
-    for _ in range(max(1, round(share * len(positions))) - 1):
+    for _ in range(max(1, round(cameras * len(positions))) - 1):
         distance = np.linalg.norm(positions[:, None] - positions[chosen], axis=-1).min(1)
         chosen.append(int(distance.argmax()))
     names = tuple(train.cameras[index] for index in sorted(chosen))
-    return replace(capture, splits=capture.splits | {"train": replace(train, cameras=names)})
+    first = train.frames[: max(1, round(frames * len(train.frames)))]
+    return replace(capture, splits=capture.splits | {"train": replace(train, cameras=names, frames=first)})
 
 
 def image_path(folder: Path, camera: str, frame: int) -> Path:
     """Where the image of a view lies."""
     return folder / "frames" / camera / f"{frame:06d}.png"
+
+
+def plate_path(folder: Path, camera: str) -> Path:
+    """Where the picture of the empty studio lies that a camera took."""
+    return folder / "plates" / f"{camera}.png"
 
 
 def pixels_path(folder: Path, camera: str, frame: int) -> Path:
@@ -223,5 +237,5 @@ def surface_path(folder: Path, frame: int) -> Path:
 
 
 def scan_path(folder: Path, frame: int) -> Path:
-    """Where the reconstructed surface of a training frame lies, in a capture that has been given to a method."""
+    """Where the scan of a training frame lies, in captures that have scans."""
     return folder / "scans" / f"{frame:06d}.npz"

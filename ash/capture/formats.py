@@ -174,24 +174,37 @@ def read_surface_truth(capture: Capture, frame: int) -> np.ndarray:
     return vertices
 
 
-def read_scan(capture: Capture, frame: int) -> tuple[np.ndarray, np.ndarray]:
-    """What a lab would reconstruct of a training frame: the surface's vertices `[s, 3]` in metres, and faces `[f, 3]`.
-
-    Without any correspondence to the template or between frames that a method could rely on. Here it is the true
-    surface.
+def read_surface_mesh_truth(capture: Capture, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """The true surface of a frame: vertices `[s, 3]` in metres and faces `[f, 3]`. For oracles only.
 
     Raises:
-        InputError: there is none of this frame; only training frames have one.
+        InputError: the capture shows no truth.
     """
-    path, shared = scan_path(capture.folder, frame), capture.folder / "scans" / "faces.npz"
-    if not path.exists():
-        path, shared = surface_path(capture.folder, frame), capture.folder / "truth" / "surface.npz"
-    if frame not in capture.splits["train"].frames or not path.exists() or not shared.exists():
+    shared = capture.folder / "truth" / "surface.npz"
+    if not shared.exists():
+        raise InputError(f"{capture.folder}: expected truth/surface.npz, found none; only oracles see the true surface")
+    return _mesh(shared, read_surface_truth(capture, frame), read_arrays(shared, expected=("faces",))["faces"])
+
+
+def read_scan(capture: Capture, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """What a scanner made of a training frame: vertices `[n, 3]` in metres, and faces `[f, 3]`.
+
+    With noise, with holes, and without any correspondence to the template or between frames.
+
+    Raises:
+        InputError: there is none of this frame; only training frames have one, in captures that have scans.
+    """
+    path = scan_path(capture.folder, frame)
+    if frame not in capture.splits["train"].frames or not path.exists():
         raise InputError(f"{capture.folder}: expected a scan of training frame {frame}, found none")
-    vertices = read_arrays(path, expected=("vertices",))["vertices"]
-    faces = _widest(read_arrays(shared, expected=("faces",))["faces"])
+    arrays = read_arrays(path, expected=("vertices", "faces"))
+    return _mesh(path, arrays["vertices"], arrays["faces"])
+
+
+def _mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    vertices, faces = _widest(vertices), _widest(faces)
     _require(path, {"vertices [s, 3]": vertices.ndim == 2 and vertices.shape[1] == 3 and len(vertices) > 0})
-    _require(shared, {"faces [f, 3] into vertices": _are_indices(faces, len(vertices))})
+    _require(path, {"faces [f, 3] into vertices": _are_indices(faces, len(vertices))})
     return vertices, faces
 
 

@@ -56,12 +56,52 @@ def draw_mesh(
     *,
     outlines: bool = False,
 ) -> Float[Tensor, "h w d"]:
-    """Colours over `background`, and coverage as the last channel (d = c + 1).
+    """`draw_mesh_views` of one camera."""
+    return draw_mesh_views(vertices, topology, [camera], shade, background, outlines=outlines)[0]
+
+
+def draw_mesh_views(
+    vertices: Float[Tensor, "v 3"],
+    topology: Topology,
+    cameras: list[Camera],
+    shade: Shade,
+    background: Float[Tensor, " c"],
+    *,
+    outlines: bool = False,
+) -> Float[Tensor, "n h w d"]:
+    """Colours over `background`, and coverage as the last channel (d = c + 1), for cameras of one size.
 
     Differentiable in whatever `shade` is, and in the vertices (world, metres). Not differentiable: which of two
     surfaces is in front. `outlines`: blend samples at outlines, which their gradient needs; without, coverage counts
     samples, as a display does.
     """
+    views = [_view_of(vertices, topology, camera) for camera in cameras]
+    # All at once: a texture's gradient is as large as the texture, however many samples it has.
+    colours = shade(torch.cat([view.seen for view in views]), torch.cat([view.weights for view in views]))
+    images = []
+    for view, own in zip(views, colours.split([len(view.seen) for view in views]), strict=True):
+        image = _resolved(own, view.covered, background, view.camera)
+        if outlines:
+            samples = torch.cat([torch.cat([own, torch.ones_like(own[:, :1])], 1), _nothing(background)])
+            image = image + _outlines(samples, view, topology)
+        images.append(image)
+    return torch.stack(images)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _MeshView:
+    """What the samples of one camera see."""
+
+    camera: Camera
+    corners: Float[Tensor, "v 3"]  # homogeneous samples
+    triangle: Int[Tensor, "h w"]  # -1: none
+    depth: Float[Tensor, "h w"]
+    covered: Int[Tensor, " n"]  # samples that see a triangle, row-major
+    seen: Int[Tensor, " n"]  # theirs
+    weights: Float[Tensor, "n 3"]  # of its corners
+
+
+def _view_of(vertices: Float[Tensor, "v 3"], topology: Topology, camera: Camera) -> _MeshView:
     width, height = camera.width * SUPERSAMPLING, camera.height * SUPERSAMPLING
     scale = torch.diag(vertices.new_tensor([SUPERSAMPLING, SUPERSAMPLING, 1.0]))
     viewmat, K = torch.from_numpy(camera.viewmat).to(vertices), scale @ torch.from_numpy(camera.K).to(vertices)
@@ -71,22 +111,45 @@ def draw_mesh(
     covered = (triangle.reshape(-1) >= 0).nonzero().squeeze(1)
     seen = triangle.reshape(-1)[covered]
     if vertices.requires_grad:
-        a, b, c = (corners.index_select(0, rows) for rows in topology.faces[seen].unbind(1))
-        weights = corner_weights(a, b, c, covered % width, covered // width)
+        weights = _weights_of(corners, topology.faces, seen, covered, width)
     else:
         weights = drawn.barycentric.reshape(-1, 3)[covered].to(vertices)
-    colours = shade(seen, weights)
-    if not outlines and _native(colours, background) and not background.requires_grad and colours.shape[1] == 3:
-        size = {"width": camera.width, "height": camera.height}
-        return ash.native.shading.resolve(colours, covered, background, **size, factor=SUPERSAMPLING)
-    samples = torch.cat([background, background.new_zeros(1)]).expand(height * width, -1)
+    return _MeshView(
+        camera=camera,
+        corners=corners,
+        triangle=triangle,
+        depth=drawn.depth,
+        covered=covered,
+        seen=seen,
+        weights=weights,
+    )
+
+
+def _resolved(
+    colours: Float[Tensor, "n c"], covered: Int[Tensor, " n"], background: Float[Tensor, " c"], camera: Camera
+) -> Float[Tensor, "h w d"]:
+    """`resolve_naive`, by native kernels where they take it."""
+    if not _native(colours, background) or background.requires_grad or colours.shape[1] != 3:
+        return resolve_naive(colours, covered, background, camera)
+    size = {"width": camera.width, "height": camera.height}
+    return ash.native.shading.resolve(colours, covered, background, **size, factor=SUPERSAMPLING)
+
+
+def resolve_naive(
+    colours: Float[Tensor, "n c"], covered: Int[Tensor, " n"], background: Float[Tensor, " c"], camera: Camera
+) -> Float[Tensor, "h w d"]:
+    """Means over each pixel's samples, of which the `covered` have colours; coverage comes last: the definition."""
+    width, height = camera.width * SUPERSAMPLING, camera.height * SUPERSAMPLING
+    samples = _nothing(background).expand(height * width, -1)
     samples = samples.index_put((covered,), torch.cat([colours, torch.ones_like(colours[:, :1])], 1))
-    if outlines:
-        samples = _blend_outlines(samples, corners, topology, triangle, drawn.depth)
     image = samples.reshape(height, width, -1)
     steps = range(SUPERSAMPLING)  # Sums of strided views are several times as fast as a mean over two axes.
     total = torch.stack([image[y::SUPERSAMPLING, x::SUPERSAMPLING] for y in steps for x in steps]).sum(0)
     return total / SUPERSAMPLING**2
+
+
+def _nothing(background: Float[Tensor, " c"]) -> Float[Tensor, "1 d"]:
+    return torch.cat([background, background.new_zeros(1)])[None]
 
 
 def _native(*tensors: Tensor | None) -> bool:
@@ -101,6 +164,20 @@ def blend(
     """Per-corner values at points within their triangles."""
     a, b, c = (values.index_select(0, rows) for rows in corners.unbind(1))
     return a * weights[:, :1] + b * weights[:, 1:2] + c * weights[:, 2:]
+
+
+def _weights_of(
+    corners: Float[Tensor, "v 3"],
+    faces: Int[Tensor, "f 3"],
+    seen: Int[Tensor, " n"],
+    covered: Int[Tensor, " n"],
+    width: int,
+) -> Float[Tensor, "n 3"]:
+    """`corner_weights` of the triangles seen at the covered samples."""
+    if _native(corners):
+        return ash.native.shading.corner_weights(corners, faces, seen, covered, width)
+    a, b, c = (corners.index_select(0, rows) for rows in faces[seen].unbind(1))
+    return corner_weights(a, b, c, covered % width, covered // width)
 
 
 def corner_weights(
@@ -120,28 +197,30 @@ def corner_weights(
     return torch.stack([volume / total for volume in volumes], 1)
 
 
-def _blend_outlines(
-    samples: Float[Tensor, "s d"],
-    corners: Float[Tensor, "v 3"],
-    topology: Topology,
-    triangle: Int[Tensor, "h w"],
-    depth: Float[Tensor, "h w"],
-) -> Float[Tensor, "s d"]:
-    """Where an outline runs between two samples, one of them takes some of the other's colour."""
+def _outlines(samples: Float[Tensor, "s d"], view: _MeshView, topology: Topology) -> Float[Tensor, "y x d"]:
+    """What an image gains where an outline runs between two samples: one of them takes some of the other's colour.
+
+    `samples`: the covered ones, then one for the whole background.
+    """
+    corners, covered = view.corners, view.covered
+    height, width = view.triangle.shape
+    row_of = torch.full((height * width,), len(covered)).index_put_((covered,), torch.arange(len(covered)))
     screen = corners[:, :2] / corners[:, 2:]
     face, edge = _outline_edges(screen.detach(), topology).nonzero(as_tuple=True)
     ends = torch.stack([topology.faces[face, edge], topology.faces[face, (edge + 1) % 3]], 1)
     third = topology.faces[face, (edge + 2) % 3]
-    shape = (triangle.shape[1], triangle.shape[0])
-    blended = samples
+    columns, pixels = width // SUPERSAMPLING, height * width // SUPERSAMPLING**2
+    gained = samples.new_zeros(pixels, samples.shape[1])
     for axis in (0, 1):  # Neighbours in a row, then in a column.
-        found = _crossings(screen, corners[:, 2].detach(), ends, third, axis, shape)
-        kept = _visible(found, triangle.reshape(-1), depth.reshape(-1))
+        found = _crossings(screen, corners[:, 2].detach(), ends, third, axis, (width, height))
+        kept = _visible(found, view.triangle.reshape(-1), view.depth.reshape(-1))
         inner, outer, share = found.inner[kept], found.outer[kept], found.reach[kept][:, None] - 0.5
         # The surface reaches beyond the middle: the sample outside takes some of its colour; or it falls short of it.
         takes = torch.where(share[:, 0] > 0, outer, inner)
-        blended = blended.index_add(0, takes, share * (samples[inner] - samples[outer]))
-    return blended
+        pixel = takes // width // SUPERSAMPLING * columns + takes % width // SUPERSAMPLING
+        taken = share * (samples[row_of[inner]] - samples[row_of[outer]])
+        gained = gained.index_add(0, pixel, taken / SUPERSAMPLING**2)
+    return gained.reshape(-1, columns, samples.shape[1])
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -80,9 +80,9 @@ inline void backward_input(const Layer& layer, const Plane& grad, const Plane& t
     convolve(product, around(grad, -1), co, to, threads, [&](int y) { return grad.at(y); });
 }
 
-// c[j][k] = the sum over pixels of a's channel j times b's channel k; a's pixels lie `a_row` and `a_pixel` floats apart, b's likewise.
+// c[j][k] = (what is there, if `add`, and) the sum over pixels of a's channel j times b's channel k; a's pixels lie `a_row` and `a_pixel` floats apart, b's likewise.
 inline void correlate(const float* a, int64_t a_row, int64_t a_pixel, int rows, const float* b, int64_t b_row, int64_t b_pixel, int columns,
-               int height, int width, float* c, int64_t c_step) {
+               int height, int width, float* c, int64_t c_step, bool add = false) {
     constexpr int MOST = 32;
     const int band = std::max(1, std::min(MOST, 256 / width));  // what is read stays in the first-level cache for all sums
     int64_t a_at[MOST], b_at[MOST];
@@ -92,7 +92,7 @@ inline void correlate(const float* a, int64_t a_row, int64_t a_pixel, int rows, 
         product.a = a + y * a_row, product.a_step = 1, product.a_inner = a_pixel;
         product.b = b + y * b_row, product.b_inner = b_pixel, product.b_block = PRODUCT_COLUMNS;
         product.a_at = a_at, product.b_at = b_at, product.segments = std::min(band, height - y), product.steps = width;
-        product.rows = rows, product.columns = columns, product.c = c, product.c_step = c_step, product.add = y > 0;
+        product.rows = rows, product.columns = columns, product.c = c, product.c_step = c_step, product.add = add || y > 0;
         kernels().multiply(product);
     }
 }

@@ -163,7 +163,7 @@ enum Fault : int64_t { FAULT_MEANS = 1, FAULT_QUATS, FAULT_ZERO_QUAT, FAULT_SCAL
 struct Kernels {
     const char* name;
     int64_t (*project)(const ProjectArgs&, int64_t first, int64_t last);  // 0, or fault + 16 * index
-    void (*project_backward)(const ProjectArgs&, int64_t first, int64_t last, double* grad_views);  // adds to [c, 12]
+    void (*project_backward)(const ProjectArgs&, int64_t first, int64_t last, double* grad_views);  // adds to [c, 12], unless null
     void (*prepare)(const float* means2d, const float* packed, int columns, int rows, Splat* splats, Rect* rects, int64_t first,
                     int64_t last);
     void (*blend)(const BlendArgs&, Tile&);

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ash.files import InputError
 
-ABI_VERSION = 6  # of ash/native/dispatch.cpp
+ABI_VERSION = 7  # of ash/native/dispatch.cpp
 LIBRARY_NAME = "libash_native" + (".dylib" if sys.platform == "darwin" else ".so")
 
 _P = c_void_p  # the address of a tensor's numbers
@@ -39,9 +39,11 @@ _SIGNATURES: dict[str, tuple[type | None, list[type]]] = {
     "ash_shade_backward": (None, [*_SHADE, _P, _P, POINTER(c_double), _P]),
     "ash_resolve": (None, [_P, _P, c_int64, c_int, c_int, c_int, _P, _P]),
     "ash_resolve_backward": (None, [_P, _P, c_int64, c_int, c_int, _P]),
+    "ash_corner_weights": (None, [*[_P] * 4, c_int64, c_int, _P]),
+    "ash_corner_weights_backward": (None, [*[_P] * 4, c_int64, c_int, c_int64, _P, _P]),
     "ash_shuffle": (None, [_P, _P, *[c_int] * 5, _P]),
-    "ash_unet": (_P, [POINTER(c_int), _P, POINTER(c_int64), _P, POINTER(_P), c_int, _P]),
-    "ash_unet_backward": (None, [_P, _P, POINTER(_P), POINTER(_P), _P, c_int]),
+    "ash_unet": (_P, [POINTER(c_int), _P, POINTER(c_int64), _P, POINTER(_P), _P, _P, c_int, c_int, _P]),
+    "ash_unet_backward": (c_int, [_P, _P, POINTER(_P), POINTER(_P), _P, _P, c_int, _P, c_int]),
     "ash_unet_release": (None, [_P]),
     "ash_skin_vertices": (None, [_P, _P, _P, c_int64, c_int, c_int, _P, _P]),
     "ash_vertex_normals": (None, [_P, _P, c_int64, c_int64, _P]),

@@ -59,9 +59,10 @@ bool set_up(const Vec3* v, const int* face, int width, int height, double near, 
             const Vec3& c = v[face[i]];
             x0 = std::min(x0, c.x / c.z), x1 = std::max(x1, c.x / c.z), y0 = std::min(y0, c.y / c.z), y1 = std::max(y1, c.y / c.z);
         }
-        // One pixel of slack on either side costs little and forgives the divisions' rounding.
-        t.left = bounded(std::floor(x0 - 0.5), width), t.right = bounded(std::ceil(x1 + 0.5), width);
-        t.top = bounded(std::floor(y0 - 0.5), height), t.bottom = bounded(std::ceil(y1 + 0.5), height);
+        // Pixels whose centres lie between the corners; the slack forgives the divisions' rounding.
+        constexpr double SLACK = 1e-3;
+        t.left = bounded(std::ceil(x0 - 0.5 - SLACK), width), t.right = bounded(std::floor(x1 - 0.5 + SLACK) + 1, width);
+        t.top = bounded(std::ceil(y0 - 0.5 - SLACK), height), t.bottom = bounded(std::floor(y1 - 0.5 + SLACK) + 1, height);
     }
     return t.left < t.right && t.top < t.bottom;
 }
@@ -118,11 +119,10 @@ int ash_rasterize(const double* vertices, const int* faces, int64_t face_count, 
     const Target target{width, near, triangle, barycentric, depth, nearest.data()};
     ash::in_parallel(threads, bands, [&](int64_t band) {
         int top = int(band) * BAND, bottom = std::min(height, top + BAND);
-        for (int64_t pixel = int64_t(top) * width; pixel < int64_t(bottom) * width; ++pixel) {
-            triangle[pixel] = -1;
-            depth[pixel] = 0;
-            for (int i = 0; i < 3; ++i) barycentric[3 * pixel + i] = 0;
-        }
+        const int64_t from = int64_t(top) * width, until = int64_t(bottom) * width;
+        std::fill(triangle + from, triangle + until, -1);
+        std::fill(depth + from, depth + until, 0.0f);
+        std::fill(barycentric + 3 * from, barycentric + 3 * until, 0.0f);
         for (int number : members[band]) draw(triangles[number], number, top, bottom, target);
     });
     return 0;

@@ -75,6 +75,37 @@ def _inputs(saved: tuple[Tensor | None, ...], surface: TexturedMesh) -> list[int
     ]
 
 
+def corner_weights(corners: Tensor, faces: Tensor, triangles: Tensor, samples: Tensor, width: int) -> Tensor:
+    """Perspective-correct weights `[n, 3]` of the corners of `triangles` `[n]` at `samples` `[n]`, `width` to a row.
+
+    Differentiable in `corners` `[v, 3]`, homogeneous pixels.
+    """
+    return _CornerWeights.apply(corners, faces, triangles, samples, width)  # type: ignore[no-any-return]
+
+
+class _CornerWeights(Function):
+    @staticmethod
+    def forward(ctx: Any, corners: Tensor, *rest: Any) -> Tensor:
+        faces, triangles, samples, width = rest
+        ctx.width = width
+        tensors = corners.contiguous(), faces.contiguous(), triangles, samples
+        ctx.save_for_backward(*tensors)
+        weights = torch.empty(len(samples), 3)
+        load().ash_corner_weights(*map(address, tensors), len(samples), width, address(weights))
+        return weights
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        corners, _, _, samples = ctx.saved_tensors
+        grad, grad_corners = grad.contiguous(), torch.empty_like(corners)
+        numbers = len(samples), ctx.width, len(corners)
+        load().ash_corner_weights_backward(
+            *map(address, ctx.saved_tensors), *numbers, address(grad), address(grad_corners)
+        )
+        return grad_corners, None, None, None, None
+
+
 def resolve(colours: Tensor, covered: Tensor, background: Tensor, *, width: int, height: int, factor: int) -> Tensor:
     """Means `[h, w, 4]` over `factor` x `factor` samples, of which the `covered` have colours; coverage comes last."""
     return _Resolve.apply(colours, covered, background, width, height, factor)  # type: ignore[no-any-return]

@@ -47,6 +47,14 @@ inline V reciprocal(V a) {
 // 2^a = mantissa * 2^floor(a); `fraction` is a - floor(a).
 inline V fraction(V a) { return {_mm512_reduce_ps(a.x, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)}; }
 inline V scale_by_floor(V mantissa, V a) { return {_mm512_scalef_ps(mantissa.x, a.x)}; }
+// Of ordinary a > 0; absolute error 2e-7 below 1.
+inline V log2_of(V a) {
+    const V m{_mm512_getmant_ps(a.x, _MM_MANT_NORM_p75_1p5, _MM_MANT_SIGN_zero)};
+    const V up = only(m < all(1.0f), all(1.0f)), exponent{_mm512_getexp_ps(a.x)};
+    const V s = (m - all(1.0f)) / (m + all(1.0f)), z = s * s;  // log(m) = 2 (s + s^3 / 3 + s^5 / 5 + ...), |s| <= 0.2
+    const V series = fma(z, fma(z, fma(z, fma(z, all(0.320598898f), all(0.412198583f)), all(0.577078016f)), all(0.961796694f)), all(2.88539008f));
+    return fma(s, series, exponent + up);
+}
 inline float sum(V a) { return _mm512_reduce_add_ps(a.x); }
 inline void transpose_4x4(__m512* r) {
     __m512d a = _mm512_castps_pd(_mm512_unpacklo_ps(r[0], r[1])), b = _mm512_castps_pd(_mm512_unpackhi_ps(r[0], r[1]));
@@ -215,6 +223,15 @@ inline void sums_of_four(const V* v, float* to) {
 
 inline V operator-(V a) { return all(0.0f) - a; }
 inline V magnitude(V a) { return max(a, -a); }
+
+#if !defined(__AVX512F__)
+inline V log2_of(V a) {
+    alignas(64) float lanes[W];
+    store(lanes, a);
+    for (float& one : lanes) one = __builtin_log2f(one);
+    return load(lanes);
+}
+#endif
 
 // 2^a for `N` vectors with a in [-126, 1), step by step for all: a polynomial of degree 5 on [0, 1), relative error 2e-7.
 template <int N> inline void exp2_of(const V* a, V* y) {

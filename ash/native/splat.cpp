@@ -67,6 +67,9 @@ int64_t tiles_in(Rect r) {
     return r.right > r.left && r.bottom > r.top ? int64_t(r.right - r.left) * (r.bottom - r.top) : 0;
 }
 
+constexpr int DIGIT = 11;  // bits of a key that a pass sorts by; two passes
+constexpr int64_t DIGITS = int64_t(1) << DIGIT;
+
 // Splats in front of the camera, nearest first, equal depths in the order given.
 int64_t order_by_depth(Drawing& d, const double* depths, int64_t first, int64_t count) {
     Ranked *from = d.ranked.reserve(count), *to = d.spare.reserve(count);
@@ -84,18 +87,20 @@ int64_t order_by_depth(Drawing& d, const double* depths, int64_t first, int64_t 
     }
     if (drawn == 0) return 0;
     int shift = 0;
-    while (((highest - lowest) >> shift) > 0xffffffffu) ++shift;
-    for (int64_t i = 0; i < drawn; ++i) from[i].key = uint32_t((bits(depths[from[i].splat - first]) - lowest) >> shift);
-    for (int pass = 0; pass < 3; ++pass) {
-        uint32_t starts[2048] = {};
-        for (int64_t i = 0; i < drawn; ++i) ++starts[(from[i].key >> (11 * pass)) & 2047];
-        uint32_t total = 0;
-        for (uint32_t& start : starts) {
-            uint32_t here = start;
-            start = total;
+    while (((highest - lowest) >> shift) >> (2 * DIGIT)) ++shift;
+    std::vector<uint32_t> starts(size_t(2) << DIGIT, 0);
+    for (int64_t i = 0; i < drawn; ++i) {
+        const uint32_t key = from[i].key = uint32_t((bits(depths[from[i].splat - first]) - lowest) >> shift);
+        ++starts[key & (DIGITS - 1)], ++starts[DIGITS + (key >> DIGIT)];
+    }
+    for (int pass = 0; pass < 2; ++pass) {
+        uint32_t total = 0, *start = starts.data() + pass * DIGITS;
+        for (int64_t digit = 0; digit < DIGITS; ++digit) {
+            const uint32_t here = start[digit];
+            start[digit] = total;
             total += here;
         }
-        for (int64_t i = 0; i < drawn; ++i) to[starts[(from[i].key >> (11 * pass)) & 2047]++] = from[i];
+        for (int64_t i = 0; i < drawn; ++i) to[start[(from[i].key >> (DIGIT * pass)) & (DIGITS - 1)]++] = from[i];
         std::swap(from, to);
     }
     // Equal keys need not be equal depths. Runs of them are short, or equal throughout.
@@ -176,7 +181,8 @@ int64_t ash_project(const float* means, const float* quats, const float* scales,
     return fault == INT64_MAX ? 0 : fault.load();
 }
 
-// grad_views: [c, 12], the rotation row by row, then the translation. Returns 0, or 1 if memory is short.
+// grad_views: [c, 12], the rotation row by row, then the translation, or null where it is not wanted. Returns 0, or 1 if memory is
+// short.
 int ash_project_backward(const float* means, const float* quats, const float* scales, const float* opacities, const float* sh,
                          const float* viewmats, const float* Ks, int64_t count, int cameras, int coefficients, int width,
                          int height, int compensate, float dilation, float near, int threads, const float* packed,
@@ -190,12 +196,12 @@ int ash_project_backward(const float* means, const float* quats, const float* sc
     args.grad_means = grad_means, args.grad_quats = grad_quats, args.grad_scales = grad_scales;
     args.grad_opacities = grad_opacities, args.grad_sh = grad_sh;
     Stopwatch watch(STAGE_PROJECT_BACKWARD);
-    std::vector<double> partial(size_t(ranges(count)) * cameras * 12, 0.0);
+    std::vector<double> partial(grad_views ? size_t(ranges(count)) * cameras * 12 : 0, 0.0);
     in_parallel(threads, ranges(count), [&](int64_t range) {
         kernels().project_backward(args, range * RANGE, std::min(count, (range + 1) * RANGE),
-                                   partial.data() + range * cameras * 12);
+                                   grad_views ? partial.data() + range * cameras * 12 : nullptr);
     });
-    for (int i = 0; i < cameras * 12; ++i) {
+    for (int i = 0; grad_views && i < cameras * 12; ++i) {
         grad_views[i] = 0;
         for (int64_t range = 0; range < ranges(count); ++range) grad_views[i] += partial[range * cameras * 12 + i];
     }

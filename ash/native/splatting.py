@@ -69,12 +69,14 @@ class _Project(Function):
         grads = [torch.empty_like(array) for array in arrays[:5]]
         cameras = len(arrays[5])
         inputs = (packed, grad_means2d.contiguous(), grad_packed.contiguous())
-        flat = torch.empty(cameras, 12, dtype=torch.float64)
+        flat = torch.empty(cameras, 12, dtype=torch.float64) if ctx.needs_input_grad[6] else None
         check_memory(
             load().ash_project_backward(
                 *map(address, arrays), *ctx.sizes, *map(address, inputs), *map(address, grads), address(flat)
             )
         )
+        if flat is None:
+            return None, *grads, None, None
         views = torch.zeros_like(arrays[5])
         views[:, :3, :3] = flat[:, :9].reshape(-1, 3, 3)
         views[:, :3, 3] = flat[:, 9:]

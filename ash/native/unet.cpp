@@ -120,15 +120,58 @@ Layers layers_of(const Shape& shape, const float* const* weights, float* const* 
     return layers;
 }
 
+// Which parts of the output are wanted: of its lines y the parts picks[lines[y]] ... picks[lines[y + 1] - 1], of `part` floats each,
+// written one after the other. All of it where there are none.
+struct Picks {
+    const int* picks;
+    const int64_t* lines;
+    int part;
+    void take(int y, const float* line, float* to) const {
+        for (int64_t i = lines[y]; i < lines[y + 1]; ++i) std::memcpy(to + i * part, line + int64_t(picks[i]) * part, part * sizeof(float));
+    }
+    void spread(int y, const float* from, float* line) const {
+        for (int64_t i = lines[y]; i < lines[y + 1]; ++i) std::memcpy(line + int64_t(picks[i]) * part, from + i * part, part * sizeof(float));
+    }
+};
+
+// The head's gradients, and that of its input. Picked parts are put into a few lines at a time, between zeros.
+void backward_head(const Network& n, const Layer& head, const Plane& last, const float* grad, const Picks& picked, int threads) {
+    const int outputs = n.shape.outputs, height = n.shape.height, width = n.shape.width;
+    const int64_t line = int64_t(width) * outputs;
+    const int lines = picked.picks ? std::max(1, std::min(height, 256 / width)) : height;  // as many as `correlate` takes at once
+    std::vector<float> spread(picked.picks ? lines * line : 0), sums(outputs);
+    const Plane& to = n.levels[0].grad;
+    kernels().pack({head.weights, last.channels, 1, outputs, 1, 0, last.channels, n.packed});
+    std::fill(head.grad_bias, head.grad_bias + outputs, 0.0f);
+    for (int y = 0; y < height; y += lines) {
+        const int count = std::min(lines, height - y);
+        const float* here = grad + y * line;
+        if (picked.picks) {
+            std::fill(spread.begin(), spread.end(), 0.0f);
+            for (int i = 0; i < count; ++i) picked.spread(y + i, grad, spread.data() + i * line);
+            here = spread.data();
+        }
+        correlate(here, line, outputs, outputs, last.at(y), last.row(), last.step, last.channels, count, width, head.grad_weights,
+                  last.channels, y > 0);
+        sum_pixels(here, line, outputs, count, width, outputs, sums.data());
+        for (int c = 0; c < outputs; ++c) head.grad_bias[c] += sums[c];
+        Product product{};
+        product.a_step = outputs, product.b = n.packed, product.c_step = to.step;
+        product.active = last.at(y), product.active_step = last.step;
+        const Plane part_of_it{to.at(y), count, width, to.channels, to.step};
+        convolve(product, {1, {0}}, outputs, part_of_it, threads, [&](int i) { return here + i * line; });
+    }
+}
+
 }  // namespace
 
 extern "C" {
 
 // shape: height, width, inputs, outputs, channels of the first level, levels, features at the bottleneck. texture: [inputs, h, w] with
-// the given strides. weights: of every layer, in the order of `Layers`, weights and bias. out: [h, w, outputs]. Returns what
-// ash_unet_backward needs, or null if memory is short.
+// the given strides. weights: of every layer, in the order of `Layers`, weights and bias. out: [h, w, outputs], or, where `picks` are
+// given, only the picked of its parts. Returns what ash_unet_backward needs, or null if memory is short.
 void* ash_unet(const int* numbers, const float* texture, const int64_t* strides, const float* features, const float* const* weights,
-               int threads, float* out) try {
+               const int* picks, const int64_t* lines, int part, int threads, float* out) try {
     Shape shape;
     std::memcpy(&shape, numbers, sizeof shape);
     auto network = take_network(shape);
@@ -158,37 +201,34 @@ void* ash_unet(const int* numbers, const float* texture, const int64_t* strides,
     const Plane& last = bottom ? n.levels[0].merged : n.levels[0].joined;
     const int64_t zero[1] = {0};
     kernels().pack({layers.head().weights, shape.outputs, 1, last.channels, last.channels, 0, 1, n.packed});
+    const Picks picked{picks, lines, part};
     in_bands(threads, shape.height, [&](int y) {
         Product product{};
         product.a = last.at(y), product.a_step = last.step, product.a_inner = 1;
         product.b = n.packed, product.b_inner = PRODUCT_COLUMNS, product.b_block = int64_t(last.channels) * PRODUCT_COLUMNS;
         product.a_at = product.b_at = zero, product.segments = 1, product.steps = last.channels;
         product.rows = shape.width, product.columns = shape.outputs, product.start = layers.head().bias;
-        product.c = out + int64_t(y) * shape.width * shape.outputs, product.c_step = shape.outputs;
+        std::vector<float> line(picks ? shape.width * shape.outputs : 0);
+        product.c = picks ? line.data() : out + int64_t(y) * shape.width * shape.outputs, product.c_step = shape.outputs;
         kernels().multiply(product);
+        if (picks) picked.take(y, line.data(), out);
     });
     return network.release();
 } catch (const std::bad_alloc&) {
     return nullptr;
 }
 
-// grad: [h, w, outputs]. Writes every layer's gradients, and the features' where there are any.
-void ash_unet_backward(void* handle, const float* grad, const float* const* weights, float* const* grads, float* grad_features, int threads) {
+// grad: of what ash_unet wrote. Writes every layer's gradients, and the features' where there are any. Returns 0, or 1 if memory is
+// short.
+int ash_unet_backward(void* handle, const float* grad, const float* const* weights, float* const* grads, const int* picks,
+                      const int64_t* lines, int part, float* grad_features, int threads) try {
     Network& n = *static_cast<Network*>(handle);
     const Shape& shape = n.shape;
     const Layers layers = layers_of(shape, weights, grads);
-    const int bottom = shape.levels, outputs = shape.outputs;
+    const int bottom = shape.levels;
     const Layer& head = layers.head();
     const Plane& last = bottom ? n.levels[0].merged : n.levels[0].joined;
-    const int64_t line = int64_t(shape.width) * outputs;
-    correlate(grad, line, outputs, outputs, last.first, last.row(), last.step, last.channels, shape.height, shape.width, head.grad_weights,
-              last.channels);
-    sum_pixels(grad, line, outputs, shape.height, shape.width, outputs, head.grad_bias);
-    kernels().pack({head.weights, last.channels, 1, outputs, 1, 0, last.channels, n.packed});
-    Product product{};
-    product.a_step = outputs, product.b = n.packed, product.c_step = n.levels[0].grad.step;
-    product.active = last.first, product.active_step = last.step;
-    convolve(product, {1, {0}}, outputs, n.levels[0].grad, threads, [&](int y) { return grad + y * line; });
+    backward_head(n, head, last, grad, {picks, lines, part}, threads);
     for (int l = 0; l < bottom; ++l) {
         Level &at = n.levels[l], &below = n.levels[l + 1];
         backward_block(layers.merge(l), at, at.joined, at.merged_middle, &at.grad_joined, n.packed, threads);
@@ -211,6 +251,9 @@ void ash_unet_backward(void* handle, const float* grad, const float* const* weig
                       threads);
     }
     backward_block(layers.down(0), n.levels[0], n.input, n.levels[0].middle, nullptr, n.packed, threads);
+    return 0;
+} catch (const std::bad_alloc&) {
+    return 1;
 }
 
 void ash_unet_release(void* handle) {

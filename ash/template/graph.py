@@ -45,11 +45,8 @@ def build_graph(mesh: TemplateMesh, *, nodes: int) -> EmbeddedGraph:
     count = len(mesh.vertices)
     if not LINKS < nodes <= count:
         raise InputError(f"embedded graph: expected {LINKS + 1} to {count} nodes, got {nodes}")
-    import trimesh  # Half a second, which most processes can spare.
-
-    coarse = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).simplify_quadric_decimation(face_count=2 * nodes)
-    chosen = np.unique(cKDTree(mesh.vertices).query(coarse.vertices)[1])
-    edges = _edge_lengths(mesh.vertices, mesh.faces)
+    chosen = _spread_over(mesh, nodes) if 2 * nodes < len(mesh.faces) else np.arange(count)
+    edges = edge_lengths(mesh.vertices, mesh.faces)
     distance = dijkstra(edges, directed=False, indices=chosen)  # [g, v]
     distance = np.where(np.isinf(distance), 1e3 + _spatial(mesh.vertices, chosen), distance)
     nearest = np.argsort(distance, axis=0, kind="stable")[: LINKS + 1].T
@@ -66,7 +63,17 @@ def build_graph(mesh: TemplateMesh, *, nodes: int) -> EmbeddedGraph:
     )
 
 
-def _edge_lengths(vertices: np.ndarray, faces: np.ndarray) -> scipy.sparse.csr_matrix:
+def _spread_over(mesh: TemplateMesh, nodes: int) -> np.ndarray:
+    """The vertices nearest to those of the mesh decimated to about so many."""
+    import trimesh  # Half a second, which most processes can spare.
+
+    whole = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    coarse = whole.simplify_quadric_decimation(face_count=2 * nodes)
+    return np.unique(cKDTree(mesh.vertices).query(coarse.vertices)[1])
+
+
+def edge_lengths(vertices: np.ndarray, faces: np.ndarray) -> scipy.sparse.csr_matrix:
+    """Lengths of a mesh's edges, `[v, v]` metres; no entry where there is no edge."""
     pairs = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1), axis=0)
     lengths = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
     upper = scipy.sparse.coo_matrix((np.maximum(lengths, 1e-9), pairs.T), shape=(len(vertices),) * 2)
@@ -123,7 +130,7 @@ def _to_torch(matrix: scipy.sparse.csr_matrix) -> Tensor:
 
 def vertex_neighbours(mesh: TemplateMesh) -> NeighbourMean:
     """Mean over the vertices that share an edge."""
-    return _mean_over_neighbours(_edge_lengths(mesh.vertices, mesh.faces))
+    return _mean_over_neighbours(edge_lengths(mesh.vertices, mesh.faces))
 
 
 def _mean_over_neighbours(edges: scipy.sparse.csr_matrix) -> NeighbourMean:

@@ -1,5 +1,6 @@
 """Stg.1: the animatable template. Motion in, deformed and posed template mesh out (ASH Sec. 3.2, appendix A)."""
 
+import copy
 from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -65,37 +66,54 @@ class KnownDeformation:
         return transforms.apply_inverse(self.posed[pose.frame])
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PlantedError:
+    """A template error of known size and kind. `ash.template_learning.errors` measures the same of a real one."""
+
+    rms_mm: float  # in every frame, over the vertices
+    static: float  # share of its square that is the same in all frames
+    lag: float  # correlation of the rest from a frame to the next of its sequence
+
+
 class PerturbedDeformation:
     """A deformation with a planted error whose size is exactly known, to chart quality against template error.
 
-    The error is smooth over the surface, and half of its mean square is the same in all frames; the other half is
-    drawn anew for every frame, as the part of a learned template's error that no pose explains. In every frame its
-    root mean square over the vertices is `error_mm`, before and after posing, for posing is rigid per vertex.
+    The error is smooth over the surface. Part of its mean square is the same in all frames; the rest is a process in
+    time whose correlation falls by the same factor with every frame (AR(1)), drawn anew for every sequence. In every
+    frame its root mean square over the vertices is the stated one, before and after posing, for posing is rigid per
+    vertex. It is a function of the seed, the sequence and the frame, in whatever order frames are asked for.
     """
 
-    LENGTH_M = 0.1  # Points nearer than this move alike.
-    WAVES = 64
+    LENGTH_M = 0.05  # Points nearer than this move alike; of learned templates 0.07 on loose clothes, less on tight.
+    WAVES = 192
+    FORGOTTEN = 1e-3  # What a frame has of one so long ago does not count.
 
-    def __init__(self, inner: Deformation, mesh: TemplateMesh, *, error_mm: float, seed: int) -> None:
-        self.inner, self.seed, self.amplitude = inner, seed, 1e-3 * error_mm
-        self.rest = mesh.vertices
-        self.static = _of_unit_rms(self._smooth_field(np.random.default_rng([seed, 0])))
+    def __init__(self, inner: Deformation, mesh: TemplateMesh, planted: PlantedError, *, seed: int) -> None:
+        self.inner, self.planted, self.seed = inner, planted, seed
+        rng = np.random.default_rng([seed, 0])
+        # A Gaussian random field over space, by random Fourier features (Rahimi and Recht 2007).
+        waves = rng.standard_normal((3, self.WAVES)) / self.LENGTH_M
+        self.features = np.cos(mesh.vertices @ waves + rng.uniform(0, 2 * np.pi, self.WAVES))
+        self.static = _of_unit_rms(self.features @ rng.standard_normal((self.WAVES, 3)))
+        lag = abs(planted.lag)
+        self.memory = 1 + (int(np.ceil(np.log(self.FORGOTTEN) / np.log(lag))) if lag > self.FORGOTTEN else 0)
 
     def canonical(self, pose: Pose, transforms: RigidTransforms) -> Float[Tensor, "v 3"]:
         """The inner deformation's vertices, off by the planted error."""
-        return self.inner.canonical(pose, transforms) + torch.from_numpy(self.error(pose.frame)).float()
+        error = self.error(pose.frame, int(pose.motion.sequence[pose.frame]))
+        return self.inner.canonical(pose, transforms) + torch.from_numpy(error).float()
 
-    def error(self, frame: int) -> Float[np.ndarray, "v 3"]:
+    def error(self, frame: int, sequence: int = 0) -> Float[np.ndarray, "v 3"]:
         """The error of a frame, metres, canonical. The two parts are orthogonal, so that their squares add up."""
-        own = self._smooth_field(np.random.default_rng([self.seed, 1, frame]))
+        own = self.features @ sum(
+            self.planted.lag**ago * self._draw(sequence, frame + self.memory - ago) for ago in range(self.memory)
+        )
         own -= self.static * (own * self.static).sum() / (self.static**2).sum()
-        return self.amplitude * np.sqrt(0.5) * (self.static + _of_unit_rms(own))
+        static, rest = np.sqrt([self.planted.static, 1 - self.planted.static])
+        return 1e-3 * self.planted.rms_mm * (static * self.static + rest * _of_unit_rms(own))
 
-    def _smooth_field(self, rng: np.random.Generator) -> Float[np.ndarray, "v 3"]:
-        """A Gaussian random field over space, by random Fourier features (Rahimi and Recht 2007)."""
-        waves = rng.standard_normal((3, self.WAVES)) / self.LENGTH_M
-        phases = rng.uniform(0, 2 * np.pi, self.WAVES)
-        return np.cos(self.rest @ waves + phases) @ rng.standard_normal((self.WAVES, 3))
+    def _draw(self, sequence: int, number: int) -> Float[np.ndarray, "w 3"]:
+        return np.random.default_rng([self.seed, 1, sequence, number]).standard_normal((self.WAVES, 3))
 
 
 def _of_unit_rms(field: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
@@ -142,13 +160,24 @@ class Template:
         window = pose.window(5)
         key = (pose.motion.dofs[window].tobytes(), np.int64(pose.frame).tobytes())
         if key not in self._kept:
-            self._kept[key] = self._pose(pose)
+            with torch.no_grad():
+                self._kept[key] = self.pose_anew(pose)
             if len(self._kept) > self.KEPT_FRAMES:
                 self._kept.popitem(last=False)
         return self._kept[key]
 
-    @torch.no_grad()
-    def _pose(self, pose: Pose) -> PosedTemplate:
+    def forget(self) -> None:
+        """Keep nothing of what was posed: the deformation has changed."""
+        self._kept.clear()
+
+    def deformed_by(self, deformation: Deformation) -> "Template":
+        """The same mesh and skinning with another deformation."""
+        other = copy.copy(self)
+        other.deformation, other._kept = deformation, OrderedDict()
+        return other
+
+    def pose_anew(self, pose: Pose) -> PosedTemplate:
+        """The template in one frame, differentiable in what its deformation learns."""
         dofs = torch.from_numpy(pose.dofs)
         joints = forward_kinematics(self.skeleton, dofs)
         joints = RigidTransforms(quats=joints.quats.float(), translations=joints.translations.float())
@@ -184,12 +213,12 @@ def skinned_template(capture: Capture) -> Template:
 
 
 def exact_template(
-    capture: Capture, posed: Float[np.ndarray, "t v 3"], *, error_mm: float = 0.0, seed: int = 0
+    capture: Capture, posed: Float[np.ndarray, "t v 3"], *, planted: PlantedError | None = None, seed: int = 0
 ) -> Template:
-    """The oracle's template: `posed` vertices are exact in every frame of the capture's motion, or off by a planted
-    error of exactly `error_mm` (rms), which is a function of the seed and the frame."""
+    """The oracle's template: `posed` vertices are exact in every frame of the capture's motion, or off by a `planted`
+    error, which is a function of the seed and the frame."""
     known = KnownDeformation(capture.motion, posed)
-    if error_mm == 0:
+    if planted is None or planted.rms_mm == 0:
         return Template(capture.template, capture.skeleton, known)
-    off = PerturbedDeformation(known, capture.template, error_mm=error_mm, seed=seed)
+    off = PerturbedDeformation(known, capture.template, planted, seed=seed)
     return Template(capture.template, capture.skeleton, off)

@@ -88,7 +88,7 @@ class GraphDeformation(nn.Module):
         super().__init__()
         self.config, self.skeleton = config, skeleton
         self.rest = torch.from_numpy(mesh.vertices).float()
-        self.graph: EmbeddedGraph = build_graph(mesh, nodes=config.nodes)
+        self.graph: EmbeddedGraph = build_graph(mesh, nodes=min(config.nodes, len(mesh.vertices)))
         self.skin: SkinWeights = sparse_skin_weights(torch.from_numpy(mesh.skin_weights).float())
         vertices, nodes = len(mesh.vertices), len(self.graph.nodes)
         self.graph_net = GraphNet(7 * config.window + 3, 6, config, nodes=nodes)

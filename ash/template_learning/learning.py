@@ -1,7 +1,7 @@
 """Which template a method stands on. A learned one is made once per capture, configuration and seed, and kept."""
 
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import safetensors.torch
@@ -12,23 +12,33 @@ from ash.capture.formats import read_template_truth
 from ash.checkpoints import load_module, read_safetensors
 from ash.config import TemplateConfig
 from ash.files import InputError, hash_of, hash_sources, only_one, write_atomic
+from ash.protocol import TrainingOutcome
 from ash.template.graph import EmbeddedGraph
-from ash.template.template import Deformation, Learned, RestDeformation, Template, exact_template, skinned_template
+from ash.template.template import (
+    Deformation,
+    Learned,
+    PlantedError,
+    RestDeformation,
+    Template,
+    exact_template,
+    skinned_template,
+)
 from ash.template_learning.deforming import LinearDeformation
 from ash.template_learning.graph_nets import GraphDeformation
 from ash.template_learning.image_tracking import track_images
 from ash.template_learning.regressing import fit_graph, fit_linear
-from ash.template_learning.tracking import Tracked, track_chamfer, track_vertices
+from ash.template_learning.tracking import Tracked, track_scans, track_surface, track_vertices
 
 Deformer = LinearDeformation | GraphDeformation
 
 
 def template_of(config: TemplateConfig, capture: Capture, *, seed: int) -> Template:
-    """The template that a configuration names; "exact", and supervision "vertices", read the truth: for oracles."""
+    """The template that a configuration names; "exact", and supervision "surface" and "vertices", are for oracles."""
     if config.kind == "skinned":
         return skinned_template(capture)
     if config.kind == "exact":
-        return exact_template(capture, read_template_truth(capture), error_mm=config.error_mm, seed=seed)
+        planted = PlantedError(rms_mm=config.error_mm, static=config.error_static, lag=config.error_lag)
+        return exact_template(capture, read_template_truth(capture), planted=planted, seed=seed)
     return learned_template(config, capture, seed=seed)
 
 
@@ -58,11 +68,18 @@ def learned_template(config: TemplateConfig, capture: Capture, *, seed: int) -> 
     return template
 
 
+def with_template(outcome: TrainingOutcome | None, template: Template) -> TrainingOutcome | None:
+    """The outcome of a training on this template, which tells what the template was learned from."""
+    if outcome is None or template.learned is None:
+        return outcome
+    return replace(outcome, template=template.learned.found)
+
+
 def template_key(config: TemplateConfig, capture: Capture, *, seed: int) -> str:
     """Hash of everything that decides a learned template, sources included."""
     train = capture.splits["train"]
     views = {"frames": train.frames, "cameras": train.cameras if config.supervision == "images" else ()}
-    drawn = seed if config.network == "graph" or config.supervision == "images" else 0  # Else nothing is random.
+    drawn = seed if config.network == "graph" else 0  # Else nothing is random.
     decisive = {
         "capture": capture.identity,
         "config": asdict(config),
@@ -80,20 +97,22 @@ def _around(deformation: Deformation, graph: EmbeddedGraph, config: TemplateConf
 def _learn(deformation: Deformer, config: TemplateConfig, capture: Capture, seed: int) -> dict[str, str]:
     start = time.perf_counter()
     at_rest = _around(RestDeformation(capture.template), deformation.graph, config, capture)
-    tracked = _track(config, capture, at_rest, deformation.graph, seed)
+    tracked = _track(config, capture, at_rest, deformation.graph)
     if isinstance(deformation, LinearDeformation):
         choice = fit_linear(deformation, capture.motion, tracked)
         found = f"static displacement {'kept' if choice.static else 'refused'}, ridge {choice.ridge:g}"
     else:
         step = fit_graph(deformation, capture.motion, tracked, steps=config.steps, seed=seed)
         found = f"step {step} of {config.steps}"
-    return {"seconds": repr(time.perf_counter() - start), "found": found}
+    return {"seconds": repr(time.perf_counter() - start), "found": f"learned from {config.supervision}: {found}"}
 
 
-def _track(config: TemplateConfig, capture: Capture, at_rest: Template, graph: EmbeddedGraph, seed: int) -> Tracked:
+def _track(config: TemplateConfig, capture: Capture, at_rest: Template, graph: EmbeddedGraph) -> Tracked:
     if config.supervision == "images":
-        return track_images(capture, at_rest, graph, seed=seed)
-    return (track_vertices if config.supervision == "vertices" else track_chamfer)(capture, at_rest)
+        return track_images(capture, at_rest, graph, passes=config.passes)
+    return {"scans": track_scans, "surface": track_surface, "vertices": track_vertices}[config.supervision](
+        capture, at_rest
+    )
 
 
 def _state(deformation: Deformer) -> dict[str, torch.Tensor]:

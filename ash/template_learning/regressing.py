@@ -6,7 +6,7 @@ near it, explains nearly as much and is better than skinning there; how much of 
 sequences that were left out.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ash.capture.dataset import Motion, Pose
+from ash.rotations import RigidTransforms
 from ash.template.graph import EmbeddedGraph
 from ash.template_learning.deforming import LinearDeformation
 from ash.template_learning.graph_nets import GraphDeformation
@@ -27,6 +28,9 @@ FOLDS = 4
 BLEND_RIDGE = 1e-4  # Nodes without vertices of their own stay at zero.
 ROUGHNESS = 0.1  # Weight of the Laplacian of the deformation, against the squared distance.
 LOOK_EVERY = 20  # Steps between two looks at the frames held out.
+
+
+Window = list[RigidTransforms]  # of the vertices, newest frame first
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -117,26 +121,39 @@ def _mean_square(error: Tensor) -> float:
 
 
 def fit_graph(deformation: GraphDeformation, motion: Motion, tracked: Tracked, *, steps: int, seed: int) -> int:
-    """Train the graph networks on the tracked frames, in place; returns the step that was kept.
+    """Train the graph networks on the tracked frames, in place; returns for how many steps.
 
-    The static displacement comes first. One fold of the training frames is held out, and the weights that were best
-    there are kept: those of step 0, which deform nothing, where no training helps.
+    One fold of the training frames is held out, and the step is found at which they fit it best: step 0, which deforms
+    nothing, where no training helps. Then the networks learn as many steps on all frames, from the same start.
     """
     folds = held_out_folds(motion.sequence[list(tracked.frames)])
     held = folds[seed % len(folds)] if folds else torch.zeros(len(tracked.frames), dtype=torch.bool)
     windows = [deformation.window_transforms(Pose(motion, frame)) for frame in tracked.frames]
-    with torch.no_grad():
-        deformation.static.copy_(tracked.canonical[~held].mean(0) - deformation.rest)
-    optimiser = torch.optim.AdamW(deformation.networks(), lr=2e-3, weight_decay=0.1)
-    seen = (~held).nonzero().squeeze(1).tolist()
-    best, kept, kept_step = float("inf"), deformation.state_dict(), 0
-    for step in range(steps + 1):
-        if step % LOOK_EVERY == 0:
+    start = {name: value.clone() for name, value in deformation.state_dict().items()}
+    best, kept = float("inf"), 0
+    if held.any():
+        for step in _train(deformation, windows, tracked, ~held, steps=steps, seed=seed):
             error = _held_out_error(deformation, windows, tracked, held.nonzero().squeeze(1).tolist())
             if error < best:
-                best, kept_step = error, step
-                kept = {name: value.clone() for name, value in deformation.state_dict().items()}
-        index = seen[np.random.default_rng([seed, step]).integers(len(seen))]
+                best, kept = error, step
+        deformation.load_state_dict(start)
+    for _ in _train(deformation, windows, tracked, torch.ones_like(held), steps=kept, seed=seed):
+        pass
+    return kept
+
+
+def _train(
+    deformation: GraphDeformation, windows: list[Window], tracked: Tracked, seen: Tensor, *, steps: int, seed: int
+) -> Iterator[int]:
+    """Learn from the frames that are `seen` `[t]`; stops at step 0, at every twentieth, and at the last."""
+    with torch.no_grad():
+        deformation.static.copy_(tracked.canonical[seen].mean(0) - deformation.rest)
+    optimiser = torch.optim.AdamW(deformation.networks(), lr=2e-3, weight_decay=0.1)
+    indices = seen.nonzero().squeeze(1).tolist()
+    for step in range(steps):
+        if step % LOOK_EVERY == 0:
+            yield step
+        index = indices[np.random.default_rng([seed, step]).integers(len(indices))]
         canonical = deformation.deform(windows[index])
         shift = canonical - tracked.canonical[index]
         rough = shift - deformation.graph.vertex_adjacency(shift)
@@ -144,14 +161,11 @@ def fit_graph(deformation: GraphDeformation, motion: Motion, tracked: Tracked, *
         optimiser.zero_grad()
         (1e6 * loss).backward()  # type: ignore[no-untyped-call]
         optimiser.step()
-    deformation.load_state_dict(kept)
-    return kept_step
+    yield steps
 
 
 @torch.no_grad()
 def _held_out_error(
-    deformation: GraphDeformation, windows: Sequence[list], tracked: Tracked, held: Sequence[int]
+    deformation: GraphDeformation, windows: Sequence[Window], tracked: Tracked, held: Sequence[int]
 ) -> float:
-    if not held:
-        return 0.0
     return float(np.mean([_mean_square(deformation.deform(windows[i]) - tracked.canonical[i]) for i in held]))

@@ -1,8 +1,8 @@
 """Where the template's vertices lie in every training frame: what Stg.1 learns from, before and apart from the avatar.
 
-Supervision is exact ("vertices": an oracle, correspondences known), what a lab has ("chamfer": a surface per frame,
-no correspondences; UMA, the successor of ASH, states this loss), or nothing but the videos ("images", in
-`ash.template_learning.image_tracking`).
+Supervision is nothing but the videos ("images", in `ash.template_learning.image_tracking`), what a studio has ("scans":
+a surface per frame with noise and holes, no correspondences; UMA, the successor of ASH, states this loss), or, for
+oracles, the truth: "surface", the same loss on the exact surface, and "vertices", with correspondences.
 """
 
 from collections.abc import Callable
@@ -10,18 +10,24 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ash.capture.dataset import Capture, Pose
-from ash.capture.formats import read_scan, read_template_truth
+from ash.capture.formats import read_scan, read_surface_mesh_truth, read_template_truth
 from ash.rotations import RigidTransforms
 from ash.template.graph import NeighbourMean, vertex_neighbours
 from ash.template.template import Template, vertex_normals
 
 RANGE_M = 0.1  # A surface point farther away than this is no match,
 ALIGNED = 0.7  # nor one whose normal differs by more than this cosine.
+HOLE_M = 0.02  # A vertex whose nearest point lies farther beside it lies over a hole.
+LAYER_M = 0.004  # One that is so much farther off its point than the point's nearest vertex is another layer's.
+SCAN_RIM = 3  # Vertices from a hole that a scan is not believed: it was seen from aside there.
+TRIM = 3.0  # Root mean squares by which a point may be off what is around it,
+TRIM_SWEEPS = 2  # so far around.
+NORMAL_SWEEPS = 3  # Of smoothing of a mesh's normals.
 POINTS = 5000  # Of a surface that look for their nearest vertex.
 SHARED_SWEEPS = (16, 4, 2)  # Smoothing of the correction that all frames share, pass by pass,
 SHARED_FRAMES = 16  # seen from some of them,
@@ -42,6 +48,7 @@ class Tracked:
 
 
 Correction = Callable[[int, Tensor], tuple[Tensor, Tensor]]  # Frame, posed vertices -> shift [v, 3], weight [v].
+ReadMesh = Callable[[Capture, int], tuple[np.ndarray, np.ndarray]]  # Frame -> vertices [s, 3] in metres, faces [f, 3].
 
 
 def track_vertices(capture: Capture, template: Template) -> Tracked:
@@ -52,19 +59,31 @@ def track_vertices(capture: Capture, template: Template) -> Tracked:
     return Tracked(frames=frames, canonical=torch.stack(canonical))
 
 
-def track_chamfer(capture: Capture, template: Template) -> Tracked:
-    """Non-rigid registration to a surface per frame: both ways to the nearest point, along its normal.
+def track_scans(capture: Capture, template: Template) -> Tracked:
+    """Register the template to the scans of the training frames, whose rims are not believed."""
+    return track_chamfer(capture, template, read_scan, rim=SCAN_RIM)
 
-    Moving along the surface's normals alone leaves the vertices free to stay where skinning put them along it, which
-    is what nobody without correspondences can know. First one correction is found for all frames, then each frame's
-    own; corrections are smoothed over the template, less from pass to pass.
+
+def track_surface(capture: Capture, template: Template) -> Tracked:
+    """An oracle: register the template to the true surface. Its rims are hems, and as true as the rest of it."""
+    return track_chamfer(capture, template, read_surface_mesh_truth, rim=0)
+
+
+def track_chamfer(capture: Capture, template: Template, read: ReadMesh, *, rim: int) -> Tracked:
+    """Non-rigid registration to a mesh per frame, which `read` gives: both ways to the nearest point, along its normal.
+
+    Moving along the mesh's normals alone leaves the vertices free to stay where skinning put them along it, which is
+    what nobody without correspondences can know. First one correction is found for all frames, then each frame's own;
+    corrections are smoothed over the template, less from pass to pass. Where the mesh has a hole nothing pulls, and a
+    point that is far off all others around it is noise: the template follows its neighbours there.
     """
-    scans = {frame: _Scan(*read_scan(capture, frame)) for frame in capture.splits["train"].frames}
+    meshes = {frame: _Mesh(*read(capture, frame), rim=rim) for frame in capture.splits["train"].frames}
+    neighbours = vertex_neighbours(template.mesh)
 
-    def towards_scan(frame: int, posed: Tensor) -> tuple[Tensor, Tensor]:
-        return scans[frame].correction(posed, vertex_normals(posed, template.faces))
+    def towards_mesh(frame: int, posed: Tensor) -> tuple[Tensor, Tensor]:
+        return meshes[frame].correction(posed, vertex_normals(posed, template.faces), neighbours)
 
-    return _register(capture, template, towards_scan)
+    return _register(capture, template, towards_mesh)
 
 
 def _register(capture: Capture, template: Template, correction: Correction) -> Tracked:
@@ -84,6 +103,7 @@ def _register(capture: Capture, template: Template, correction: Correction) -> T
         for index, frame in enumerate(frames):
             shift, weight = _in_canonical(transforms[frame], canonical[index], frame, correction)
             canonical[index] += smoothed(shift, weight, neighbours, sweeps)
+            canonical[index] = rest + (canonical[index] - rest) * _told(weight, neighbours)
     return Tracked(frames=frames, canonical=canonical)
 
 
@@ -98,38 +118,92 @@ def _in_canonical(
 def smoothed(
     shift: Float[Tensor, "v 3"], weight: Float[Tensor, " v"], neighbours: NeighbourMean, sweeps: int
 ) -> Float[Tensor, "v 3"]:
-    """Weighted mean of the shifts around every vertex; what no weighted vertex is near stays where it is."""
-    both = torch.cat([shift * weight[:, None], weight[:, None]], 1)
+    """Mean of the weighted shifts around every vertex: where nothing has weight, nothing moves."""
+    mean = shift * weight[:, None]
     for _ in range(sweeps):
-        both = 0.5 * (both + neighbours(both))
-    return both[:, :3] / both[:, 3:].clamp(min=0.05)
+        mean = 0.5 * (mean + neighbours(mean))
+    return mean
 
 
-class _Scan:
+def _told(weight: Float[Tensor, " v"], neighbours: NeighbourMean) -> Float[Tensor, "v 1"]:
+    """1 where most vertices around were told where to go, down to 0 in the middle of a hole: nobody knows there."""
+    share = weight[:, None]
+    for _ in range(OWN_SWEEPS[0]):
+        share = 0.5 * (share + neighbours(share))
+    return (2 * share).clamp(max=1)
+
+
+class _Mesh:
     """A surface of one frame, to look up the nearest points of."""
 
-    def __init__(self, vertices: Float[np.ndarray, "s 3"], faces: Int[np.ndarray, "f 3"]) -> None:
+    def __init__(self, vertices: Float[np.ndarray, "s 3"], faces: Int[np.ndarray, "f 3"], *, rim: int) -> None:
+        """`rim`: how many vertices deep the rim of holes is that is not believed."""
         self.points = torch.from_numpy(vertices).float()
-        self.normals = vertex_normals(self.points, torch.from_numpy(faces))
+        self.normals = _smooth_normals(self.points, torch.from_numpy(faces))
+        self.believed = ~_rim(faces, len(vertices), rings=rim) if rim else torch.ones(len(vertices), dtype=torch.bool)
         self.tree = cKDTree(vertices)
         self.few = torch.arange(0, len(vertices), max(1, len(vertices) // POINTS))
 
-    def correction(self, posed: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean shift along the normals of the scan, from each vertex' nearest point and from the points nearest to it;
+    def correction(self, posed: Tensor, normals: Tensor, neighbours: NeighbourMean) -> tuple[Tensor, Tensor]:
+        """Mean shift along the normals of the mesh, from each vertex' nearest point and from the points nearest to it;
         and 1 where there is any, else 0."""
+        vertices, points = self._matches(posed, normals)
+        normal = self.normals[points]
+        off = ((self.points[points] - posed[vertices]) * normal).sum(1, keepdim=True)
+        around, _ = _mean_of_matches(off, vertices, len(posed))
+        for _ in range(TRIM_SWEEPS):
+            around = 0.5 * (around + neighbours(around))
+        surprise = (off - around[vertices]).abs().squeeze(1)
+        kept = surprise <= TRIM * surprise.square().mean().sqrt()
+        return _mean_of_matches((off * normal)[kept], vertices[kept], len(posed))
+
+    def _matches(self, posed: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+        """Pairs of a vertex and a point that belong together."""
         # A vertex without a point in range gets an infinite distance and a number beyond the last point.
         distance, nearest = self.tree.query(posed.numpy(), distance_upper_bound=RANGE_M)
-        back, vertex = cKDTree(posed.numpy()).query(self.points[self.few].numpy())
-        vertices = torch.cat([torch.arange(len(posed)), torch.from_numpy(vertex)])
-        points = torch.cat([torch.from_numpy(nearest).clamp(max=len(self.points) - 1), self.few])
-        normal = self.normals[points]
-        matches = (torch.from_numpy(np.concatenate([distance, back])) < RANGE_M) & (
-            (normal * normals[vertices]).sum(1) > ALIGNED
-        )
-        shift = normal * ((self.points[points] - posed[vertices]) * normal).sum(1, keepdim=True)
-        total = torch.zeros_like(posed).index_add_(0, vertices[matches], shift[matches])
-        count = torch.zeros(len(posed)).index_add_(0, vertices, matches.float())
-        return total / count.clamp(min=1)[:, None], (count > 0).float()
+        forward = torch.from_numpy(np.minimum(nearest, len(self.points) - 1))
+        back, vertex = (torch.from_numpy(found) for found in cKDTree(posed.numpy()).query(self.points.numpy()))
+        off, beside = self._apart(posed, forward)
+        # A leg under a skirt that alone was scanned is not to be drawn to it: the skirt's own vertices are nearer.
+        owner_off, _ = self._apart(posed[vertex[forward]], forward)
+        own = torch.from_numpy(np.isfinite(distance)) & (beside < HOLE_M) & (off.abs() < owner_off.abs() + LAYER_M)
+        vertices = torch.cat([torch.arange(len(posed))[own], vertex[self.few][back[self.few] < RANGE_M]])
+        points = torch.cat([forward[own], self.few[back[self.few] < RANGE_M]])
+        kept = ((self.normals[points] * normals[vertices]).sum(1) > ALIGNED) & self.believed[points]
+        return vertices[kept], points[kept]
+
+    def _apart(self, places: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+        """How far points lie from places along their normals, and how far beside them; metres."""
+        normal, apart = self.normals[points], self.points[points] - places
+        off = (apart * normal).sum(1)
+        return off, (apart - normal * off[:, None]).norm(dim=1)
+
+
+def _rim(faces: Int[np.ndarray, "f 3"], count: int, *, rings: int) -> Bool[Tensor, " s"]:
+    """Vertices on open edges, and those around them: seen from aside, a scanner is at its worst there."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
+    _, name, uses = np.unique(edges[:, 0] * count + edges[:, 1], return_inverse=True, return_counts=True)
+    rim = torch.zeros(count, dtype=torch.bool)
+    rim[torch.from_numpy(edges[uses[name] == 1].ravel())] = True
+    for _ in range(rings - 1):
+        rim[torch.from_numpy(faces)[rim[torch.from_numpy(faces)].any(1)].reshape(-1)] = True
+    return rim
+
+
+def _smooth_normals(vertices: Float[Tensor, "s 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "s 3"]:
+    """Normals without the grain of a scan: means over the faces around, some rounds of it."""
+    normals = vertex_normals(vertices, faces)
+    for _ in range(NORMAL_SWEEPS):
+        of_faces = normals[faces].mean(1).repeat_interleave(3, 0)
+        normals = torch.nn.functional.normalize(torch.zeros_like(normals).index_add_(0, faces.reshape(-1), of_faces))
+    return normals
+
+
+def _mean_of_matches(values: Tensor, vertices: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Mean of the values `[n, c]` of each vertex' matches, and 1 where there is any, else 0."""
+    total = torch.zeros(count, values.shape[1]).index_add_(0, vertices, values)
+    matches = torch.zeros(count).index_add_(0, vertices, torch.ones(len(vertices)))
+    return total / matches.clamp(min=1)[:, None], (matches > 0).float()
 
 
 def template_error_mm(template: Template, capture: Capture, frames: tuple[int, ...]) -> Float[np.ndarray, "t v"]:

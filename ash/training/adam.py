@@ -23,6 +23,7 @@ class Adam:
         self.groups = groups
         self.eps = eps
         self.moments: list[Moments | None] = [None] * len(self.parameters)
+        self._addresses: dict[int, _Addresses] = {}  # by the first parameter of a group
 
     @property
     def parameters(self) -> list[Tensor]:
@@ -44,14 +45,18 @@ class Adam:
         for group in self.groups:
             moving = {first + i: p for i, p in enumerate(group["params"]) if p.grad is not None}
             if moving:
-                finite &= self._move(list(moving.values()), [self._moments(index) for index in moving], group["lr"])
+                moments = [self._moments(index) for index in moving]
+                finite &= self._move(first, list(moving.values()), moments, group["lr"])
             first += len(group["params"])
         return finite
 
-    def _move(self, parameters: list[Tensor], moments: list[Moments], lr: float) -> bool:
+    def _move(self, first: int, parameters: list[Tensor], moments: list[Moments], lr: float) -> bool:
         """All of one learning rate; whether their gradients were finite."""
         if all(p.dtype == torch.float32 and p.device.type == "cpu" for p in parameters):
-            return _move_native(parameters, moments, lr, self.eps)
+            known = self._addresses.get(first)
+            if known is None or not known.are_of(parameters, moments):
+                known = self._addresses[first] = _Addresses(parameters, moments)
+            return _move_native(known, lr, self.eps)
         finite = all(bool(torch.isfinite(parameter.grad).all()) for parameter in parameters)  # type: ignore[arg-type]
         _move_by_torch(parameters, moments, lr, self.eps)
         return finite
@@ -89,16 +94,29 @@ def _move_by_torch(parameters: list[Tensor], moments: list[Moments], lr: float, 
     )
 
 
-def _move_native(parameters: list[Tensor], moments: list[Moments], lr: float, eps: float) -> bool:
-    count = len(parameters)
-    grads = [_laid_like(parameter) for parameter in parameters]
-    means, squares, steps = ([m[name] for m in moments] for name in ("exp_avg", "exp_avg_sq", "step"))
-    arrays = [
-        (c_void_p * count)(*(tensor.data_ptr() for tensor in tensors))
-        for tensors in (parameters, grads, means, squares, steps)
-    ]
-    counts = (c_int64 * count)(*(parameter.numel() for parameter in parameters))
-    return bool(load().ash_adam(count, *arrays, counts, lr, *BETAS, eps, torch.get_num_threads()))
+class _Addresses:
+    """Where parameters and moments lie, as the kernel takes them: looked up once, not in every step."""
+
+    def __init__(self, parameters: list[Tensor], moments: list[Moments]) -> None:
+        self.parameters, self.moments = parameters, moments
+        means, squares, steps = ([m[name] for m in moments] for name in ("exp_avg", "exp_avg_sq", "step"))
+        self.places, self.means, self.squares, self.steps = map(_addresses, (parameters, means, squares, steps))
+        self.counts = (c_int64 * len(parameters))(*(parameter.numel() for parameter in parameters))
+
+    def are_of(self, parameters: list[Tensor], moments: list[Moments]) -> bool:
+        """Whether they are those of the same tensors, where they were."""
+        same = len(moments) == len(self.moments) and all(a is b for a, b in zip(moments, self.moments, strict=True))
+        return same and all(p.data_ptr() == place for p, place in zip(parameters, self.places, strict=True))
+
+
+def _addresses(tensors: list[Tensor]) -> Any:
+    return (c_void_p * len(tensors))(*(tensor.data_ptr() for tensor in tensors))
+
+
+def _move_native(known: _Addresses, lr: float, eps: float) -> bool:
+    grads = [_laid_like(parameter) for parameter in known.parameters]  # Kept by name until they were read.
+    arrays = known.places, _addresses(grads), known.means, known.squares, known.steps
+    return bool(load().ash_adam(len(grads), *arrays, known.counts, lr, *BETAS, eps, torch.get_num_threads()))
 
 
 def _laid_like(parameter: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """What one step of training sees: the images of a capture in memory, and a few of them cut out as a batch."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from math import gcd
 
 import numpy as np
@@ -29,6 +29,7 @@ class TrainingImages:
     cameras: dict[str, Camera]
     frames: tuple[int, ...]
     reserved: tuple[tuple[str, int], ...] = ()  # views that no batch holds
+    plates: dict[str, UInt8[np.ndarray, "h w 3"]] = field(default_factory=dict)  # the empty studio, where it is known
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -39,7 +40,7 @@ class Batch:
     cameras: list[Camera]
     targets: Float[Tensor, "c h w 3"]  # over `background`
     foreground: Float[Tensor, "c h w"]
-    background: Float[Tensor, " 3"]
+    background: Float[Tensor, " 3"] | Float[Tensor, "c h w 3"]  # a colour, or one for every pixel
 
 
 def load_training_images(capture: Capture) -> TrainingImages:
@@ -63,6 +64,7 @@ def load_training_images(capture: Capture) -> TrainingImages:
         cameras={name: capture.cameras[name] for name in train.cameras},
         frames=tuple(train.frames),
         reserved=reserved_views(tuple(train.cameras), tuple(train.frames)),
+        plates={name: plate for name in train.cameras if (plate := capture.plate(name)) is not None},
     )
 
 
@@ -90,8 +92,35 @@ def draw_batch(images: TrainingImages, config: TrainingConfig, seed: int, step: 
     cameras = [name for name in images.cameras if (name, frame) not in images.reserved]
     count = min(config.views_per_step, len(cameras))
     names = [cameras[i] for i in rng.choice(len(cameras), count, replace=False)]
-    colour = rng.random(3) if config.background == "random" else np.zeros(3)
-    return cut_batch(images, frame, names, torch.from_numpy(colour).float())
+    colour = np.zeros(3) if config.background == "black" else rng.random(3)
+    batch = cut_batch(images, frame, names, torch.from_numpy(colour).float())
+    return in_studio(batch, images) if config.background == "studio" else batch
+
+
+def in_studio(batch: Batch, images: TrainingImages) -> Batch:
+    """The batch before what each camera saw of the empty studio, wherever its masks are not empty.
+
+    Where a mask is too large, the studio shows in the image, and nothing needs to be drawn before it.
+
+    Raises:
+        InputError: nobody took a picture of the empty studio.
+    """
+    if not images.plates:
+        raise InputError("background='studio': expected plates/ in the capture, pictures of the empty studio")
+    behind = torch.empty_like(batch.targets)
+    for view, (camera, mask) in enumerate(zip(batch.cameras, batch.foreground, strict=True)):
+        whole = images.cameras[camera.name]
+        left, top = np.round(whole.K[:2, 2] - camera.K[:2, 2]).astype(int)
+        plate = images.plates[camera.name][top : top + camera.height, left : left + camera.width]
+        seen = torch.from_numpy(np.ascontiguousarray(plate)).float() / 255
+        behind[view] = torch.where(mask[..., None] > 0, seen, batch.background)
+    share = 1 - batch.foreground[..., None]
+    return replace(batch, targets=batch.targets + share * (behind - batch.background), background=behind)
+
+
+def over(rgb: Float[Tensor, "c h w 3"], alpha: Float[Tensor, "c h w"], background: Tensor) -> Tensor:
+    """Premultiplied colours over a background, one colour or one for every pixel."""
+    return rgb + (1 - alpha)[..., None] * background
 
 
 def cut_batch(images: TrainingImages, frame: int, names: list[str], background: Tensor) -> Batch:

@@ -27,7 +27,7 @@ from ash.files import InputError, write_atomic
 from ash.protocol import TrainingOutcome
 from ash.training.adam import Adam
 from ash.training.batches import Batch, TrainingImages, cut_batch, draw_batch
-from ash.training.losses import l1_ssim_loss, ssim_target
+from ash.training.losses import exact_target, l1_ssim_loss
 from ash.training.stopping import (
     ReservedScore,
     TrainingCourse,
@@ -123,7 +123,7 @@ def fit(
 def view_loss(images: Float[Tensor, "c h w 3"], batch: Batch, config: TrainingConfig) -> Tensor:
     """ASH Eq. 9, mean over the views."""
     losses = [
-        l1_ssim_loss(image, ssim_target(target), l1_weight=config.l1_weight, ssim_weight=config.ssim_weight)
+        l1_ssim_loss(image, exact_target(target), l1_weight=config.l1_weight, ssim_weight=config.ssim_weight)
         for image, target in zip(images, batch.targets, strict=True)
     ]
     return torch.stack(losses).mean()
@@ -141,6 +141,7 @@ class _Run:
         self.step, self.seconds, self.rate_scale = 0, 0.0, 1.0
         self.course = TrainingCourse()
         self.average: dict[str, Tensor] = {}
+        self.averaged: list[Tensor] = []  # the parameters, in the order of `average`
         self.average_afresh()
         self.started, self.saved_at = time.process_time(), time.monotonic()
 
@@ -152,7 +153,9 @@ class _Run:
     def average_afresh(self) -> None:
         """Let the average of the weights start from the weights as they are."""
         if self.config.ema:
-            self.average = {name: value.detach().clone() for name, value in self.learner.module.named_parameters()}
+            learned = dict(self.learner.module.named_parameters())
+            self.average = {name: value.detach().clone() for name, value in learned.items()}
+            self.averaged = [value.detach() for value in learned.values()]
 
     def advance(self, batch: Batch) -> None:
         """One step of Adam."""
@@ -177,9 +180,10 @@ class _Run:
         if not (math.isfinite(loss.item()) and self.optimiser.step()):
             self._roll_back("loss or gradient not finite")
             return
-        for name, value in self.learner.module.named_parameters() if self.average else ():
+        if self.average:
             # A short memory at first, so that the start is soon forgotten.
-            self.average[name].lerp_(value.detach(), 1 - min(self.config.ema, (1 + self.step) / (10 + self.step)))
+            weight = 1 - min(self.config.ema, (1 + self.step) / (10 + self.step))
+            torch._foreach_lerp_(list(self.average.values()), self.averaged, weight)
         self.step += 1
         self._look(loss)
 
@@ -294,6 +298,8 @@ class _Run:
             gained=gain_of_last_third(self.course.scores),
             reserved_psnr=self._score_of_this_step(),
             correction_spread=self._spread(),
+            cameras=len(self.images.cameras),
+            frames=len(self.images.frames),
         )
         self._append({"outcome": asdict(outcome)})
         return outcome

@@ -11,7 +11,7 @@ from benchmarks.analysis.scores import RANKED_SPLITS
 from benchmarks.analysis.statistics import mean_interval
 from benchmarks.cell.cells import CellResult
 
-COLUMNS = ("scene", "split", "method", "seconds", "seed", "psnr")
+COLUMNS = ("scene", "split", "method", "seconds", "capture", "seed", "psnr")
 
 
 def snapshots(results: Sequence[CellResult]) -> pd.DataFrame:
@@ -24,16 +24,18 @@ def snapshots(results: Sequence[CellResult]) -> pd.DataFrame:
         if result.status != "done" or not result.snapshots or result.config.axis:
             continue
         end = result.training.seconds if result.training else result.value("speed", "", "train_s")
-        where = (result.config.scene, result.config.method, result.config.seed)
+        config = result.config
         points = [(row.split, row.seconds, row.psnr) for row in result.snapshots]
         final = [(split, end, result.value(split, "foreground", "psnr")) for split in RANKED_SPLITS]
         for split, seconds, psnr in points + [point for point in final if None not in point]:
-            rows.append((where[0], split, where[1], seconds, where[2], psnr))
+            rows.append((config.scene, split, config.method, seconds, config.capture, config.seed, psnr))
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
 def curves(results: Sequence[CellResult]) -> pd.DataFrame:
     """Mean over seeds with its 95 % interval: scene, split, method, seconds, psnr, low, high (NaN for one seed).
+
+    Over captures, where the scene has several: then seeds within a capture are averaged.
 
     Seconds are those of the snapshots of any method on the scene; before its own first snapshot a method has no row.
     """
@@ -43,18 +45,19 @@ def curves(results: Sequence[CellResult]) -> pd.DataFrame:
         marks = np.unique(here.seconds.round())
         for method, own in here.groupby("method", sort=False):
             for mark in marks:
-                scores = [_at(run, mark) for _, run in own.groupby("seed")]
-                if None not in scores:
-                    interval = mean_interval([score for score in scores if score is not None])
+                scores = own.groupby(["capture", "seed"]).apply(_at, mark, include_groups=False)
+                if scores.notna().all():
+                    means = scores.groupby("capture").mean()
+                    interval = mean_interval(list(means if len(means) > 1 else scores))
                     rows.append((scene, split, method, mark, interval.mean, interval.low, interval.high))
     table = pd.DataFrame(rows, columns=["scene", "split", "method", "seconds", "psnr", "low", "high"])
     return table.astype({"low": float, "high": float})
 
 
-def _at(run: pd.DataFrame, seconds: float) -> float | None:
-    """The score of the latest snapshot that was there by then."""
+def _at(run: pd.DataFrame, seconds: float) -> float:
+    """The score of the latest snapshot that was there by then; NaN where none was."""
     there = run[run.seconds.round() <= seconds].sort_values("seconds")
-    return float(there.psnr.iloc[-1]) if len(there) else None
+    return float(there.psnr.iloc[-1]) if len(there) else np.nan
 
 
 def crossings(table: pd.DataFrame) -> pd.DataFrame:

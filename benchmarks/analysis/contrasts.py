@@ -79,4 +79,9 @@ def _bootstrap(scores: Scores, scene: str, ours: str, theirs: str, split: str) -
     a, b = (scores.per_image(scene, method, split) for method in (ours, theirs))
     if a.empty or not a.columns.equals(b.columns) or a.isna().any(axis=None) or b.isna().any(axis=None):
         return float("nan"), float("nan")
-    return hierarchical_bootstrap(a.to_numpy(), b.to_numpy(), rng=np.random.default_rng(0))
+    pairs = scores.captures(scene) > 1
+    if pairs:
+        a, b = (rows.groupby(level="capture").mean() for rows in (a, b))
+        if not a.index.equals(b.index):
+            return float("nan"), float("nan")
+    return hierarchical_bootstrap(a.to_numpy(), b.to_numpy(), rng=np.random.default_rng(0), pairs=pairs)

@@ -5,24 +5,29 @@ A fixed mesh with the best texture stands beside them: what geometry of such an 
 
 import math
 from dataclasses import dataclass
-from itertools import product
+from itertools import pairwise, product
 
 from benchmarks.analysis.contrasts import difference
-from benchmarks.analysis.names import SPLIT_NAMES
+from benchmarks.analysis.names import SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import Quantity, Scores, foreground
 from benchmarks.analysis.statistics import Interval, mean_interval
 from benchmarks.cell.methods import ON_EXACT, WRONG_BY_MM
 
 # ASH (CVPR 2024), Table 1: PSNR of ASH minus DDC, tight and loose clothes.
 PAPER_DB = {"novel_view": {"tight": 4.6, "loose": 7.4}, "novel_pose": {"tight": 1.1, "loose": 0.7}}
+# Templates that both methods learned: from what, and the rows that stand on it.
+LEARNED = {"images": ("ash", "ddc"), "scans": ("by_scans", "ddc_by_scans")}
+# Rows of ASH that differ from each other in the template alone.
+PLACED = ("ash", "by_scans", "by_surface", "by_vertices", "by_graph", "unlearned")
 LEVEL_TITLES = dict(zip(ON_EXACT, ("ASH", "DDC", "fixed mesh, best texture"), strict=True))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Margin:
-    """Foreground PSNR of ASH minus DDC in dB on templates of one error; the interval needs two seeds."""
+    """Foreground PSNR of ASH minus DDC in dB on templates of one error; the interval needs two seeds or captures."""
 
     error_mm: float  # root mean square
+    template: str  # "planted", or what it was learned from
     mean: float
     low: float | None
     high: float | None
@@ -37,20 +42,39 @@ class Level:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class PlacedTemplate:
+    """ASH on a template of its own, beside what planted errors of that size and of learned templates' kind allow."""
+
+    method: str
+    error_mm: float
+    psnr: float
+    planted_psnr: float | None  # between the planted errors around it; None: beyond all of them
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class MarginCurve:
-    """A scene and split: margins on templates of known error, least error first, and on the methods' own template."""
+    """A scene and split: margins on templates of planted error, least error first, and on learned templates.
+
+    Planted errors are of the kind that learned templates have: `ash.config.TemplateConfig` says how static and how
+    lasting, as measured by `ash.template_learning.errors`. So a learned template has its place on the curve.
+    """
 
     scene: str
     split: str
     levels: tuple[Level, ...]
     known: tuple[Margin, ...]
-    honest: Margin | None
+    learned: tuple[Margin, ...]
+    placed: tuple[PlacedTemplate, ...]
     paper_db: float | None  # the paper's margin on such clothes
 
     @property
     def crossing_mm(self) -> float | None:
         """The error at which the two are equal, between measured ones; None: one leads throughout."""
         return self.error_at(0.0)
+
+    def margin_at(self, error_mm: float) -> float | None:
+        """The margin on planted errors of a size, linear between measured ones; None beyond them."""
+        return _between([(margin.error_mm, margin.mean) for margin in self.known], error_mm)
 
     def error_at(self, margin_db: float) -> float | None:
         """The least error at which the margin is reached, linear between measured errors."""
@@ -64,21 +88,53 @@ def margin_curves(scores: Scores) -> tuple[MarginCurve, ...]:
     """A curve per scene and split, for scenes on which both methods ran with two errors or more."""
     found = []
     for scene, split in product(scores.scenes, PAPER_DB):
-        known = [_margin(scores, scene, split, ash, ddc, float(mm)) for mm, (ash, ddc, _) in WRONG_BY_MM.items()]
+        known = [
+            _margin(scores, scene, split, (ash, ddc), float(mm), "planted") for mm, (ash, ddc, _) in WRONG_BY_MM.items()
+        ]
         there = tuple(margin for margin in known if margin is not None)
         if len(there) > 1:
-            template = scores.get(scene, "ash", Quantity(split, "", "template_mm"))
+            levels = _levels(scores, scene, split)
             found.append(
                 MarginCurve(
                     scene=scene,
                     split=split,
-                    levels=_levels(scores, scene, split),
+                    levels=levels,
                     known=there,
-                    honest=_margin(scores, scene, split, "ash", "ddc", template.mean) if template else None,
+                    learned=_learned(scores, scene, split),
+                    placed=_placed(scores, scene, split, levels),
                     paper_db=PAPER_DB[split].get(scene),
                 )
             )
     return tuple(found)
+
+
+def _learned(scores: Scores, scene: str, split: str) -> tuple[Margin, ...]:
+    found = []
+    for template, rows in LEARNED.items():
+        error = scores.get(scene, rows[0], Quantity(split, "", "template_mm"))
+        margin = _margin(scores, scene, split, rows, error.mean, template) if error else None
+        found += [margin] if margin else []
+    return tuple(found)
+
+
+def _placed(scores: Scores, scene: str, split: str, levels: tuple[Level, ...]) -> tuple[PlacedTemplate, ...]:
+    curve = [(mm, psnr.mean) for level in levels if level.method == ON_EXACT[0] for mm, psnr in level.qualities]
+    found = []
+    for method in PLACED:
+        error = scores.get(scene, method, Quantity(split, "", "template_mm"))
+        psnr = scores.get(scene, method, foreground(split))
+        if error and psnr and scores.whole(scene, method):
+            planted = _between(curve, error.mean)
+            found.append(PlacedTemplate(method=method, error_mm=error.mean, psnr=psnr.mean, planted_psnr=planted))
+    return tuple(found)
+
+
+def _between(points: list[tuple[float, float]], place: float) -> float | None:
+    """The value at a place, linear between points in rising order; None beyond them."""
+    for (a, low), (b, high) in pairwise(points):
+        if a <= place <= b:
+            return low + (place - a) / (b - a) * (high - low)
+    return None
 
 
 def sentence(curve: MarginCurve) -> str:
@@ -93,9 +149,25 @@ def sentence(curve: MarginCurve) -> str:
         at = curve.error_at(curve.paper_db)
         reached = "is not reached" if at is None else f"is reached at {at:.1f} mm"
         text += f"; the paper's {curve.paper_db:+.1f} dB {reached}"
-    if curve.honest is not None:
-        text += f"; with the honest template ({curve.honest.error_mm:.1f} mm) it is {curve.honest.mean:+.1f} dB"
+    for margin in curve.learned:
+        text += (
+            f"; on the template learned from {margin.template} ({margin.error_mm:.1f} mm) it is {margin.mean:+.1f} dB"
+        )
+        planted = curve.margin_at(margin.error_mm)
+        text += "" if planted is None else f", on a planted error of that size {planted:+.1f} dB"
     return text + "."
+
+
+def placement(curve: MarginCurve) -> str:
+    """Where ASH stands on templates of its own, in one sentence; empty where it has none."""
+    said = []
+    for placed in curve.placed:
+        text = f"{look_of(placed.method).title} {placed.psnr:.1f} dB at {placed.error_mm:.1f} mm"
+        said.append(text if placed.planted_psnr is None else f"{text} ({placed.planted_psnr:.1f})")
+    if not said:
+        return ""
+    where = f"On {curve.scene}, {SPLIT_NAMES[curve.split].words}"
+    return f"{where}, by template (in brackets: a planted error of that size): {'; '.join(said)}."
 
 
 def _levels(scores: Scores, scene: str, split: str) -> tuple[Level, ...]:
@@ -110,9 +182,11 @@ def _levels(scores: Scores, scene: str, split: str) -> tuple[Level, ...]:
     return tuple(found)
 
 
-def _margin(scores: Scores, scene: str, split: str, ash: str, ddc: str, error_mm: float) -> Margin | None:
-    test = difference(scores, scene, ash, ddc, split)
+def _margin(
+    scores: Scores, scene: str, split: str, rows: tuple[str, str], error_mm: float, template: str
+) -> Margin | None:
+    test = difference(scores, scene, *rows, split)
     if test is None:
         return None
     low, high = (None, None) if math.isnan(test.low) else (test.low, test.high)
-    return Margin(error_mm=error_mm, mean=test.mean, low=low, high=high)
+    return Margin(error_mm=error_mm, template=template, mean=test.mean, low=low, high=high)

@@ -16,8 +16,9 @@ import pandas as pd
 from ash.files import InputError
 from benchmarks.analysis.names import is_ours
 from benchmarks.analysis.statistics import mean_interval
-from benchmarks.cell.cells import CellResult
+from benchmarks.cell.cells import CellConfig, CellResult
 from benchmarks.cell.metrics import METRICS
+from benchmarks.suites.suites import capture_name
 
 COLUMNS = (
     "scene",
@@ -71,8 +72,8 @@ def tidy(results: Sequence[CellResult], captures: Mapping[str, str] | None = Non
             "unit": METRICS[row.metric].unit,
             "direction": METRICS[row.metric].direction,
             "protocol": config.protocol,
-            "subject": config.capture_seed,
-            "capture": (captures or {}).get(config.key, f"{config.scene}-{config.size}-{config.capture_seed}"),
+            "subject": config.subject,
+            "capture": (captures or {}).get(config.key, _capture_name(config)),
             "axis": config.axis,
             "severity": config.severity,
             "status": result.status,
@@ -82,6 +83,10 @@ def tidy(results: Sequence[CellResult], captures: Mapping[str, str] | None = Non
         for row in result.summary
     ]
     return pd.DataFrame(rows, columns=[*COLUMNS, "axis", "severity", "status"])
+
+
+def _capture_name(config: CellConfig) -> str:
+    return capture_name(config.scene, config.size, config.capture_seed, config.subject)
 
 
 def csv_of(table: pd.DataFrame) -> str:
@@ -132,25 +137,39 @@ def images_of(results: Sequence[CellResult]) -> pd.DataFrame:
 def curves_of(results: Sequence[CellResult]) -> pd.DataFrame:
     """One row per point of the training logs that has a PSNR: its cell, `seconds` of training, `psnr` in dB."""
     rows = [
-        (result.config.scene, result.config.method, result.config.seed, point.seconds, point.psnr)
+        (
+            result.config.scene,
+            result.config.method,
+            result.config.capture,
+            result.config.seed,
+            point.seconds,
+            point.psnr,
+        )
         for result in results
         if not result.config.axis
         for point in result.curve
         if point.psnr is not None and point.seconds > 0
     ]
-    return pd.DataFrame(rows, columns=["scene", "method", "seed", "seconds", "psnr"])
+    return pd.DataFrame(rows, columns=["scene", "method", "capture", "seed", "seconds", "psnr"])
 
 
 def outcomes_of(results: Sequence[CellResult]) -> pd.DataFrame:
     """One row per cell that tells how its training ended: `scene`, `method`, whether it `finished` learning, whether
-    its decoders carry nothing (are `dead`), and the `choice` of a search.
+    its decoders carry nothing (are `dead`), the `choice` of a search, and what its `template` was learned from.
     """
     rows = [
-        (result.config.scene, result.config.method, end.ended_by == "plateau", end.carries_nothing, end.choice or "")
+        (
+            result.config.scene,
+            result.config.method,
+            end.ended_by == "plateau",
+            end.carries_nothing,
+            end.choice or "",
+            end.template or "",
+        )
         for result in results
         if not result.config.axis and (end := result.training) is not None
     ]
-    return pd.DataFrame(rows, columns=["scene", "method", "finished", "dead", "choice"])
+    return pd.DataFrame(rows, columns=["scene", "method", "finished", "dead", "choice", "template"])
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -25,8 +25,9 @@ from ash.protocol import TrainingOutcome
 from benchmarks.cell.metrics import IMAGE_SPLITS, METRICS, PROTOCOL, VIEW_SCORES
 from benchmarks.cell.views import View
 
+DrawnBy = Literal["method", "display", "trainer"]  # a timed frame; "trainer": the display did not open there
 Status = Literal["done", "crashed", "diverged", "timeout", "out of memory"]
-VARIED = ("factory", "changes")
+VARIED = ("factory", "changes", "subject")
 STATUSES = ("done", "crashed", "diverged", "timeout", "out of memory")
 
 
@@ -47,11 +48,12 @@ class CellConfig:
     severity: float = 0.0
     factory: str = ""  # an entry point or `package.module:factory`, where the row `method` has another name than that
     changes: dict[str, Any] = field(default_factory=dict)  # in the method's configuration: dotted key to new value
+    subject: int = 0  # whom the capture shows
     protocol: str = PROTOCOL
 
     @property
     def key(self) -> str:
-        """The cell's name. Cells from before methods could be varied keep theirs."""
+        """The cell's name. Cells from before methods and subjects could be varied keep theirs."""
         return hash_of({name: value for name, value in asdict(self).items() if name not in VARIED or value})[:16]
 
     @property
@@ -67,7 +69,8 @@ class CellConfig:
     @property
     def title(self) -> str:
         """For progress lines and errors."""
-        return f"{self.place} · {self.method} · seed {self.seed}"
+        who = f" · subject {self.subject}" if self.subject else ""
+        return f"{self.place}{who} · {self.method} · seed {self.seed}"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -111,11 +114,16 @@ class Snapshot:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Timing:
-    """Milliseconds per timed frame, whole and by stage; `reference_ms` times a fixed workload between the frames."""
+    """Milliseconds per timed frame, whole and by stage; `reference_ms` times a fixed workload between the frames.
+
+    `agreement_db`: the least foreground PSNR between a timed picture and the scored one of the same view.
+    """
 
     frame_ms: tuple[float, ...]
     stage_ms: dict[str, tuple[float, ...]]
     reference_ms: tuple[float, ...]
+    drawn_by: DrawnBy = "method"
+    agreement_db: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

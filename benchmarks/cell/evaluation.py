@@ -24,14 +24,16 @@ from benchmarks.cell.cells import (
     stored_prediction,
 )
 from benchmarks.cell.curves import read_curve, seconds_to_settle
-from benchmarks.cell.host import EXAM, WORK, Described, Host, Spent, Timed, frame_times_ms
+from benchmarks.cell.failing import MethodFailed
+from benchmarks.cell.host import EXAM, WORK, Described, Host, Timed, frame_times_ms
 from benchmarks.cell.metrics import IMAGE_SPLITS, VIEW_SCORES
-from benchmarks.cell.timing import TIMED_FRAMES, WARM_UP_FRAMES, reference_workload_ms
+from benchmarks.cell.timing import TIMED_FRAMES, WARM_UP_FRAMES, Spent, reference_workload_ms
 from benchmarks.cell.views import View, evaluated_views, playback
 from benchmarks.cell.weights import weights_file
 
 GEOMETRY_FRAMES = 4
 MOST_SNAPSHOTS = 100
+LEAST_AGREEMENT_DB = 20.0  # Of a timed picture with the scored one: a display may sample outlines otherwise.
 
 
 GEOMETRY_POINTS = 4096  # Gaussians whose distance to the surface is measured, evenly taken; the mean wants no more.
@@ -64,14 +66,14 @@ def draw_all(cell: Cell, capture: Capture, host: Host) -> Submission:
     host.meet(cell.folder.resolve() / EXAM, capture)
     for view in views:
         write_image(prediction_path(cell.folder, view), metrics.quantise(host.draw(view, capture.cameras[view.camera])))
-    timing = _timing(host, playback(views))
-    described = host.describe()
+    described, peak_mb = host.describe(), host.peak_memory_mb()
+    timing = _timing(cell, capture, host, playback(views))
     return Submission(
         views=views,
         timing=timing,
         geometry=_pose_geometry(host, described, views),
         described=described,
-        peak_mb=host.peak_memory_mb(),
+        peak_mb=peak_mb,
         snapshots=_snapshots(cell, capture, host, views),
         isolated=host.isolated,
     )
@@ -129,13 +131,20 @@ def _psnr(capture: Capture, view: View, prediction: np.ndarray) -> float:
     return metrics.psnr(prediction[..., :3], truth[..., :3], mask if mask.any() else None)
 
 
-def _timing(host: Host, views: list[View]) -> Timing:
-    """The method's own milliseconds, which ours outside must bear out."""
+def _timing(cell: Cell, capture: Capture, host: Host, views: list[View]) -> Timing:
+    """The method's own milliseconds, which ours outside must bear out, of pictures that show what was scored."""
+    drawn_by = host.open_display()
     frames: list[Timed] = []
-    references = []
+    references, agreements = [], []
     for index in range(WARM_UP_FRAMES + TIMED_FRAMES):
-        frames.append(host.time(views[index % len(views)]))
+        view = views[index % len(views)]
+        frames.append(host.time(view))
+        shown = metrics.quantise(host.draw(view, capture.cameras[view.camera], "shown"))
+        agreements.append(_agreement(shown, stored_prediction(cell, capture, view)))
         references.append(reference_workload_ms())
+    if min(agreements) < LEAST_AGREEMENT_DB:
+        told = f"{min(agreements):.1f} dB, expected {LEAST_AGREEMENT_DB:.0f} or more"
+        raise MethodFailed("crashed", f"a timed picture differs from the one that was scored by {told}")
     timed = frames[WARM_UP_FRAMES:]
     stages: dict[str, tuple[float, ...]] = {
         name: tuple(frame.stage_ms[name] for frame in timed if name in frame.stage_ms)
@@ -145,7 +154,14 @@ def _timing(host: Host, views: list[View]) -> Timing:
         frame_ms=frame_times_ms(timed),
         stage_ms=stages,
         reference_ms=tuple(references[WARM_UP_FRAMES:]),
+        drawn_by=drawn_by,
+        agreement_db=min(agreements),
     )
+
+
+def _agreement(shown: np.ndarray, scored: np.ndarray) -> float:
+    region = metrics.foreground(shown) | metrics.foreground(scored)
+    return metrics.psnr(shown[..., :3], scored[..., :3], region if region.any() else None)
 
 
 def _score(cell: Cell, capture: Capture, view: View, prediction: np.ndarray) -> ViewScore:
@@ -203,6 +219,8 @@ def _training_summary(training: TrainingOutcome | None, curve: tuple[CurvePoint,
         return ()
     reached, settled = training.ended_by == "plateau", seconds_to_settle(curve)
     rows = {"steps": float(training.steps), "plateau": float(reached)}
+    seen = {"train_cameras": training.cameras, "train_frames": training.frames}
+    rows |= {name: float(count) for name, count in seen.items() if count}
     if training.search_seconds:
         rows["search_s"] = training.search_seconds
     if reached and settled is not None:

@@ -74,6 +74,8 @@ class Answers:
     def __init__(self, order: dict[str, Any]) -> None:
         self.order = order
         self.avatar: Any = None
+        self.drawer: Any = None  # the avatar's display
+        self.picture: Any = None  # the one that was timed last
         self.capture: Any = None
         self.motion: Any = None
         self.cameras: Any = None
@@ -128,12 +130,29 @@ class Answers:
 
     def do_draw(self, camera: str, frame: int) -> tuple[dict[str, Any], bytes]:
         """One picture."""
-        return _array(self._render(camera, frame)[0])
+        return _array(self._render(camera, frame, self.avatar)[0])
+
+    def do_display(self) -> tuple[dict[str, Any], bytes]:
+        """Open the display of an avatar that has one of its own: what is timed from now on is drawn by it."""
+        from ash.files import InputError
+        from ash.protocol import Displayed
+
+        if not isinstance(self.avatar, Displayed):
+            return {"drawn_by": "method"}, b""
+        try:
+            self.drawer = self.avatar.open_display()
+        except InputError:  # This machine has no OpenGL.
+            return {"drawn_by": "trainer"}, b""
+        return {"drawn_by": "display"}, b""
 
     def do_time(self, camera: str, frame: int) -> tuple[dict[str, Any], bytes]:
         """One picture, of which only the milliseconds are told."""
-        _, milliseconds, stages = self._render(camera, frame)
+        self.picture, milliseconds, stages = self._render(camera, frame, self.drawer or self.avatar)
         return {"ms": milliseconds, "stages": stages}, b""
+
+    def do_shown(self, camera: str, frame: int) -> tuple[dict[str, Any], bytes]:
+        """The picture that was timed last."""
+        return _array(self.picture)
 
     def do_vertices(self, frame: int) -> tuple[dict[str, Any], bytes]:
         """The posed template."""
@@ -166,12 +185,12 @@ class Answers:
 
         return Pose(self.motion, frame)
 
-    def _render(self, camera: str, frame: int) -> tuple[Any, float, dict[str, float]]:
+    def _render(self, camera: str, frame: int, drawer: Any) -> tuple[Any, float, dict[str, float]]:
         from ash.protocol import StageClock
 
         clock, pose = StageClock(), self._pose(frame)
         start = time.perf_counter()
-        image = self.avatar.render(pose, self.cameras[camera], clock=clock)
+        image = drawer.render(pose, self.cameras[camera], clock=clock)
         return image, (time.perf_counter() - start) * 1e3, {name: float(ms) for name, ms in clock.ms.items()}
 
 

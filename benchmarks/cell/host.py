@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, distribution
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import psutil
@@ -28,14 +28,16 @@ import psutil
 from ash.capture.dataset import Camera, Capture
 from ash.capture.formats import write_cameras, write_motion
 from ash.capture.typed import from_json
-from ash.files import one_line, require_plain
+from ash.files import require_plain
 from ash.protocol import TrainingOutcome
 from benchmarks.cell import isolation
-from benchmarks.cell.cells import CHECKPOINT, Cell, Status
+from benchmarks.cell.cells import CHECKPOINT, Cell, DrawnBy, Status
 from benchmarks.cell.children import end_family, pass_on, peak_memory_mb
+from benchmarks.cell.failing import Killed, MethodFailed
 from benchmarks.cell.guest import LARGEST_HEADER
 from benchmarks.cell.methods import OUR_PACKAGES, Method
 from benchmarks.cell.sources import editable_folder, package_files
+from benchmarks.cell.timing import Spent
 from benchmarks.cell.views import View
 
 WORK, EXAM, BASE = "work", "exam", "room"  # In a cell's folder: the method's own, what it is to draw, its file system.
@@ -47,18 +49,6 @@ CLOCK_LIE_MS, TRAINING_SLACK_S = 20.0, 5.0  # what a busy machine's scheduler ma
 ISOLATION = "ASH_BENCH_ISOLATION"  # "off": do without namespaces, as where the kernel has none
 
 
-class MethodFailed(Exception):
-    """The method did not come through; `status` says how."""
-
-    def __init__(self, status: Status, reason: str) -> None:
-        super().__init__(one_line(reason))
-        self.status: Status = status
-
-
-class Killed(Exception):
-    """The method's process was killed by somebody else, such as the kernel for want of memory."""
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Timed:
     """Milliseconds of one frame by the method's clock, whole and by stage, and by ours."""
@@ -66,17 +56,6 @@ class Timed:
     inside_ms: float
     stage_ms: dict[str, float]
     outside_ms: float
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Spent:
-    """Seconds of a training, seen from outside: by the clock, and of CPU time of all the method's processes.
-
-    A process that was stopped, or shared its core, has less of the latter; one that used several cores has more.
-    """
-
-    wall_s: float
-    cpu_s: float | None  # None: a result from before it was measured
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -125,10 +104,17 @@ class Host:
         write_motion(folder / "motion.npz", capture.motion)
         self._ask("meet", folder=str(folder))
 
-    def draw(self, view: View, camera: Camera) -> np.ndarray:
-        """One picture, float32 `[h, w, 4]`, finite."""
+    def open_display(self) -> DrawnBy:
+        """Have what is timed from now on drawn by the method's display, where it has one that opens here."""
+        told: Any = self._ask("display")[0].get("drawn_by")
+        if told not in get_args(DrawnBy):
+            raise MethodFailed("crashed", f"expected who draws timed frames, got {told!r}")
+        return told  # type: ignore[no-any-return]
+
+    def draw(self, view: View, camera: Camera, what: Literal["draw", "shown"] = "draw") -> np.ndarray:
+        """One picture, float32 `[h, w, 4]`, finite; "shown": the one that was timed last."""
         expected = (camera.height, camera.width, 4)
-        header, payload = self._ask("draw", most=4 * math.prod(expected), camera=view.camera, frame=view.frame)
+        header, payload = self._ask(what, most=4 * math.prod(expected), camera=view.camera, frame=view.frame)
         if header.get("dtype") != "<f4" or header.get("shape") != list(expected):
             got = f"{header.get('dtype')} {header.get('shape')}"
             raise MethodFailed("crashed", f"expected an image float32 {expected}, got {got}")

@@ -12,8 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ash.files import InputError
+from ash.files import InputError, open_regular
 
+LARGEST = 1 << 30  # bytes of a file of weights
 TAPS = (1, 4, 7, 9, 11)  # The layers of AlexNet whose activations are compared: after each ReLU.
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 
@@ -79,7 +80,10 @@ def _trunk(weights: dict[str, Tensor], path: Path) -> nn.Sequential:
 
 def _load(path: Path) -> dict[str, Tensor]:
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        with open_regular(path, most=LARGEST) as file:
+            content = torch.load(file, map_location="cpu", weights_only=True)
+    except InputError:
+        raise
     except Exception as error:  # torch raises half a dozen kinds for a damaged file
         raise InputError(f"{path}: expected a file of tensors ({type(error).__name__})") from error
     if not isinstance(content, dict):

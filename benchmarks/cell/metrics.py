@@ -1,13 +1,14 @@
 """What is measured, and how: one list that tables, chart and gate read, and the locked arithmetic behind it.
 
-Protocol "1". Before anything is compared, both images are composited on black and quantised to uint8 sRGB.
+Protocol "2". Before anything is compared, both images are composited on black and quantised to uint8 sRGB.
 Regions, ours first, then those of others' conventions:
 
 - `foreground`: pixels whose true alpha is above one half. The number to look at: background only dilutes it.
 - `full`: the whole frame.
 - `release_crop`: as the released ASH code validates: mask eroded by 3x3, both images composited on white by that mask,
-  a window of 600x496 (height x width at 1285x940, scaled to the frame, never smaller than the subject) centred on it.
-  Errors outside the silhouette are invisible to it. SSIM there is scikit-image's default, a 7x7 box.
+  a window of 600 rows and 496 columns (of 940 and 1285; in those shares of another frame) around what is not white in
+  the prediction. Errors outside the silhouette are invisible to it, and so is what such a window cuts off. SSIM there
+  is scikit-image's default, a 7x7 box. In protocol "1" the window had the true mask's place and never cut.
 - `white_frame`: as AnimatableGaussians scores: the whole frame on white, the truth cut out by its mask, the prediction
   composited by its own alpha; SSIM with the 7x7 box.
 """
@@ -20,11 +21,11 @@ import numpy as np
 from scipy import ndimage
 from skimage.metrics import structural_similarity
 
-PROTOCOL = "1"
+PROTOCOL = "2"
 PSNR_CAP_DB = 100.0  # Identical images would be infinite, and JSON and means know no infinity.
 FLIP_MARGIN = 24  # Pixels around the subject that FLIP's widest filter (radius 16 at 67 pixels per degree) can reach.
 SSIM_MARGIN = 11  # Pixels, beyond which windows of 11x11 or 7x7, mirrored at the margin's edge, see nothing.
-RELEASE_WINDOW = (600 / 1285, 496 / 940)
+RELEASE_WINDOW = (600 / 940, 496 / 1285)  # of the rows, of the columns
 
 Direction = Literal["up", "down", "none"]
 
@@ -77,6 +78,10 @@ METRICS = {
             key="train_cpu_s", title="training, CPU", unit="s", direction="none", worst=1e6, decimals=0, abs_tol=0.0
         ),
         Metric(key="steps", title="steps", unit="", direction="none", worst=0.0, decimals=0, abs_tol=0.0),
+        Metric(
+            key="train_cameras", title="cameras seen", unit="", direction="none", worst=0.0, decimals=0, abs_tol=0.0
+        ),
+        Metric(key="train_frames", title="frames seen", unit="", direction="none", worst=0.0, decimals=0, abs_tol=0.0),
         Metric(key="plateau", title="plateau", unit="", direction="none", worst=0.0, decimals=0, abs_tol=0.0),
         Metric(key="settled_s", title="within 0.3 dB", unit="s", direction="down", worst=1e6, decimals=0, abs_tol=0.0),
         Metric(key="search_s", title="search", unit="s", direction="down", worst=1e6, decimals=0, abs_tol=0.0),
@@ -188,10 +193,11 @@ def release_crop(predicted: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> 
     mask = ndimage.binary_erosion(mask, np.ones((3, 3)))
     if not mask.any():
         return None
-    rows, columns = mask.any(axis=1), mask.any(axis=0)
-    window = _window(np.asarray(rows), RELEASE_WINDOW[0]), _window(np.asarray(columns), RELEASE_WINDOW[1])
-    white = [np.where(mask[..., None], image, 255).astype(np.uint8) for image in (predicted, truth)]
-    return white[0][window], white[1][window]
+    drawn, true = (np.where(mask[..., None], image, 255).astype(np.uint8) for image in (predicted, truth))
+    coloured: np.ndarray = (drawn != 255).any(-1)
+    shown = coloured if coloured.any() else mask
+    window = _window(np.asarray(shown.any(1)), RELEASE_WINDOW[0]), _window(np.asarray(shown.any(0)), RELEASE_WINDOW[1])
+    return drawn[window], true[window]
 
 
 def white_frame(predicted: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -210,9 +216,9 @@ def box_ssim(predicted: np.ndarray, truth: np.ndarray) -> float:
 
 
 def _window(occupied: np.ndarray, fraction: float) -> slice:
-    """The interval of a fraction of an axis that is centred on its occupied part and holds all of it."""
+    """The interval of a fraction of an axis that is centred on its occupied part, as far as the axis allows."""
     first, last = np.flatnonzero(occupied)[[0, -1]]
-    length = max(round(fraction * len(occupied)), int(last - first + 1))
+    length = round(fraction * len(occupied))
     start = int(np.clip((first + last + 1 - length) // 2, 0, len(occupied) - length))
     return slice(start, start + length)
 

@@ -20,6 +20,7 @@ from typing import cast
 
 from ash.capture.dataset import Capture
 from ash.capture.formats import load_capture
+from ash.capture.manifest import verify_capture
 from ash.files import InputError, disk_problem
 from ash.protocol import Avatar
 from benchmarks import provenance
@@ -38,9 +39,11 @@ from benchmarks.cell.cells import (
 )
 from benchmarks.cell.children import adopt_orphans
 from benchmarks.cell.evaluation import _flicker_summary, _gap_summary, _image_summary, _score, draw_all, judge
-from benchmarks.cell.host import WORK, Host, Killed, MethodFailed, Spent, give_files, hosted, take_files
+from benchmarks.cell.failing import Killed, MethodFailed, Spoilt
+from benchmarks.cell.host import WORK, Host, give_files, hosted, take_files
 from benchmarks.cell.methods import ORACLES, configured, find_method
 from benchmarks.cell.sealing import seen_by_method, watched
+from benchmarks.cell.timing import Spent
 from benchmarks.cell.views import View
 
 KILLED = 76  # exit code
@@ -92,7 +95,9 @@ def run_cell(cell: Cell) -> CellResult:
     try:
         result = _train_and_evaluate(cell, capture)
     except MethodFailed as error:
-        if resumed:  # What an earlier attempt left may be damaged, and a whole training ends the same.
+        if resumed and not isinstance(
+            error, Spoilt
+        ):  # What an earlier attempt left may be damaged, and a whole training ends the same.
             print(f"{cell.config.title}: {error.status}: {error}; once more, from nothing", file=sys.stderr)
             shutil.rmtree(cell.folder / WORK)
             return run_cell(cell)
@@ -193,8 +198,29 @@ def trained_host(cell: Cell, capture: Capture, *, secret: tuple[Path, ...] = ())
 @contextmanager
 def _hosted(cell: Cell, capture: Capture, *, secret: tuple[Path, ...] = ()) -> Iterator[Host]:
     method, oracle = find_method(cell.config.source), cell.config.source in ORACLES
-    with _seen(cell, capture) as seen, hosted(cell, capture, seen, method, oracle=oracle, secret=secret) as host:
-        yield host
+    exposed = False
+    try:
+        with _seen(cell, capture) as seen, hosted(cell, capture, seen, method, oracle=oracle, secret=secret) as host:
+            if not host.isolated and (damage := _damage(cell, capture)):
+                raise InputError(f"{cell.capture_folder}: {damage}")
+            exposed = not host.isolated
+            yield host
+    except (MethodFailed, Killed) as error:
+        if exposed and (damage := _damage(cell, capture)):
+            raise Spoilt(damage) from error
+        raise
+    if exposed and (damage := _damage(cell, capture)):
+        raise Spoilt(damage)
+
+
+def _damage(cell: Cell, capture: Capture) -> str:
+    """What is wrong with a capture's files, each hashed again; nothing if they are as they were made."""
+    try:
+        if capture.identity != cell.config.capture:
+            return "its manifest is altered"
+        return next(iter(verify_capture(capture.folder)), "")
+    except (InputError, OSError) as error:
+        return str(error)
 
 
 def _clear(cell: Cell) -> None:

@@ -1,8 +1,8 @@
 """What a method sees of a capture: a copy with the training part alone, and no way back to the rest by opening files.
 
-The copy is a capture of its own: training cameras, training motion, training images, the scans of training frames, no
-other truth. While the method's code runs, opening or listing anything inside the original is refused and remembered,
-and so is writing to the copy. The watch is Python's audit hook: it sees what Python opens, whatever library asks it to,
+The copy is a capture of its own: training cameras, training motion, training images, scans where there are any, and no
+truth. While the method's code runs, opening or listing anything inside the original is refused and remembered, and so
+is writing to the copy. The watch is Python's audit hook: it sees what Python opens, whatever library asks it to,
 and stops mistakes and ordinary cheating. It is no prison: a library that opens files by itself, in C, is not seen.
 """
 
@@ -15,10 +15,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ash.capture.dataset import Capture, image_path, scan_path, surface_path
+from ash.capture.dataset import Capture, image_path, plate_path, scan_path
 from ash.capture.formats import load_capture, write_cameras, write_motion
 from ash.capture.manifest import Manifest, files_below
-from ash.files import read_arrays, sha256_of, write_arrays
+from ash.files import sha256_of
 
 KEPT_AS_THEY_ARE = ("skeleton.json", "template.npz", "body.npz")
 READING = ("open", "os.listdir", "os.scandir")
@@ -51,8 +51,13 @@ def training_copy(capture: Capture, folder: Path) -> Capture:
     write_motion(folder / "motion.npz", seen.motion)
     for camera, frame in seen.splits["train"].views:
         copy(image_path(capture.folder, camera, frame), image_path(folder, camera, frame))
-    _put_scans(capture, folder)
-    made = {"cameras.json", "motion.npz", "scans/faces.npz"}
+    for camera in seen.cameras:
+        if plate_path(capture.folder, camera).exists():
+            copy(plate_path(capture.folder, camera), plate_path(folder, camera))
+    for frame in seen.splits["train"].frames:
+        if scan_path(capture.folder, frame).exists():
+            copy(scan_path(capture.folder, frame), scan_path(folder, frame))
+    made = {"cameras.json", "motion.npz"}
     known = {name: digest for name, digest in capture.manifest.files.items() if name not in made}
     files = {name: known.get(name) or sha256_of(folder / name) for name in files_below(folder)}
     Manifest(scene=capture.scene, seed=capture.manifest.seed, splits=seen.splits, files=files).write(folder)
@@ -63,16 +68,6 @@ def copy(source: Path, target: Path) -> None:
     """Copy a file's bytes, making the folder."""
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(source, target)
-
-
-def _put_scans(capture: Capture, folder: Path) -> None:
-    """The surface of every training frame, which a lab reconstructs from its cameras; here it is the true one."""
-    shared = capture.folder / "truth" / "surface.npz"
-    if not shared.exists():
-        return
-    write_arrays(folder / "scans" / "faces.npz", faces=read_arrays(shared, expected=("faces",))["faces"])
-    for frame in capture.splits["train"].frames:
-        copy(surface_path(capture.folder, frame), scan_path(folder, frame))
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 import resource
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,17 @@ from benchmarks.cell.views import View
 
 WARM_UP_FRAMES = 3
 TIMED_FRAMES = 15
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Spent:
+    """Seconds of a training, seen from outside: by the clock, and of CPU time of all the method's processes.
+
+    A process that was stopped, or shared its core, has less of the latter; one that used several cores has more.
+    """
+
+    wall_s: float
+    cpu_s: float | None  # None: a result from before it was measured
 
 
 def time_frames(avatar: Drawn, capture: Capture, views: list[View]) -> Timing:

@@ -28,7 +28,7 @@ from benchmarks.suites.runs import RUN_FILE, read_run
 
 KEPT_POSES = 48  # Playing a short motion again, or turning the camera, decodes nothing anew.
 NOT_FINITE = "the rendered image holds NaN or infinity"
-THIN = 0.25  # of its standard deviations: how large a Gaussian is shown as an ellipsoid
+THIN = 0.4  # of its standard deviations: how large a Gaussian is shown as an ellipsoid
 
 
 class Actor:
@@ -77,7 +77,8 @@ class Actor:
             opacities=(full.opacities > 0.1).float(),
             sh=full.sh,
         )
-        return self._over(shown, camera, behind)
+        with clock.stage("stg4"):
+            return self._over(shown, camera, behind)
 
     def gaussians(self, pose: Pose, clock: StageClock) -> Gaussians:
         """The posed Gaussians of an avatar that has any."""
@@ -192,7 +193,7 @@ def _cells_in(folder: Path) -> Sequence[Cell]:
     """Of a run, of a cell, or of what `train` left."""
     loose = sorted(folder.glob("cells/*/config.json"))
     if loose and not (folder / RUN_FILE).exists():
-        return [read_cell(path.parent) for path in loose]
+        return sorted(map(read_cell, (path.parent for path in loose)), key=lambda cell: cell.config.title)
     return read_run(folder).cells
 
 

@@ -11,6 +11,7 @@ from synth.camera.rig import look_at
 SPIRAL, RIG = "spiral", "rig"
 RISE = 0.35  # of its distance: how far the spiral's camera goes up and down
 TURN_FRAMES = 96  # frames of one turn
+START = (0.25, 0.12, 0.96)  # from the person's middle, nearly of length 1
 STEPS_PER_SECOND = 12.0  # where the spiral is played
 
 
@@ -26,6 +27,12 @@ def middle_of(capture: Capture) -> np.ndarray:
     """The middle of the resting person, `[3]` metres."""
     vertices = capture.template.vertices
     return (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+
+
+def starting_place(capture: Capture) -> np.ndarray:
+    """Where a new viewer stands, `[3]` metres: before the person, as far away as the capture's first camera."""
+    middle, first = middle_of(capture), next(iter(capture.cameras.values()))
+    return middle + float(np.linalg.norm(first.position - middle)) * np.array(START)
 
 
 def spiral_camera(capture: Capture, step: float, *, width: int, height: int) -> Camera:

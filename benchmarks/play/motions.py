@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ash.capture.dataset import Capture, Motion, Pose
 from ash.files import InputError
@@ -103,18 +102,6 @@ def frames_in(act: Act, text: str | None) -> tuple[int, ...]:
     if not 0 <= start < stop <= len(act):
         raise InputError(f"frames: expected A:B within 0:{len(act)}, got {text}")
     return act.frames[start:stop]
-
-
-def bent(motion: Motion, bends_deg: dict[int, tuple[float, float, float]]) -> Motion:
-    """The motion with joints turned further, in all frames: joint -> degrees about its own x, y, z, in this order."""
-    if not bends_deg:
-        return motion
-    dofs = motion.dofs.copy()
-    for joint, degrees in bends_deg.items():
-        at = slice(3 + 3 * joint, 6 + 3 * joint)
-        turn = Rotation.from_euler("XYZ", degrees, degrees=True)
-        dofs[:, at] = (Rotation.from_rotvec(motion.dofs[:, at]) * turn).as_rotvec()
-    return replace(motion, dofs=dofs)
 
 
 def joint_heads(capture: Capture, pose: Pose) -> np.ndarray:

@@ -10,12 +10,12 @@ from typing import Any
 import viser
 import viser._messages as messages
 
+from benchmarks.play.joints import ORDER, UNKNOWN, Angles, angles_of, ranges_of
 from benchmarks.play.picture import Painter, Painting
 from benchmarks.play.standpoint import Standpoint
 from benchmarks.play.state import ABSOLUTE, FLIP, FREE, NO_ERROR, NOTHING, SPIRAL, TRUTH, ViewState
 from benchmarks.play.viewer import Viewer, gone_is_fine
 
-MOST_BEND_DEG = 90
 WORDS_SECONDS = 0.3  # between two changes of the line of numbers: faster nobody reads
 SPEEDS = {"1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0}
 NO_JOINT = "(choose a joint)"
@@ -35,6 +35,10 @@ D dark, L light.
 Because the person is synthetic, the *truth* is known too: put it beside the avatar under *Compare*, for any pose and \
 from any side.
 
+**Numbers**: the error against the truth in dB (higher is better) and as FLIP (lower is better); the picture's size, \
+and how many milliseconds it took. Of these, Stg.1 poses the template mesh, Stg.2 draws what the networks see of it, \
+Stg.3 decodes the Gaussians, Stg.4 splats them. Poses seen before need Stg.4 alone.
+
 **While you move**, the picture is coarser, so that it stays smooth; it is sharp again once you let go.
 """
 
@@ -48,6 +52,7 @@ class Page:
         self.capture = painter.cast.capture
         self.client, self.gui = viewer.client, viewer.client.gui
         self._said = 0.0
+        self._angles_shown: tuple[int | None, int, int] = (None, 0, 0)  # of which joint, act and step
         self._build()
         given = f"const LABEL = {json.dumps(LABEL)}, DIVIDER = {json.dumps(self.divider._impl.uuid)};\n"
         script = messages.RunJavascriptMessage(given + SCRIPT.read_text())
@@ -140,22 +145,22 @@ class Page:
         self.render.on_click(lambda _: self.ask_truth())
 
     def _build_pose(self) -> None:
-        self.gui.add_markdown("Turn a joint further than the motion does, and see whether the avatar bears it.")
-        names = [NO_JOINT, *self.capture.skeleton.names]
+        self.gui.add_markdown("Hold a joint as you like, and see whether the avatar bears it; the others go on moving.")
+        self.joint_names = [name.replace("_", " ") for name in self.capture.skeleton.names]
         self.joint = self.gui.add_dropdown(
-            "Joint", names, initial_value=NO_JOINT, hint="Turned joints are marked in the skeleton."
+            "Joint",
+            [NO_JOINT, *self.joint_names],
+            initial_value=NO_JOINT,
+            hint="Joints that you hold are marked in the skeleton.",
         )
-        self.bends = [
-            self.gui.add_slider(
-                f"About {axis}", -MOST_BEND_DEG, MOST_BEND_DEG, 1, 0, hint=f"Degrees, {words}.", visible=False
-            )
-            for axis, words in (("x", "forward and back"), ("y", "about the body's length"), ("z", "sideways"))
+        self.turns = [
+            self.gui.add_slider(f"About {axis.lower()}", -UNKNOWN, UNKNOWN, 0.5, 0.0, visible=False) for axis in ORDER
         ]
         self.reset_joint = self.gui.add_button("Reset this joint", visible=False)
         self.reset_pose = self.gui.add_button("Reset all joints")
         self._on(self.joint, lambda _: self._choose_joint())
-        for slider in self.bends:
-            self._on(slider, lambda _: self._bend())
+        for number, slider in enumerate(self.turns):
+            self._on(slider, lambda value, number=number: self._turn(number, float(value)))
         self.reset_joint.on_click(lambda _: self._reset(self._joint_index()))
         self.reset_pose.on_click(lambda _: self._reset(None))
 
@@ -235,26 +240,40 @@ class Page:
         self._set(right=value)
 
     def _joint_index(self) -> int | None:
-        return None if self.joint.value == NO_JOINT else self.capture.skeleton.names.index(self.joint.value)
+        return None if self.joint.value == NO_JOINT else self.joint_names.index(self.joint.value)
 
     def _choose_joint(self) -> None:
         joint = self._joint_index()
-        for slider, degrees in zip(self.bends, self.viewer.state.bend_of(-1 if joint is None else joint), strict=True):
-            slider.visible = joint is not None
-            slider.value = round(degrees)
         self.reset_joint.visible = joint is not None
+        ranges = (None,) * len(self.turns) if joint is None else ranges_of(self.capture.skeleton.names[joint])
+        for slider, limits in zip(self.turns, ranges, strict=True):
+            slider.visible = limits is not None
+            if limits is not None:
+                slider.min, slider.max, slider.label = limits.low, limits.high, limits.more.capitalize()
+                slider.hint = f"Degrees: {limits.high:g} {limits.more}, {limits.low:g} {limits.less}."
+        self._show_angles(self.viewer.state)
 
-    def _bend(self) -> None:
+    def _show_angles(self, state: ViewState) -> None:
+        """Put the sliders where the chosen joint is; at an end, where the motion goes beyond."""
+        joint = self._joint_index()
+        for slider, angle in zip(self.turns, self._angles(state, joint) if joint is not None else (), strict=False):
+            slider.value = min(max(angle, slider.min), slider.max)
+        self._angles_shown = joint, state.act, state.step
+
+    def _angles(self, state: ViewState, joint: int) -> Angles:
+        """The angles at which a joint is held, or to which the motion has it turned."""
+        act = self.painter.acts[state.act]
+        rotvec = act.motion.dofs[act.frames[state.step], 3 + 3 * joint : 6 + 3 * joint]
+        return dict(state.held).get(joint) or angles_of(self.capture.skeleton, joint, rotvec)
+
+    def _turn(self, number: int, degrees: float) -> None:
         joint = self._joint_index()
         if joint is not None:
-            x, y, z = (float(slider.value) for slider in self.bends)
-            self.viewer.change(lambda state: state.with_bend(joint, (x, y, z)))
+            x, z, y = (degrees if i == number else a for i, a in enumerate(self._angles(self.viewer.state, joint)))
+            self.viewer.change(lambda state: state.with_held(joint, (x, z, y)))
 
     def _reset(self, joint: int | None) -> None:
-        kept = () if joint is None else tuple(bend for bend in self.viewer.state.bends if bend[0] != joint)
-        self._set(bends=kept)
-        for slider in self.bends:
-            slider.value = 0
+        self._show_angles(self.viewer.change(lambda state: state.without_held(joint)))
 
     def _darken(self, dark: bool) -> None:
         self.dark.value = dark
@@ -294,6 +313,9 @@ class Page:
             self._said = now
             self.title.content = self._headline(state, drawn.score)
             self.words.content = _plain(words) + (f"\n\n{drawn.note}" if drawn.note else "")
+        joint = self._joint_index()
+        if still and self._angles_shown != (joint, state.act, state.step) and joint not in dict(state.held):
+            self._show_angles(state)
 
     def _headline(self, state: ViewState, score: str) -> str:
         act = self.painter.acts[state.act]

@@ -14,16 +14,24 @@ from ash.protocol import StageClock
 from benchmarks.cell import metrics
 from benchmarks.play.actors import Actor, Cast, on_colour
 from benchmarks.play.cameras import resized, spiral_camera
-from benchmarks.play.motions import Act, bent, joint_heads
+from benchmarks.play.joints import held
+from benchmarks.play.motions import Act, joint_heads
 from benchmarks.play.shelf import TruthPicture, TruthShelf
 from benchmarks.play.state import ABSOLUTE, FREE, NO_ERROR, NOTHING, SPIRAL, TRUTH, ViewState
 
 LIGHT, DARK = (236, 236, 236), (24, 26, 30)  # behind the subject
 INK = {False: (20, 25, 35), True: (235, 238, 242)}
-MESH, BONE, JOINT, BENT_JOINT = (47, 111, 222), (221, 107, 32), (255, 255, 255), (255, 60, 60)
-EDGE = 0.045  # of a triangle's height: how wide its outline is drawn
+MESH, BONE, JOINT, HELD_JOINT = (47, 111, 222), (221, 107, 32), (255, 255, 255), (255, 60, 60)
+LINE = 1 / 900  # of the picture's height: how wide a triangle's outline is drawn, at least a pixel
+CLEAR = 6.0  # lines' widths between a triangle's edges, below which its outline fades: a dense mesh veils nothing
 ERROR_WHITE = {ABSOLUTE: 0.3, "FLIP": 0.7}  # the error at which the map's colours end
+UNKNOWN_TRUTH = (
+    "No truth of this view yet: press *Render truth here* under *Compare*, "
+    "or look through one of the capture's cameras."
+)
 SCORES_KEPT = 256
+NAMES_AT = 0.94  # of the height, from the top: above the bar that a phone has at the bottom
+NEAR = 0.01  # metres, of depth: nearer is not drawn
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -41,7 +49,7 @@ class Painter:
 
     def __init__(self, cast: Cast, acts: tuple[Act, ...], shelf: TruthShelf) -> None:
         self.cast, self.acts, self.shelf = cast, acts, shelf
-        self._bent: tuple[tuple, Motion] | None = None
+        self._held: tuple[tuple, Motion] | None = None
         self._scores: OrderedDict[tuple, tuple[float, float, np.ndarray | None]] = OrderedDict()
 
     def draw(self, state: ViewState, *, width: int, height: int, careful: bool) -> Painting:
@@ -58,8 +66,8 @@ class Painter:
         left = self._avatar(state, state.left, Pose(motion, frame), camera, clock)
         if truth is not None and state.error != NO_ERROR:
             left = self._error(state, state.left, Pose(motion, frame), truth, camera)
-        elif state.error != NO_ERROR:
-            note = "No truth of this view yet: press *Render truth here*, or look through one of the capture's cameras."
+        elif truth is None and (state.error != NO_ERROR or state.right == TRUTH):
+            note = UNKNOWN_TRUTH
         pixels = left
         if state.right == TRUTH:
             shown = _blank(camera, state, "No truth of\nthis view yet") if truth is None else _fit(truth, camera, state)
@@ -88,13 +96,13 @@ class Painter:
         return state.eye.camera(width=width, height=height)
 
     def motion(self, act: Act, state: ViewState) -> Motion:
-        """The act's motion, with the viewer's bends; the last one is kept."""
-        if not state.bends:
+        """The act's motion, with the joints that the viewer holds; the last one is kept."""
+        if not state.held:
             return act.motion
-        key = (act.name, state.bends)
-        if self._bent is None or self._bent[0] != key:
-            self._bent = key, bent(act.motion, dict(state.bends))
-        return self._bent[1]
+        key = (act.name, state.held)
+        if self._held is None or self._held[0] != key:
+            self._held = key, held(act.motion, self.cast.capture.skeleton, dict(state.held))
+        return self._held[1]
 
     def _avatar(self, state: ViewState, title: str, pose: Pose, camera: Camera, clock: StageClock) -> np.ndarray:
         actor = self.cast.actor(title)
@@ -180,10 +188,11 @@ def _fit(picture: TruthPicture, camera: Camera, state: ViewState) -> np.ndarray:
 
 def _blank(camera: Camera, state: ViewState, text: str) -> np.ndarray:
     sheet = Image.new("RGB", (camera.width, camera.height), DARK if state.dark else LIGHT)
-    place = (camera.width * (1 + state.divider) / 2, camera.height / 3)  # Above the divider's handle.
     room, longest = (1 - state.divider) * camera.width, max(map(len, text.splitlines()))
-    font = ImageFont.load_default(max(10, min(camera.height / 32, 1.5 * room / longest)))
-    ImageDraw.Draw(sheet).text(place, text, fill=INK[state.dark], font=font, anchor="mm", align="center")
+    size = max(10, min(camera.height / 32, 1.5 * room / longest))
+    place = (state.divider * camera.width + size, camera.height / 3)  # Above the divider's handle, off the panel.
+    font = ImageFont.load_default(size)
+    ImageDraw.Draw(sheet).text(place, text, fill=INK[state.dark], font=font, anchor="lm")
     return np.asarray(sheet)
 
 
@@ -196,7 +205,7 @@ def _divided(left: np.ndarray, right: np.ndarray, state: ViewState) -> np.ndarra
     pen.line([(column, 0), (column, height)], fill=INK[state.dark], width=max(1, height // 300))
     gap = max(6, height // 60)
     name = "Truth" if state.right == TRUTH else state.right
-    base = height - 2 * gap
+    base = round(NAMES_AT * height)
     pen.text((column - gap, base), state.left, fill=INK[state.dark], font=font, anchor="rs")
     pen.text((column + gap, base), name, fill=INK[state.dark], font=font, anchor="ls")
     return np.asarray(sheet)
@@ -208,17 +217,35 @@ def _faces(content: bytes) -> torch.Tensor:
 
 
 def _with_mesh(pixels: np.ndarray, vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
-    """The nearest triangles' outlines."""
+    """The nearest triangles' outlines, as wide everywhere, with soft edges."""
     height, width = pixels.shape[:2]
     seen = vertices @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    homogeneous = torch.from_numpy((seen @ camera.K.T).astype(np.float32))
+    homogeneous = (seen @ camera.K.T).astype(np.float32)
     drawn = rasterize_mesh(
-        homogeneous, _faces(faces.tobytes()), width=width, height=height, threads=torch.get_num_threads()
+        torch.from_numpy(homogeneous),
+        _faces(faces.tobytes()),
+        width=width,
+        height=height,
+        threads=torch.get_num_threads(),
     )
-    edge = (drawn.triangle >= 0) & (drawn.barycentric.amin(-1) < EDGE)
+    triangle = drawn.triangle.numpy()
+    covered = triangle >= 0
+    heights = _heights(homogeneous[:, :2] / np.maximum(homogeneous[:, 2:], NEAR), faces)[triangle[covered]]
+    line = max(1.0, LINE * height)
+    inside = (drawn.barycentric.numpy()[covered] * heights).min(axis=1)  # pixels to the nearest edge
+    opacity = np.clip((line + 1) / 2 - inside, 0, 1) * np.clip(heights.min(axis=1) / (CLEAR * line), 0, 1)
     result = pixels.copy()
-    result[edge.numpy()] = MESH
+    mixed = pixels[covered] + opacity[:, None] * (np.array(MESH, dtype=np.float32) - pixels[covered])
+    result[covered] = np.rint(mixed).astype(np.uint8)
     return result
+
+
+def _heights(corners: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """How far each corner of each triangle lies from the edge opposite, `[f, 3]` pixels."""
+    triangles = corners[faces]
+    edges = np.roll(triangles, -1, axis=1) - np.roll(triangles, 1, axis=1)  # opposite each corner
+    twice_area = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
+    return twice_area[:, None] / np.maximum(np.linalg.norm(edges, axis=2), 1e-6)
 
 
 def _with_skeleton(
@@ -227,12 +254,12 @@ def _with_skeleton(
     sheet = Image.fromarray(pixels)
     pen, size = ImageDraw.Draw(sheet), max(2, pixels.shape[0] // 150)
     places, depth = camera.project(heads)
-    turned = {joint for joint, _ in state.bends}
+    turned = {joint for joint, _ in state.held}
     for joint, parent in enumerate(parents):
         if parent >= 0 and min(depth[joint], depth[parent]) > 0.05:
             pen.line([tuple(places[parent]), tuple(places[joint])], fill=BONE, width=size)
     for joint, (x, y) in enumerate(places):
         if depth[joint] > 0.05:
-            colour = BENT_JOINT if joint in turned else JOINT
+            colour = HELD_JOINT if joint in turned else JOINT
             pen.ellipse([x - size, y - size, x + size, y + size], fill=colour, outline=BONE)
     return np.asarray(sheet)

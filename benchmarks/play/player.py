@@ -11,7 +11,7 @@ import torch
 import viser
 
 from benchmarks.play.actors import Cast, open_cast
-from benchmarks.play.cameras import middle_of
+from benchmarks.play.cameras import middle_of, starting_place
 from benchmarks.play.doors import DoorOptions, close_server, open_server
 from benchmarks.play.motions import acts_of
 from benchmarks.play.page import LABEL, Page
@@ -50,12 +50,10 @@ class PlayServer:
         self.studio.close()
 
     def _set_stage(self) -> None:
-        """Where a new viewer stands: before the person, as far away as the capture's cameras."""
-        middle, first = middle_of(self.cast.capture), next(iter(self.cast.capture.cameras.values()))
-        reach = float(np.linalg.norm(first.position - middle))
-        start = self.server.initial_camera
-        start.position = middle + reach * np.array([0.25, 0.12, 0.96])
-        start.look_at, start.up = middle, np.array([0.0, 1.0, 0.0])
+        """Where a new viewer stands, and what the page looks like."""
+        first, start = next(iter(self.cast.capture.cameras.values())), self.server.initial_camera
+        start.position, start.look_at = starting_place(self.cast.capture), middle_of(self.cast.capture)
+        start.up = np.array([0.0, 1.0, 0.0])
         start.fov = 2 * float(np.arctan2(first.height / 2, first.K[1, 1]))
         self.server.scene.set_up_direction("+y")
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -84,7 +82,7 @@ class PlayServer:
         size = {"width": round(shrink * state.eye.width), "height": round(shrink * state.eye.height)}
         camera = self.painter.camera(state, **size)
         frame = act.frames[state.step]
-        captured = act.captured and not state.bends
+        captured = act.captured and not state.held
         start = time.perf_counter()
 
         def heard(words: str) -> None:

@@ -47,7 +47,7 @@ class TruthShelf:
         """The truth of this pose as this camera sees it, if it is known."""
         frame = act.frames[state.step]
         own = self.capture.cameras.get(state.camera)
-        if own is not None and not state.bends:
+        if own is not None and not state.held:
             image = capture_image(self.capture, act, frame, own)
             if image is not None:
                 return TruthPicture(camera=own, on_black=image)
@@ -71,4 +71,4 @@ def truth_from(camera: Camera, straight: np.ndarray) -> TruthPicture:
 
 
 def _pose_key(act: Act, state: ViewState) -> tuple:
-    return act.name, act.frames[state.step], state.bends
+    return act.name, act.frames[state.step], state.held

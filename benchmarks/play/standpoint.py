@@ -9,13 +9,15 @@ import viser
 from scipy.spatial.transform import Rotation
 
 from ash.capture.dataset import Camera, Capture
-from benchmarks.play.cameras import middle_of, resized
+from benchmarks.play.cameras import middle_of, resized, starting_place
 from benchmarks.play.state import FREE, Eye
 from benchmarks.play.viewer import Viewer
 
 SETTLE_SECONDS = 0.6  # after a jump, in which the browser may still report where it was
 SAME_M, SAME_DEG = 0.01, 0.6
-NARROW = 0.6  # width by height
+NARROW = 0.75  # width by height
+FRUSTUM_M, LINE_M = 0.12, 0.006  # a frustum's size, and how thick its lines are
+BLOCKS_M = 0.6  # of a frustum: nearer, it would hide the person
 TRAINING, HELD_OUT = (47, 111, 222), (221, 107, 32)  # frustums
 
 
@@ -27,7 +29,7 @@ class Standpoint:
         self.viewer, self.capture, self.told = viewer, capture, told
         self.client = viewer.client
         self._jumped: tuple[float, np.ndarray] | None = None
-        self._frustums: list[viser.CameraFrustumHandle] = []
+        self._frustums: dict[str, viser.CameraFrustumHandle] = {}
         self._frustums_wanted = False
         self.client.camera.on_update(self._moved)
         first = eye_of(self.client.camera)  # What it told before anybody listened; it may never say it again.
@@ -38,7 +40,10 @@ class Standpoint:
     def _step_back(self, eye: Eye) -> None:
         """On a narrow screen the person's arms stay in the picture."""
         middle = middle_of(self.capture)
-        self.client.camera.position = middle + (eye.position - middle) * NARROW * eye.height / eye.width
+        with self.client.atomic():  # From where it shall start: what it told may be from before it was sent there.
+            start = starting_place(self.capture)
+            self.client.camera.position = middle + (start - middle) * NARROW * eye.height / eye.width
+            self.client.camera.look_at = middle
 
     def jump(self, name: str) -> None:
         """Look through one of the capture's cameras, follow the spiral, or look around freely from here."""
@@ -51,12 +56,20 @@ class Standpoint:
     def show_frustums(self, wanted: bool) -> None:
         """Draw the capture's cameras, but for the one that is looked through; or none."""
         self._frustums_wanted = wanted
-        for handle in self._frustums:
+        for handle in self._frustums.values():
             handle.remove()
-        self._frustums = []
-        for name, camera in self.capture.cameras.items() if wanted else ():
-            if name != self.viewer.state.camera:
-                self._frustums.append(self._frustum(name, camera))
+        chosen = self.viewer.state.camera
+        own = self.capture.cameras.items() if wanted else ()
+        self._frustums = {name: self._frustum(name, camera) for name, camera in own if name != chosen}
+        self._clear_view()
+
+    def _clear_view(self) -> None:
+        """Hide the frustums that stand before the viewer's face."""
+        eye = self.viewer.state.eye
+        for name, handle in self._frustums.items():
+            far = eye is None or np.linalg.norm(self.capture.cameras[name].position - eye.position) > BLOCKS_M
+            if handle.visible != far:
+                handle.visible = bool(far)
 
     def _frustum(self, name: str, camera: Camera) -> viser.CameraFrustumHandle:
         quat = Rotation.from_matrix(camera.viewmat[:3, :3].T).as_quat()
@@ -64,7 +77,9 @@ class Standpoint:
             f"/cameras/{name}",
             fov=2 * float(np.arctan2(camera.height / 2, camera.K[1, 1])),
             aspect=camera.width / camera.height,
-            scale=0.12,
+            scale=FRUSTUM_M,
+            thickness=LINE_M,
+            variant="filled",  # Lines alone are hard to hit.
             color=TRAINING if name in self.capture.splits["train"].cameras else HELD_OUT,
             wxyz=quat[[3, 0, 1, 2]],
             position=camera.position,
@@ -94,11 +109,13 @@ class Standpoint:
             return
         if self._is_where_it_jumped(eye):
             self.viewer.change(lambda state: replace(state, eye=eye))
+            self._clear_view()
             return
         before = self.viewer.state.eye
         stays = before is None or np.array_equal(eye.viewmat, before.viewmat)  # Only the window's size changed.
         self.viewer.change(lambda state: replace(state, eye=eye, camera=state.camera if stays else FREE))
         self.told(self.viewer.state.camera)
+        self._clear_view()
 
     def _is_where_it_jumped(self, eye: Eye) -> bool:
         if self._jumped is None or self.viewer.state.camera not in self.capture.cameras:

@@ -5,11 +5,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ash.capture.dataset import Camera
+from benchmarks.play.joints import Angles
 
 NOTHING, TRUTH = "nothing", "the truth"
 NO_ERROR, ABSOLUTE, FLIP = "no", "absolute", "FLIP"
 FREE, SPIRAL = "free", "spiral"
-Bend = tuple[float, float, float]  # degrees about a joint's own x, y, z
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -49,21 +49,19 @@ class ViewState:
     mesh: bool = False
     skeleton: bool = False
     ellipsoids: bool = False
-    bends: tuple[tuple[int, Bend], ...] = ()
+    held: tuple[tuple[int, Angles], ...] = ()  # joints that the viewer turned, and their angles
     dark: bool = False
     camera: str = FREE  # or spiral, or one of the capture's
     angle: float = 0.0  # steps along the spiral
     eye: Eye | None = field(default=None, compare=False)  # None until the browser has told
 
-    def with_bend(self, joint: int, bend: Bend) -> "ViewState":
-        """With one joint turned; no turn at all is not remembered."""
-        others = {j: b for j, b in self.bends if j != joint}
-        kept = others | ({joint: bend} if any(bend) else {})
-        return replace(self, bends=tuple(sorted(kept.items())))
+    def with_held(self, joint: int, angles: Angles) -> "ViewState":
+        """With one joint held at angles, in all frames."""
+        return replace(self, held=tuple(sorted((dict(self.held) | {joint: angles}).items())))
 
-    def bend_of(self, joint: int) -> Bend:
-        """How far a joint is turned."""
-        return dict(self.bends).get(joint, (0.0, 0.0, 0.0))
+    def without_held(self, joint: int | None) -> "ViewState":
+        """With one joint as the motion has it again; None: with all."""
+        return replace(self, held=tuple(each for each in self.held if joint is not None and each[0] != joint))
 
     def stepped(self, steps: int, length: int) -> "ViewState":
         """So many frames further; at the ends, around again or stopped, as `loop` says."""

@@ -98,7 +98,7 @@ class Viewer:
             self._sharp = not self._dirty
         self._sent.append(self.served)
         with gone_is_fine(self.client):
-            self.show(state, drawn, self._words(drawn, ms))
+            self.show(state, drawn, self._words(drawn, ms, moving=moving))
 
     def _advance(self, now: float) -> ViewState:
         """Let the motion and the spiral go on by the time that has passed."""
@@ -119,15 +119,15 @@ class Viewer:
         with self._lock:
             self._state = replace(self._state, playing=False)
 
-    def _words(self, drawn: Painting, ms: float) -> str:
+    def _words(self, drawn: Painting, ms: float, *, moving: bool) -> str:
         height, width = drawn.pixels.shape[:2]
         times = [t for t in self._sent if self.served - t < 1.5]
         rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 2 else 0.0
         stages = " · ".join(
             f"{name.replace('stg', 'Stg.')} {value:.0f}" for name, value in sorted(drawn.stage_ms.items())
         )
-        moving = f"{rate:.0f} pictures a second, " if rate >= 2 else ""
-        return f"{moving}{width} x {height}, {ms:.0f} ms ({stages})"
+        speed = f"{rate:.0f} pictures a second, " if moving and rate >= 2 else ""
+        return f"{speed}{width} x {height}, {ms:.0f} ms" + (f" ({stages})" if stages else "")
 
 
 @contextmanager

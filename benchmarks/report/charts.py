@@ -52,7 +52,9 @@ def speed(
         if x[0] < REAL_TIME_MS < x[1]:
             mark = pd.DataFrame({"ms": [REAL_TIME_MS], "psnr": [y[0]], "text": ["30 frames/s"]})
             layers.append(alt.Chart(_data(mark)).mark_rule(strokeDash=[2, 4]).encode(x=at["x"]))
-            layers.append(_text(alt.Chart(_data(mark)), at, "text:N", dx=4, dy=-6, align="left", color=DIM))
+            late = math.log(REAL_TIME_MS / x[0]) > 0.8 * math.log(x[1] / x[0])  # No room is left on the right.
+            place: dict[str, Any] = {"dx": -4, "align": "right"} if late else {"dx": 4, "align": "left"}
+            layers.append(_text(alt.Chart(_data(mark)), at, "text:N", dy=-6, color=DIM, **place))
         panels.append(_layer(layers, f"{panel}", size, notes.get(str(panel), "")))
     return tuple(panels), named
 

@@ -133,7 +133,11 @@ def effects_figure(found: Sequence[Contrast], scene: str) -> Figure | None:
 
 
 def training_figure(scores: Scores, curves: pd.DataFrame, scene: str) -> Figure | None:
-    """Foreground PSNR of reserved training views over seconds of training, first seed; `curves`: see `curves_of`."""
+    """Foreground PSNR of reserved training views over seconds of training, first seed of the first capture.
+
+    `curves`: see `curves_of`.
+    """
+    curves = curves[curves["capture"] == curves.groupby("method")["capture"].transform("first")]
     curves = curves[curves["seed"] == curves.groupby("method")["seed"].transform("min")]
     methods = [m for m in scores.methods(scene) if (curves["method"] == m).sum() > 1]
     if not methods:

@@ -42,6 +42,8 @@ COSTS = (
     "search_s",
     "settled_s",
     "steps",
+    "train_cameras",
+    "train_frames",
     "peak_rss_mb",
     "params",
     "gaussians",

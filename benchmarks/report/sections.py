@@ -42,8 +42,8 @@ def margins(scores: Scores) -> list[Section]:
             for mm, psnr in level.qualities
         ]
     )
-    known, own = "template of known error", "the method's own template"
-    margins = [(c, known, m) for c in curves for m in c.known] + [(c, own, c.honest) for c in curves if c.honest]
+    known, own = "planted error", "learned template"
+    margins = [(c, known, m) for c in curves for m in c.known] + [(c, own, m) for c in curves for m in c.learned]
     differences = pd.DataFrame([_sample(c, name, m.error_mm, m.mean, m.low, m.high) for c, name, m in margins])
     rules = [(_place(c), 0.0, "") for c in curves]
     rules += [(_place(c), c.paper_db, f"the paper's {c.paper_db:+.1f} dB") for c in curves if c.paper_db is not None]
@@ -63,8 +63,8 @@ def margins(scores: Scores) -> list[Section]:
         Figure(
             name="margin",
             title="ASH minus DDC against the template's error",
-            caption="Foreground PSNR of ASH minus DDC when both are given such a template, and with the methods' own. "
-            f"{WHISKERS}",
+            caption="Foreground PSNR of ASH minus DDC when both are given such a template, and on templates that both "
+            f"learned. {WHISKERS}",
             panels=charts.lines(
                 differences,
                 pair,
@@ -75,7 +75,8 @@ def margins(scores: Scores) -> list[Section]:
             series=tuple(pair),
         ),
     )
-    findings = Bullets(items=tuple(margin.sentence(curve) for curve in curves))
+    placed = [placement for curve in curves if (placement := margin.placement(curve))]
+    findings = Bullets(items=(*map(margin.sentence, curves), *placed))
     return [Section(title="The margin explained", blocks=(*map(_chart, figures), findings))]
 
 

@@ -13,6 +13,10 @@ from benchmarks.cell.methods import is_oracle
 TOO_CLOSE_DB = 0.1
 CLOCKS_APART_S, CLOCKS_APART = 5.0, 0.5  # seconds, and share of the shorter: what a busy machine does not explain
 FEW_METHODS = 6
+DRAWN_BY = {
+    "display": "frames are timed as its display draws them, by OpenGL",
+    "trainer": "frames are timed as its training renderer draws them, for this machine opens no OpenGL display",
+}
 
 
 def headline(scores: Scores, scene: str) -> str:
@@ -38,6 +42,7 @@ def remarks(scores: Scores, scene: str) -> list[str]:
     choices = scores.outcomes.query("scene == @scene and choice != ''").drop_duplicates(["method", "choice"])
     said = [f"{look_of(method).title}: {choice}" for method, choice in zip(choices.method, choices.choice, strict=True)]
     found.append(f"What a search found to suffice: {'; '.join(said)}." if said else "")
+    found.append(_supervision(scores, scene))
     dead = _told(scores, scene, "dead")
     found.append(f"Decoders carry nothing, the same output in every frame: {dead}." if dead else "")
     failed = [look_of(method).title for method in scores.methods(scene) if scores.failed(scene, method)]
@@ -61,6 +66,10 @@ def doubts(results: Sequence[CellResult]) -> tuple[str, ...]:
             f"Not isolated: {', '.join(titles)}. The system had no room to lock the method in, so the truth was out of"
             " sight, and opening it was watched, but not impossible."
         )
+    for kind, words in DRAWN_BY.items():
+        timed = (r.config.method for r in results if r.timing is not None and r.timing.drawn_by == kind)
+        if names := [look_of(method).title for method in dict.fromkeys(timed)]:
+            found.append(f"{', '.join(names)}: {words}.")
     for result in results:
         wall, cpu = (result.value("speed", "", f"train_{clock}_s") for clock in ("wall", "cpu"))
         if wall is None or cpu is None or abs(wall - cpu) < CLOCKS_APART_S + CLOCKS_APART * min(wall, cpu):
@@ -140,6 +149,16 @@ def _template(scores: Scores, scene: str) -> str:
     later = dict(errors["novel_pose"]).get(method)
     test = "" if later is None else f", {later:.1f} mm on held-out motion"
     return f"The template that methods were given is off by {error:.1f} mm (root mean square){test}."
+
+
+def _supervision(scores: Scores, scene: str) -> str:
+    """What each row's template was learned from."""
+    rows = scores.outcomes.query("scene == @scene and template != ''").drop_duplicates(["method", "template"])
+    said = [
+        f"{template} ({', '.join(look_of(method).title for method in group['method'])})"
+        for template, group in rows.groupby("template", sort=False)
+    ]
+    return f"Templates: {'; '.join(said)}." if said else ""
 
 
 def _told(scores: Scores, scene: str, what: str) -> str:

@@ -37,7 +37,7 @@ CAPTURE = "mannequin-ci-0"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Subject:
+class TimedAvatar:
     """A configuration to be timed."""
 
     name: str
@@ -47,18 +47,18 @@ class Subject:
     trains: bool = False  # time steps of training, too
 
 
-def subjects() -> tuple[Subject, ...]:
+def subjects() -> tuple[TimedAvatar, ...]:
     """`cpu` at four resolutions of the texel lattice, `frugal`, and the paper's."""
     cpu = named("cpu")
     lattices = {texels: replace(cpu, model=replace(cpu.model, texels=texels)) for texels in (64, 128, 256, 512)}
     small = [
-        Subject(
+        TimedAvatar(
             name="cpu" if config == cpu else f"cpu@{texels}", config=config, width=512, height=512, trains=config == cpu
         )
         for texels, config in lattices.items()
     ]
-    frugal = Subject(name="frugal", config=named("frugal"), width=512, height=512, trains=True)
-    return (*small, frugal, Subject(name="paper", config=named("paper"), width=1285, height=940))
+    frugal = TimedAvatar(name="frugal", config=named("frugal"), width=512, height=512, trains=True)
+    return (*small, frugal, TimedAvatar(name="paper", config=named("paper"), width=1285, height=940))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +74,7 @@ class PictureAgreement:
 def speed_frame(
     capture: Capture,
     *,
-    timed: tuple[Subject, ...] | None = None,
+    timed: tuple[TimedAvatar, ...] | None = None,
     threads: tuple[int, ...] = (1, 2),
     rounds: int = 15,
 ) -> Iterator[list[SpeedRow] | PictureAgreement]:
@@ -127,7 +127,7 @@ def _wake(avatar: AshAvatar) -> None:
 def frame_by_definition(model: AshModel, capture: Capture, frame: int, camera: Camera) -> Tensor:
     """The image of a frame by the definitions alone, rgb `[h, w, 3]`."""
     posed = model.template.pose(Pose(capture.motion, frame))
-    canonical, normals, transforms = place_naive(model.lattice, posed)
+    canonical, normals, transforms = place_naive(model.lattice, posed, model.config.anchor)
     conditions = replace(
         model.conditions(Pose(capture.motion, frame)), canonical=canonical, normals=normals, transforms=transforms
     )

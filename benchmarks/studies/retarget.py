@@ -14,7 +14,8 @@ from ash.capture.formats import load_capture, read_template_truth
 from ash.files import InputError, sha256_of, write_image, write_json
 from benchmarks.cell import metrics
 from benchmarks.cell.cells import Cell, is_trained, result_of
-from benchmarks.cell.host import EXAM, Killed, MethodFailed
+from benchmarks.cell.failing import Killed, MethodFailed
+from benchmarks.cell.host import EXAM
 from benchmarks.cell.methods import ORACLES
 from benchmarks.cell.process import trained_host
 from benchmarks.cell.views import View, spread

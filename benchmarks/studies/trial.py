@@ -77,15 +77,19 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def read_outcome(folder: Path) -> Outcome | None:
-    """What a trial left, or None where it did not come to its end."""
+    """What a trial left, or None where it did not come to its end.
+
+    Raises:
+        InputError: it is something else; the method's process can write there too.
+    """
     path = folder / "outcome.json"
     if not path.exists():
         return None
-    content = read_json(path)
-    known = {field.name: content[field.name] for field in fields(Outcome)}
-    known["pictures"] = tuple(known["pictures"])
-    known["again"] = None if known["again"] is None else tuple(known["again"])
-    return Outcome(**known)
+    try:
+        outcome: Outcome = from_json(Outcome, read_json(path))
+        return outcome
+    except ValueError as error:
+        raise InputError(f"{path}: expected what a trial leaves ({error})") from error
 
 
 def perform(trial: Trial, folder: Path) -> Outcome:

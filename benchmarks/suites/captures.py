@@ -9,7 +9,8 @@ from ash.capture.manifest import Manifest, is_capture, read_manifest, verify_cap
 from ash.files import InputError, hash_of
 from benchmarks.suites.scenes import draw_scene, identity_of, scene_of
 from benchmarks.suites.stress import Stress
-from benchmarks.suites.suites import CaptureSpec
+from benchmarks.suites.suites import CaptureSpec, Suite
+from synth.person.cast import VALIDATION
 from synth.readers.perturb import perturb
 from synth.scene import Scene
 
@@ -33,7 +34,14 @@ def make_capture(spec: CaptureSpec, data: Path, *, workers: int) -> Path:
 
 def described(spec: CaptureSpec) -> Scene:
     """The scene of a capture that is to be made."""
-    return scene_of(spec.of or spec.scene, size=spec.size, seed=spec.seed, name=spec.scene, changes=spec.changes)
+    return scene_of(
+        spec.of or spec.scene,
+        size=spec.size,
+        seed=spec.seed,
+        subject=spec.subject,
+        name=spec.scene,
+        changes=spec.changes,
+    )
 
 
 def _spoilt_capture(spec: CaptureSpec, stress: Stress, clean: Path, data: Path) -> Path:
@@ -61,6 +69,31 @@ def require_intact(folder: Path) -> None:
     if problems:
         more = f" (and {len(problems) - 1} more, see ash-bench verify)" if len(problems) > 1 else ""
         raise InputError(f"{folder}: {problems[0]}{more}")
+
+
+def subject_of(manifest: Manifest) -> int:
+    """Whom a capture shows; captures from before there were others show subject 0."""
+    number = manifest.parameters.get("subject", 0)
+    if not isinstance(number, int):
+        raise InputError(f"capture of {manifest.scene}: subject {number!r}, expected a whole number")
+    return number
+
+
+def require_published(suite: Suite) -> None:
+    """Refuse a suite with captures for validation and tuning: what was tuned on them may not be judged by them.
+
+    Raises:
+        InputError: a finished capture has a subject or a root seed from 100 on.
+    """
+    for spec in suite.captures:
+        if spec.folder is None:
+            continue
+        manifest = read_manifest(spec.folder)
+        for what, number in (("subject", subject_of(manifest)), ("seed", manifest.seed)):
+            if number >= VALIDATION:
+                raise InputError(
+                    f"{spec.folder}: {what} {number} is for validation and tuning, expected one below {VALIDATION}"
+                )
 
 
 def truth_of(manifest: Manifest) -> str:

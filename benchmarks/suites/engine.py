@@ -288,7 +288,19 @@ def _environment() -> dict[str, str]:
 def _why_stale(cell: Cell) -> str | None:
     """Which input changed since this method and seed were last run in this folder, if they were."""
     fresh = asdict(cell.config)
-    same = ("scene", "size", "method", "preset", "seed", "capture_seed", "axis", "severity", "factory", "changes")
+    same = (
+        "scene",
+        "size",
+        "method",
+        "preset",
+        "seed",
+        "capture_seed",
+        "subject",
+        "axis",
+        "severity",
+        "factory",
+        "changes",
+    )
     for path in cell.folder.parent.glob("*/config.json"):
         content = read_json(path)
         old = content.get("config", {}) if isinstance(content, dict) else {}

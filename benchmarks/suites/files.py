@@ -5,7 +5,8 @@
     size = "quick"               # of scenes; `size` in a scene's table overrules it
     methods = ["ash", { of = "ash", model.width = 8 }, { of = "my_package.avatar:mine", name = "mine" }]
     preset = "cpu"               # of methods; `preset` in a method's table overrules it
-    seeds = 3
+    seeds = 3                    # of the training
+    subjects = 8                 # captures of so many people, see `synth.person.cast`
     stresses.cameras = [25, 50]  # axis = severities, see `benchmarks.suites.stress`
     limit_minutes = 60           # of one cell, and limit_mb
     cell_minutes = 2.5           # what one cell takes, for estimates
@@ -20,17 +21,18 @@ from pathlib import Path
 from typing import Any
 
 import tomlkit
-from tomlkit.exceptions import NonExistentKey, ParseError
+from tomlkit.exceptions import NonExistentKey, TOMLKitError
 from tomlkit.items import AbstractTable, Table
 
 from ash.capture.manifest import read_manifest
 from ash.fields import WRITTEN, Changes, nearest
-from ash.files import InputError
+from ash.files import InputError, open_regular
 from benchmarks.cell.methods import configured, find_method
 from benchmarks.suites.stress import Stress
 from benchmarks.suites.suites import MethodSpec, SceneSpec, Suite, varied_name
 
 FOLDER = Path(__file__).parent
+LARGEST = 1 << 20  # bytes of a suite's file
 MARK = "ba5e11ne"  # Found again where it was put; no file has it.
 Place = tuple[str | int, ...]  # A key of the file, from the top.
 PLAIN: dict[str, type] = {
@@ -38,6 +40,7 @@ PLAIN: dict[str, type] = {
     "size": str,
     "preset": str,
     "seeds": int,
+    "subjects": int,
     "cell_minutes": float,
     "limit_minutes": float,
     "limit_mb": int,
@@ -65,14 +68,13 @@ def read_suite(path: Path) -> Suite:
         InputError: names file, line and key.
     """
     try:
-        text = path.read_text()
+        with open_regular(path, most=LARGEST) as file:
+            text = file.read().decode()
         content: dict[str, Any] = tomlkit.parse(text).unwrap()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: expected TOML in UTF-8 ({error})") from error
-    except ParseError as error:
-        raise InputError(f"{path}:{error.line}: not valid TOML ({error})") from error
+    except TOMLKitError as error:  # Not every kind knows its line.
+        raise InputError(f"{path}:{getattr(error, 'line', 1)}: not valid TOML ({error})") from error
     return _Reader(path, text).suite(content)
 
 
@@ -161,8 +163,9 @@ class _Reader:
         for key, value in known.items():
             if not isinstance(value, str) or not value:
                 raise self.error((*place, key), f"{key}: expected a text, got {value!r}")
-        if "seed" in row:
-            raise self.error((*place, "seed"), "seed: a row has none of its own, the suite's `seeds` counts them")
+        for key in ("seed", "subject"):
+            if key in row:
+                raise self.error((*place, key), f"{key}: a row has none of its own, the suite's `{key}s` counts them")
         return known, _dotted({key: value for key, value in row.items() if key not in own})
 
     def required(self, known: dict[str, str], place: Place) -> str:

@@ -11,7 +11,7 @@ from ash.files import InputError, only_run_in, read_json, require_plain, write_j
 from benchmarks.cell.cells import Cell, CellConfig, CellResult, read_cell, result_of
 from benchmarks.cell.methods import code_version, find_method
 from benchmarks.cell.metrics import PROTOCOL
-from benchmarks.suites.captures import make_capture, require_intact, truth_of
+from benchmarks.suites.captures import make_capture, require_intact, subject_of, truth_of
 from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells, shard_of
 from benchmarks.suites.progress import Progress
 from benchmarks.suites.suites import CellSpec, Suite
@@ -105,6 +105,7 @@ def cell_for(spec: CellSpec, capture_folder: Path, out: Path) -> Cell:
         changes=dict(spec.changes),
         axis=spec.capture.stress.axis if spec.capture.stress else "",
         severity=spec.capture.stress.severity if spec.capture.stress else 0.0,
+        subject=subject_of(capture.manifest),
     )
     return Cell(config=config, folder=out / "cells" / config.key, capture_folder=capture_folder)
 
@@ -148,14 +149,15 @@ def read_run(folder: Path) -> Run:
 def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
     """The finished cells of several runs as one, to be reported in `out`; a cell that several have is taken once.
 
-    Where one scene's name stands for different captures, each is called as its capture's folder is.
+    Where one scene's name stands for different captures of a subject, each is called as its capture's folder is.
     """
     runs = [read_run(folder) for folder in folders]
     cells = list({cell.config.key: cell for run in runs for cell in run.cells}.values())
-    shown: dict[str, set[str]] = {}
+    shown: dict[tuple[str, int], set[str]] = {}
     for cell in cells:
-        shown.setdefault(cell.config.place, set()).add(cell.config.truth)
-    named = [_told_apart(cell) if len(shown[cell.config.place]) > 1 else cell for cell in cells]
+        shown.setdefault((cell.config.place, cell.config.subject), set()).add(cell.config.truth)
+    mixed = {place for (place, _), truths in shown.items() if len(truths) > 1}
+    named = [_told_apart(cell) if cell.config.place in mixed else cell for cell in cells]
     about = f"cells of {', '.join(map(str, folders))}"
     return Run(folder=out, suite=out.name, about=about, command=command, cells=tuple(named))
 

@@ -1,7 +1,9 @@
 """Every scene by its name, those of the generator and `splats`, and how each becomes a capture."""
 
 from collections.abc import Callable
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +22,7 @@ def scene_names() -> tuple[str, ...]:
     return (*SCENES, SPLATS)
 
 
-def scene_of(of: str, *, size: str, seed: int = 0, name: str = "", changes: Changes = ()) -> Scene:
+def scene_of(of: str, *, size: str, seed: int = 0, subject: int = 0, name: str = "", changes: Changes = ()) -> Scene:
     """A scene by name, with fields replaced; `name` is what it is called then.
 
     Raises:
@@ -28,7 +30,7 @@ def scene_of(of: str, *, size: str, seed: int = 0, name: str = "", changes: Chan
     """
     if of not in scene_names():
         raise InputError(f"unknown scene {of!r}, {nearest(of, scene_names())}")
-    return replaced(replace(_plain(of, size, seed), name=name or of), changes, of=of)
+    return replaced(replace(_plain(of, size, seed), subject=subject, name=name or of), changes, of=of)
 
 
 def _plain(of: str, size: str, seed: int) -> Scene:
@@ -47,7 +49,11 @@ def identity_of(of: str, wanted: Scene) -> str:
 
 
 def draw_scene(of: str, wanted: Scene, folder: Path, *, title: str, workers: int) -> None:
-    """Render into `folder` what is missing of the capture of a scene that is a variant of `of`."""
+    """Render into `folder` what is missing of the capture of a scene that is a variant of `of`.
+
+    Raises:
+        InputError: processes that render were killed from outside, in each of two attempts.
+    """
     if of == SPLATS:
         from benchmarks.suites import splats
 
@@ -58,7 +64,18 @@ def draw_scene(of: str, wanted: Scene, folder: Path, *, title: str, workers: int
     progress = Progress(f"images of {title}", 0, expected_s=0.0, workers=workers)
     if not (folder / "cameras.json").exists():  # Written last before the images.
         progress.say(f"preparing {title}: body, motion, clothes, texture (up to two minutes)")
-    render(wanted, folder, workers=workers, progress=progress.advance)
+    draw = partial(render, wanted, folder, workers=workers, progress=progress.advance)
+    try:
+        draw()
+    except BrokenProcessPool:  # The kernel kills when memory runs out; what was drawn is kept.
+        progress.say(f"{title}: a process that renders was killed from outside, tried again")
+        try:
+            draw()
+        except BrokenProcessPool:
+            raise InputError(
+                f"{folder}: processes that render were killed from outside in each of 2 attempts; the kernel does that"
+                " when memory runs out, and fewer --workers need less"
+            ) from None
     progress.close()
 
 

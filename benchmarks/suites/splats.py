@@ -1,9 +1,9 @@
-"""The first rung, `splats`: images of known texel Gaussians, so that no model error is left. ASH must recover them.
+"""The first rung, `splats`: images of known Gaussians, so that no light, cloth or pose stands between them and ASH.
 
-It is drawn here and not in `synth`, which makes the truth that the splatter is judged by and so must not know it.
+They are none of ASH's: more than it has texels, at other places, of other shapes. Training must approximate them.
+The rung is drawn here and not in `synth`, which makes the truth that the splatter is judged by and so must not know it.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,16 +17,15 @@ from ash.capture.formats import write_cameras, write_motion, write_skeleton, wri
 from ash.capture.manifest import Manifest, hash_files, is_capture
 from ash.config import ModelConfig
 from ash.files import hash_of, write_arrays, write_image
-from ash.gaussians.initialising import DISC_SCALE, DISC_THICKNESS, blank_gaussians, texel_pitch
 from ash.model import AshModel
-from ash.rotations import rotmat_to_unitquat
-from ash.template.template import RestDeformation, Template, vertex_normals
-from ash.textures import TexelLattice, build_lattice
-from synth.capture import WantedView, make_body, splits
+from ash.template.template import RestDeformation, Template
+from ash.textures import TexelLattice
+from synth.capture import make_body
 from synth.scene import Scene
+from synth.views import WantedView, splits
 
-CI_TEXELS, TEXELS = 64, 256  # As the presets have at these sizes: the very Gaussians can be recovered.
-VERSION = 1
+CI_COUNT, COUNT = 5_000, 60_000  # About twice as many as the presets' lattices have texels at these sizes.
+VERSION = 2
 
 
 def identity(scene: Scene) -> str:
@@ -93,7 +92,8 @@ def _person(scene: Scene) -> Person:
     mesh = body.template()
     motion = make_motion(body.skeleton, scene.train + scene.test, fps=scene.fps, seed=stream(scene, "motion"))
     template = Template(mesh, body.skeleton, RestDeformation(mesh))
-    model = known_avatar(template, texels=CI_TEXELS if scene.size == "ci" else TEXELS, seed=scene.seed)
+    seed = stream(scene, "splats") if scene.subject else scene.seed
+    model = known_avatar(template, count=CI_COUNT if scene.size == "ci" else COUNT, seed=seed)
     posed = np.stack([template.pose(Pose(motion, frame)).vertices.numpy() for frame in range(len(motion.dofs))])
     cameras = make_cameras(scene.rig, posed.reshape(-1, 3).astype(np.float64))
     return Person(
@@ -106,42 +106,68 @@ def _person(scene: Scene) -> Person:
     )
 
 
-def known_avatar(template: Template, *, texels: int, seed: int) -> AshModel:
-    """Texel Gaussians that no training has touched, on a template: discs of many sizes, colours, opacities, offsets."""
+def known_avatar(template: Template, *, count: int, seed: int) -> AshModel:
+    """`count` Gaussians at random places of a template, of random sizes, shapes, directions, opacities and colours.
+
+    No texel lattice and no initialiser of the method has a part in it: what is trained must approximate them.
+    """
     config = ModelConfig(
-        texels=texels, window=1, yaw_normalise=True, levels=0, motion=False, base=True, sh_degree=0, dilation=0.05
+        texels=4,
+        window=1,
+        yaw_normalise=True,
+        levels=0,
+        motion=False,
+        base=True,
+        sh_degree=0,
+        dilation=0.05,
+        anchor="surface",
+        offset_unit_m=1.0,
     )
-    lattice = build_lattice(template.mesh, texels)
-    return AshModel(config, template, lattice, _known_gaussians(config, template, lattice, seed), None)
+    rng = np.random.default_rng([seed, 7])
+    places = scattered(template.mesh, count, rng)
+    return AshModel(config, template, places, _known_gaussians(template, places, rng), None)
 
 
-def _known_gaussians(config: ModelConfig, template: Template, lattice: TexelLattice, seed: int) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
+def scattered(mesh: TemplateMesh, count: int, rng: np.random.Generator) -> TexelLattice:
+    """Places of a mesh drawn evenly over its surface, in the form of a lattice; they lie on no texel."""
+    area = _areas(mesh)
+    triangle = rng.choice(len(area), count, p=area / area.sum())
+    return TexelLattice(
+        resolution=1,
+        texels=torch.arange(count),
+        corners=torch.from_numpy(mesh.faces[triangle]),
+        barycentric=torch.from_numpy(rng.dirichlet(np.ones(3), count)).float(),
+    )
+
+
+def _areas(mesh: TemplateMesh) -> np.ndarray:
+    """Of the triangles, square metres."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    doubled: np.ndarray = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return doubled / 2
+
+
+def _known_gaussians(template: Template, places: TexelLattice, rng: np.random.Generator) -> Tensor:
+    """Raw parameters `[n, 14]`: offset (metres), log-scale, quaternion, opacity's logit, colour's constant."""
     rest = torch.from_numpy(template.mesh.vertices).float()
-    count = len(lattice.texels)
-    places, pitch = lattice.interpolate(rest), texel_pitch(lattice, rest)
-    normals = torch.nn.functional.normalize(lattice.interpolate(vertex_normals(rest, template.faces)), dim=-1)
-    raw = blank_gaussians(config, count, 1.0)
-    raw[:, :3] = 0.2 * _waves(places, 3, 0.1, generator)  # centimetres
-    raw[:, 3:6] = (DISC_SCALE * pitch).log()[:, None] + 0.1 * torch.randn(count, 3, generator=generator)
-    raw[:, 5] += math.log(DISC_THICKNESS)
-    helper = torch.eye(3)[normals.abs().argmin(1)]
-    first = torch.nn.functional.normalize(torch.linalg.cross(helper, normals), dim=-1)
-    raw[:, 6:10] = rotmat_to_unitquat(torch.stack([first, torch.linalg.cross(normals, first), normals], -1))
-    raw[:, 10] = 2 + _waves(places, 1, 0.2, generator)[:, 0]
-    # Colours that change from texel to texel and along the body; 0.5 plus 0.28 times them stays within 0 and 1.
-    raw[:, 11:14] = 0.5 * _waves(places, 3, 0.06, generator) + 0.15 * torch.randn(count, 3, generator=generator)
-    return raw
+    points = places.interpolate(rest).numpy()
+    pitch = np.sqrt(_areas(template.mesh).sum() / len(points))
+    size = np.log(0.7 * pitch) + rng.normal(0, 0.3, (len(points), 1)) + rng.normal(0, 0.4, (len(points), 3))
+    offset = 0.002 * _waves(points, 3, 0.1, rng)
+    turn = rng.standard_normal((len(points), 4))
+    opacity = 1.5 + 1.0 * rng.standard_normal((len(points), 1))
+    # Colours that change from one to the next and along the body; 0.5 plus 0.28 times them stays within 0 and 1.
+    colour = 0.5 * _waves(points, 3, 0.06, rng) + 0.15 * rng.standard_normal((len(points), 3))
+    return torch.from_numpy(np.concatenate([offset, size, turn, opacity, colour], 1)).float()
 
 
-def _waves(places: Tensor, channels: int, length_m: float, generator: torch.Generator) -> Tensor:
+def _waves(places: np.ndarray, channels: int, length_m: float, rng: np.random.Generator) -> np.ndarray:
     """Smooth random functions over space, of variance one: a sum of waves."""
     count = 32
-    directions = torch.randn(3, count, generator=generator) / length_m
-    phases = 2 * math.pi * torch.rand(count, generator=generator)
-    return (
-        torch.cos(places @ directions + phases) @ torch.randn(count, channels, generator=generator) / (count / 2) ** 0.5
-    )
+    directions, phases = rng.standard_normal((3, count)) / length_m, rng.uniform(0, 2 * np.pi, count)
+    weights = rng.standard_normal((count, channels)) / (count / 2) ** 0.5
+    waves: np.ndarray = np.cos(places @ directions + phases) @ weights
+    return waves
 
 
 @torch.no_grad()

@@ -9,6 +9,7 @@ from ash.fields import Changes
 from ash.files import InputError, hash_of
 from benchmarks.cell.methods import ORACLES, find_method, is_oracle, named_method
 from benchmarks.suites.stress import Stress
+from synth.person.cast import VALIDATION
 
 LONGEST_VALUE = 24  # Characters of a changed value in a name; its hash stands for a longer one.
 
@@ -44,11 +45,12 @@ class MethodSpec:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class CaptureSpec:
-    """Which capture a cell needs: a scene, its root seed, and how it is spoilt, if it is."""
+    """Which capture a cell needs: a scene, its root seed, its subject, and how it is spoilt, if it is."""
 
     scene: str
     size: str
     seed: int = 0
+    subject: int = 0
     stress: Stress | None = None
     of: str = ""  # the generator's scene, where `scene` is a name of the suite's
     changes: Changes = ()
@@ -57,7 +59,7 @@ class CaptureSpec:
     @property
     def name(self) -> str:
         """The capture's folder."""
-        name = f"{self.scene}-{self.size}-{self.seed}"
+        name = capture_name(self.scene, self.size, self.seed, self.subject)
         return name if self.stress is None else f"{name}-{self.stress.axis}-{self.stress.severity:g}"
 
 
@@ -84,6 +86,7 @@ class Suite:
     methods: tuple[MethodSpec, ...]
     preset: str
     seeds: int = 1
+    subjects: int = 1
     cell_minutes: float = 1.0
     stresses: tuple[Stress, ...] = ()
     limit_minutes: float = 60.0
@@ -99,14 +102,28 @@ class Suite:
                 raise InputError(f"two {what}s are called {twice[0]!r}, expected a name of its own for each")
         if self.seeds < 1:
             raise InputError(f"seeds: expected at least 1, got {self.seeds}")
+        if not 1 <= self.subjects <= VALIDATION:
+            raise InputError(
+                f"subjects: expected 1 to {VALIDATION}, got {self.subjects}:"
+                f" those from {VALIDATION} on are for validation"
+            )
         for name in ("cell_minutes", "limit_minutes", "limit_mb"):
             if getattr(self, name) <= 0:
                 raise InputError(f"{name}: expected more than 0, got {getattr(self, name)}")
 
     @property
     def captures(self) -> tuple[CaptureSpec, ...]:
-        """One capture per scene, and one per scene and stress, shared by all methods and seeds."""
-        return tuple(_capture(scene, self.size, stress) for stress in (None, *self.stresses) for scene in self.scenes)
+        """One capture per subject and scene, and one per stress of it, shared by all methods and seeds.
+
+        Subjects outermost; a finished capture has the one that it has.
+        """
+        return tuple(
+            _capture(scene, self.size, stress, subject)
+            for subject in range(self.subjects)
+            for stress in (None, *self.stresses)
+            for scene in self.scenes
+            if not (scene.folder and subject)
+        )
 
     @property
     def cells(self) -> Iterator[CellSpec]:
@@ -148,10 +165,16 @@ def varied_name(of: str, changes: Changes) -> str:
     return "+".join(parts)
 
 
-def _capture(scene: SceneSpec, size: str, stress: Stress | None) -> CaptureSpec:
+def capture_name(scene: str, size: str, seed: int, subject: int = 0) -> str:
+    """What the folder of a capture is called."""
+    return f"{scene}-{size}-{seed}-subject{subject}" if subject else f"{scene}-{size}-{seed}"
+
+
+def _capture(scene: SceneSpec, size: str, stress: Stress | None, subject: int) -> CaptureSpec:
     return CaptureSpec(
         scene=scene.name,
         size=scene.size or size,
+        subject=subject,
         stress=stress,
         of="" if scene.of == scene.name else scene.of,
         changes=scene.changes,

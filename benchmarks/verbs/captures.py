@@ -54,6 +54,7 @@ class SynthVerb:
     size: str = "quick"  # of the capture: ci, quick, table or paper
     out: Folder | None = None  # default: data/SCENE-SIZE-SEED
     seed: Natural = 0  # root seed of the scene
+    subject: Natural = 0  # who it is: body, skin, hair, clothes and prints follow from the number
     motion: File | None = None  # train on this motion (BVH or AMASS .npz)
     test_motion: File | None = None  # test on this motion
     excerpt: Excerpts = Excerpt()
@@ -68,7 +69,7 @@ class SynthVerb:
         from benchmarks.suites.scenes import scene_of
         from synth.presets import with_rig
 
-        plain = scene_of(self.scene, size=self.size, seed=self.seed)
+        plain = scene_of(self.scene, size=self.size, seed=self.seed, subject=self.subject)
         seen = plain if self.rig_file is None else with_rig(plain, self.rig_file)
         return replace(seen, rig=replace(seen.rig, shutter=self.shutter)) if self.shutter else seen
 
@@ -106,15 +107,15 @@ class SynthVerb:
         """The scene that is asked for, and its name among captures."""
         from ash.fields import replaced
         from benchmarks.suites.scenes import scene_of
-        from benchmarks.suites.suites import varied_name
+        from benchmarks.suites.suites import capture_name, varied_name
 
         changes = dict(changes_of(self))
         wanted = replaced(self.settings(), changes, of=self.scene)
         if changes and "name" not in changes:
             wanted = replace(wanted, name=varied_name(self.scene, tuple(changes.items())))
         wanted = self._moved(wanted)
-        name = f"{self.scene}-{self.size}-{self.seed}"
-        plain = wanted == scene_of(self.scene, size=self.size, seed=self.seed)
+        name = capture_name(self.scene, self.size, self.seed, self.subject)
+        plain = wanted == scene_of(self.scene, size=self.size, seed=self.seed, subject=self.subject)
         return wanted, name if plain else f"{name}-{wanted.identity[:8]}"
 
     def _moved(self, scene: "Scene") -> "Scene":
@@ -237,19 +238,29 @@ class MotionsVerb:
 
 @dataclass(frozen=True, kw_only=True)
 class SheetsVerb:
-    """Draw a contact sheet of all scenes and a turntable."""
+    """Draw a contact sheet of all scenes and a turntable, or one of people."""
 
-    out: Folder = Path("reports/scenes")  # where they go
+    out: Folder | None = None  # where they go; default: reports/scenes, or reports/people
     scene: UseAppendAction[tuple[str, ...]] = ()  # only this scene; may be repeated
+    subjects: CountIfAny = None  # draw the first so many subjects instead, each in both outfits
 
     def __call__(self) -> int:
         """Draw them."""
         from benchmarks.suites.scenes import draw_views_of, scene_of
         from synth.readers.sheets import SHOWN, draw_sheets
 
+        if self.subjects is not None:
+            from benchmarks.provenance import cores
+            from synth.readers.people import draw_cast
+
+            if self.scene:
+                raise InputError("--subjects shows people in both outfits: expected it or --scene")
+            print(draw_cast(self.out or Path("reports/people"), range(self.subjects), workers=cores()))
+            return DONE
         names = self.scene or SHOWN
         for path in draw_sheets(
-            self.out, [(name, scene_of(name, size="quick"), draw_views_of(name)) for name in names]
+            self.out or Path("reports/scenes"),
+            [(name, scene_of(name, size="quick"), draw_views_of(name)) for name in names],
         ):
             print(path)
         return DONE

@@ -3,7 +3,9 @@
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -115,18 +117,22 @@ class TestVerb:
         if not (root / "tests").is_dir() or not (root / "pyproject.toml").is_file():
             raise InputError(f"{root}: expected a checkout with tests/; an installed package has none")
         module = [sys.executable, "-m"]
-        checks = {
+        brief = {  # Beside pytest, in what time that leaves: some tests take times.
             "ruff check": [*module, "ruff", "check", "."],
             "ruff format": [*module, "ruff", "format", "--check", "."],
             "import-linter": [sys.executable, "-c", "from importlinter.cli import lint_imports_command as f; f()"],
             "mypy": [*module, "mypy"],
-            "pytest": [*module, "pytest", "-n", str(cores()), "--dist", "loadfile", *self.pytest],
         }
-        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-        failed = []
-        for name, command in checks.items():
-            print(f"--- {name}", flush=True)
-            if subprocess.run(command, cwd=root, env=environment, check=False).returncode:
-                failed.append(name)
+        # A worker that dies ends the run and names its test: xdist would wait for ever for what it was given.
+        spread = ["-n", str(cores()), "--dist", "loadfile", "--no-loadscope-reorder", "--max-worker-restart", "0"]
+        run = partial(subprocess.run, cwd=root, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=False)
+        with ThreadPoolExecutor() as beside:
+            told = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+            running = {name: beside.submit(run, ["nice", *command], **told) for name, command in brief.items()}
+            print("--- pytest", flush=True)
+            failed = ["pytest"] if run([*module, "pytest", *spread, *self.pytest]).returncode else []
+            for name, done in running.items():
+                print(f"--- {name}\n{done.result().stdout}", end="", flush=True)
+                failed += [name] if done.result().returncode else []
         print(f"--- failed: {', '.join(failed)}" if failed else "--- all checks passed")
         return FAILED if failed else DONE

@@ -50,6 +50,7 @@ class RunVerb:
     size: str | None = None  # of scenes: ci, quick, table or paper
     preset: str | None = None  # budget of the methods
     seeds: CountIfAny = None  # train every method with so many seeds
+    subjects: CountIfAny = None  # on captures of so many people, from subject 0 on
     out: Folder | None = None  # where results go; default: runs/SUITE
     data: Folder = Path("data")  # where captures are kept
     workers: CountIfAny = None  # cells side by side; default: all cores
@@ -62,9 +63,11 @@ class RunVerb:
     def __call__(self) -> int:
         """Captures, cells, report."""
         from benchmarks.provenance import cores
+        from benchmarks.suites.captures import require_published
         from benchmarks.suites.runs import RunOptions
 
         suite = self._chosen()
+        require_published(suite)
         _use_lpips(self.lpips_weights)
         options = RunOptions(
             out=self.out or Path("runs") / suite.name,
@@ -88,7 +91,12 @@ class RunVerb:
 
         suite = find_suite(self.suite)
         return suite.narrowed(
-            scenes=self._scenes(suite), methods=self.methods, size=self.size, preset=self.preset, seeds=self.seeds
+            scenes=self._scenes(suite),
+            methods=self.methods,
+            size=self.size,
+            preset=self.preset,
+            seeds=self.seeds,
+            subjects=self.subjects,
         )
 
     def _scenes(self, suite: "Suite") -> "tuple[SceneSpec, ...]":

@@ -6,6 +6,7 @@ One thread per process: floating-point sums then have one order, and a picture h
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -18,12 +19,14 @@ import numpy as np
 from ash.capture.dataset import Camera
 from ash.files import InputError
 from synth.camera.lighting import is_plain, make_integrator, make_lamps, make_sky, sky_and_lamps
+from synth.camera.plates import make_hall
 from synth.camera.sensing import Window, make_sensor, window_of
 from synth.person.body import Surface, vertex_normals
 from synth.scene import Light
 
 OLDEST_LLVM = 17  # 15 and 16 accept the first kernels and then abort the process ("Cannot select fminimum")
-PROBE_SECONDS = 300
+PROBE_SECONDS, PROBES = 300, 2
+KILLED = (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT, -signal.SIGHUP)  # by others; a wrong LLVM aborts by itself
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -72,7 +75,7 @@ def probe() -> Renderer:
     """Find a renderer that really renders: each candidate draws a small textured scene in a process of its own.
 
     Raises:
-        InputError: not even scalar_rgb works.
+        InputError: not even scalar_rgb works; or a probe was killed again and again.
     """
     for libllvm in find_libllvm():
         version = _try("llvm_ad_rgb", libllvm)
@@ -94,11 +97,20 @@ def _try(variant: str, libllvm: str) -> str:
     root = str(Path(__file__).resolve().parents[2])
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, [root, environment.get("PYTHONPATH", "")]))
     command = [sys.executable, "-m", "synth.camera.render", variant]
-    try:
-        done = subprocess.run(command, env=environment, capture_output=True, timeout=PROBE_SECONDS, check=True)
-        return str(json.loads(done.stdout)["mitsuba"])
-    except (OSError, subprocess.SubprocessError, json.JSONDecodeError, KeyError):
-        return ""
+    for _ in range(PROBES):
+        try:
+            done = subprocess.run(command, env=environment, capture_output=True, timeout=PROBE_SECONDS)
+        except subprocess.TimeoutExpired:
+            continue
+        except OSError:
+            return ""
+        if done.returncode in KILLED:
+            continue  # That says nothing of what it tried.
+        try:
+            return str(json.loads(done.stdout)["mitsuba"]) if done.returncode == 0 else ""
+        except (json.JSONDecodeError, KeyError):
+            return ""
+    raise InputError(f"the probe of Mitsuba's {variant} was killed from outside, or stopped, {PROBES} times; run again")
 
 
 def _use(renderer: Renderer) -> Any:
@@ -268,6 +280,20 @@ class Studio:
         barycentric = np.where((triangle >= 0)[:, None], barycentric, 0).astype(np.float32)
         shape = (window.height, window.width)
         return triangle.astype(np.int32).reshape(shape), barycentric.reshape(*shape, 2)
+
+
+def shoot_plates(renderer: Renderer, cameras: list[Camera], *, seed: int, samples: int = 64) -> list[np.ndarray]:
+    """The empty studio in every camera, sRGB uint8 `[h, w, 3]`."""
+    mi = _use(renderer)
+    radius = max(float(np.hypot(*camera.position[[0, 2]])) for camera in cameras)
+    hall, integrator = make_hall(mi, radius, seed), mi.load_dict({"type": "direct"})
+    plates = []
+    for camera in cameras:
+        whole = Window(left=0, top=0, width=camera.width, height=camera.height)
+        sensor = make_sensor(mi, camera, whole, vectorised=bool(renderer.libllvm))
+        image = np.array(mi.render(hall, sensor=sensor, integrator=integrator, spp=samples, seed=seed % 2**32))
+        plates.append(np.round(255 * _to_srgb(image[..., :3].astype(np.float64))).astype(np.uint8))
+    return plates
 
 
 def _to_srgb(linear: np.ndarray) -> np.ndarray:

@@ -1,7 +1,8 @@
-"""The realistic body: the anny model (CC0 data), baked once into a small cache, then dressed.
+"""The realistic body: the anny model (CC0 data), each subject's shape baked once into a small cache, then dressed.
 
-anny is constructed in a process of its own with its cache in a temporary folder (0.8 GB, removed afterwards); what is
-kept is one body shape: vertices, quads, UVs and skin weights merged onto our joints.
+anny is constructed in a process of its own with its cache in a temporary folder (0.8 GB, removed afterwards). That
+takes most of the time, so a whole block of subjects is baked at once. What is kept of each is one body shape:
+vertices, quads, UVs and skin weights merged onto our joints.
 """
 
 import hashlib
@@ -11,16 +12,17 @@ import sys
 import tempfile
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ash.capture.dataset import Skeleton
 from ash.files import InputError, read_arrays, write_arrays
+from synth.person.cast import BLOCK, FIRST, Shape, subject
 from synth.posing import bone_frames, linear_blend_skinning, rotation_between, rotmat_to_rotvec, rotvec_to_rotmat
 from synth.skeleton import JOINTS, SIDES, SIGNS
 
 FORMAT = 3
-SHAPE = {"gender": 0.0, "age": 0.5, "muscle": 0.55, "weight": 0.42, "height": 0.55, "proportions": 0.7}
 BAKE_SECONDS = 900
 BAKED = ("vertices", "quads", "uvs", "uv_quads", "weights", "heads", "eyes", "mouth")
 
@@ -71,48 +73,77 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ash-bench"
 
 
-def baked_body() -> dict[str, np.ndarray]:
-    """The baked arrays (`BAKED`), from the cache or newly baked."""
-    path = cache_folder() / f"body-{bake_key()}.npz"
+def baked_body(number: int = 0) -> dict[str, np.ndarray]:
+    """The baked arrays (`BAKED`) of a subject, from the cache or newly baked with the others of its block."""
+    path = _path(subject(number).shape)
     if not path.is_file():
-        _bake_apart(path)
+        _bake_apart(number)
     return read_arrays(path, expected=BAKED)
 
 
-def bake_key() -> str:
+def bake_key(shape: Shape = FIRST.shape) -> str:
     """What identifies a baked body: the release of anny, the shape and how it is merged."""
     try:
         release = version("anny")
     except PackageNotFoundError as error:
         raise InputError("this scene needs the anny body model: expected the package anny to be installed") from error
-    return hashlib.sha256(repr((FORMAT, release, sorted(SHAPE.items()), BONES)).encode()).hexdigest()[:12]
+    return hashlib.sha256(repr((FORMAT, release, sorted(shape.phenotypes.items()), BONES)).encode()).hexdigest()[:12]
 
 
-def _bake_apart(path: Path) -> None:
+def _path(shape: Shape) -> Path:
+    return cache_folder() / f"body-{bake_key(shape)}.npz"
+
+
+def _bake_apart(number: int) -> None:
     root = str(Path(__file__).resolve().parents[2])
     with tempfile.TemporaryDirectory(prefix="ash-bench-anny-") as scratch:
         environment = dict(os.environ)
         environment["ANNY_CACHE_DIR"] = str(Path(scratch) / "anny")
         environment["WARP_CACHE_PATH"] = str(Path(scratch) / "warp")
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, [root, environment.get("PYTHONPATH", "")]))
-        command = [sys.executable, "-m", "synth.person.anny_body", str(path)]
+        command = [sys.executable, "-m", "synth.person.anny_body", str(number)]
         done = subprocess.run(
             command, env=environment, capture_output=True, text=True, timeout=BAKE_SECONDS, check=False
         )
-    if done.returncode or not path.is_file():
+    if done.returncode or not _path(subject(number).shape).is_file():
         raise InputError(f"baking the anny body failed: {done.stderr.strip().splitlines()[-1:] or 'no message'}")
 
 
-def _bake(path: Path) -> None:
+def _bake(number: int) -> None:
+    """Bake what is missing of a subject's block; the subject itself comes first."""
     import warnings
 
     warnings.simplefilter("ignore")
     import anny
+    from anny.models.legacy import legacy_rig_to_anny, legacy_topology_to_anny
+
+    first = number // BLOCK * BLOCK
+    block = sorted(range(first, first + BLOCK), key=lambda k: k != number)
+    missing = [shape for shape in (subject(k).shape for k in block) if not _path(shape).is_file()]
+    # A descent needs anny's whole range of shapes; subject 0 has none and keeps the reduced model, and so its bytes.
+    models = {
+        False: anny.create_fullbody_model,
+        True: lambda: anny.Anny(
+            rig=legacy_rig_to_anny("default", "blender-rootidentity"),
+            topology=legacy_topology_to_anny(),
+            phenotypes="all",
+            phenotype_blendshapes="original",
+            pose_parameterization="local-bone",
+        ),
+    }
+    for mixed, make in models.items():
+        shapes = [shape for shape in missing if (shape.descent is not None) == mixed]
+        model = make() if shapes else None
+        for shape in shapes:
+            write_arrays(_path(shape), **_baked(model, shape))
+
+
+def _baked(model: Any, shape: Shape) -> dict[str, np.ndarray]:
+    """What is kept of one shape of a body model."""
     import torch
 
-    model = anny.create_fullbody_model()
-    shape = {name: torch.tensor([value], dtype=torch.float32) for name, value in SHAPE.items()}
-    body = model(phenotype_kwargs=shape)
+    phenotypes = {name: torch.tensor([value], dtype=torch.float32) for name, value in shape.phenotypes.items()}
+    body = model(phenotype_kwargs=phenotypes)
     bones = tuple(model.bone_labels)
     heads = _to_ours(body["rest_bone_heads"][0].numpy())
     rig = Skeleton(names=bones, parents=np.array(model.bone_parents), heads=heads)
@@ -129,17 +160,16 @@ def _bake(path: Path) -> None:
     names = [name for name, _ in JOINTS]
     merge = np.zeros((len(bones), len(names)))
     merge[np.arange(len(bones)), [names.index(_joint_of(bone)) for bone in bones]] = 1
-    write_arrays(
-        path,
-        vertices=vertices - floor,
-        quads=model.faces.numpy().astype(np.int64),
-        uvs=model.texture_coordinates.numpy().astype(np.float64),
-        uv_quads=model.face_texture_coordinate_indices.numpy().astype(np.int64),
-        weights=dense @ merge,
-        heads=np.stack([heads[bones.index(_bone_of(name))] for name in names]),
-        eyes=np.stack([heads[bones.index(f"eye.{side}")] for side in "LR"]),
-        mouth=(heads[bones.index("oris05")] + heads[bones.index("oris01")]) / 2,
-    )
+    return {
+        "vertices": vertices - floor,
+        "quads": model.faces.numpy().astype(np.int64),
+        "uvs": model.texture_coordinates.numpy().astype(np.float64),
+        "uv_quads": model.face_texture_coordinate_indices.numpy().astype(np.int64),
+        "weights": dense @ merge,
+        "heads": np.stack([heads[bones.index(_bone_of(name))] for name in names]),
+        "eyes": np.stack([heads[bones.index(f"eye.{side}")] for side in "LR"]),
+        "mouth": (heads[bones.index("oris05")] + heads[bones.index("oris01")]) / 2,
+    }
 
 
 def _relax_hands(rig: Skeleton, vertices: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -205,4 +235,4 @@ def _bone_of(joint: str) -> str:
 
 
 if __name__ == "__main__":
-    _bake(Path(sys.argv[1]))
+    _bake(int(sys.argv[1]))

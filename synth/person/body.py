@@ -36,6 +36,7 @@ class Face:
     eyes: np.ndarray  # [2, 3] metres, left and right
     mouth: np.ndarray  # [3] metres
     modelled: bool  # eyeballs and lips are geometry, not only paint
+    nape: float = 0.98  # slope of the hairline of a modelled head
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -57,7 +58,7 @@ class Body:
         x, y, z = (points - self.face.eyes.mean(axis=0)).T
         if not self.face.modelled:
             return (y - 0.116 - 1.1 * z) / 1.5
-        above = (y - 0.062 - 0.98 * z) / 1.4
+        above = (y - 0.062 - self.face.nape * z) / 1.4
         ears = np.hypot((y + 0.012) / 1.15, z + 0.088) - 0.038
         return np.where(np.abs(x) > 0.06, np.minimum(above, ears), above)
 

@@ -3,7 +3,7 @@
 import hashlib
 import inspect
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,18 +12,28 @@ from ash.files import InputError, read_arrays, write_arrays
 from synth.person import body, garments, mesh, tubes
 from synth.person.anny_body import bake_key, baked_body, cache_folder
 from synth.person.body import PARTS, Body, Face, Surface, neighbour_mean
+from synth.person.cast import FIRST, Skirt, Subject, subject
 from synth.person.garments import cut_garment, soft_normals
-from synth.person.mesh import Charted, beside, decimate, joined, pack, select, subdivide, uv_charts
+from synth.person.mesh import Charted, beside, decimate, joined, largest_piece, pack, select, subdivide, uv_charts
 from synth.person.tubes import Tube, chain_weights, chart_uvs, grid_faces, lattice, skirt_weights
 from synth.skeleton import JOINTS, SIDES, make_skeleton
 
 TEMPLATE_VERTICES = 7000
+# Lengths in metres are those of subject 0; others are larger or smaller as their legs, feet and heads are.
 WAIST = 0.985  # metres above the floor
 UNTUCKED = 0.05  # metres that the shirt hangs over the trousers
-CUFF = 0.17  # height at which the trousers end
 BAND = 3  # rings of faces that the skin goes on beneath a hem
 ANKLE = 0.085  # where the foot is hidden in its shoe
-HAIR = 0.016
+LEG, FOOT = 0.9198, 0.1505  # metres from hip to floor, and from ankle to ball
+EYES = np.array([0, 1.6222, 0.1333])
+FLARE = (
+    (0.52, 0.115),
+    (0.62, 0.095),
+    (0.74, 0.072),
+    (0.86, 0.05),
+    (0.95, 0.022),
+    (1.01, 0.006),
+)  # of a skirt, by height
 DENSITY = {"head": 1.45, "hand": 1.25, "eye": 2.0}
 STORED = (
     "vertices", "weights", "faces", "uvs", "uv_faces", "part", "kept", "template_faces", "template_uv_faces",
@@ -31,28 +41,51 @@ STORED = (
 )  # fmt: skip
 
 
-def anny_body(*, skirt: bool) -> Body:
-    """The dressed anny body: in loose clothes with a skirt, or in tight clothes without."""
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Measures:
+    """How large a body is beside subject 0's, to a thousandth, so that subject 0 itself is exactly 1."""
+
+    leg: float
+    foot: float
+    head: np.ndarray  # [3] metres from the eyes of subject 0 to this body's
+
+    @classmethod
+    def of(cls, baked: dict[str, np.ndarray]) -> "Measures":
+        """Measure a baked body."""
+        names = [name for name, _ in JOINTS]
+        hip, ankle, ball = (baked["heads"][names.index(f"{bone}_left")] for bone in ("thigh", "foot", "toe"))
+        return cls(
+            leg=round(float(hip[1] / LEG), 3),
+            foot=round(float((ball[2] - ankle[2]) / FOOT), 3),
+            head=np.round(baked["eyes"].mean(axis=0) - EYES, 3),
+        )
+
+
+def anny_body(*, skirt: bool, number: int = 0) -> Body:
+    """A subject's dressed body: in loose clothes with a skirt, or in tight clothes without."""
+    person = subject(number)
     modules = (sys.modules[__name__], garments, mesh, tubes, body)
     source = "".join(inspect.getsource(module) for module in modules)
-    key = hashlib.sha256(f"{skirt} {bake_key()} {source}".encode()).hexdigest()[:12]
+    cut = (person.head.depth, person.head.nape, person.shirt.sleeve, person.trousers.cuff)
+    sewn = (person.skirt.length, person.skirt.fullness) if skirt else ()
+    key = hashlib.sha256(f"{skirt} {cut} {sewn} {bake_key(person.shape)} {source}".encode()).hexdigest()[:12]
     path = cache_folder() / f"dressed-{key}.npz"
     if path.is_file():
         try:
-            return _unpack(read_arrays(path, expected=STORED))
+            return _unpack(read_arrays(path, expected=STORED), person)
         except InputError:
             path.unlink()
-    write_arrays(path, **_dress(skirt=skirt))
-    return _unpack(read_arrays(path, expected=STORED))
+    write_arrays(path, **_dress(person, skirt=skirt))
+    return _unpack(read_arrays(path, expected=STORED), person)
 
 
-def _unpack(stored: dict[str, np.ndarray]) -> Body:
+def _unpack(stored: dict[str, np.ndarray], person: Subject) -> Body:
     names = [name for name, _ in JOINTS]
     return Body(
         skeleton=make_skeleton(dict(zip(names, stored["heads"], strict=True))),
         surface=Surface(**{name: stored[name] for name in ("vertices", "faces", "uvs", "uv_faces", "part")}),
         skin_weights=stored["weights"],
-        face=Face(eyes=stored["eyes"], mouth=stored["mouth"], modelled=True),
+        face=Face(eyes=stored["eyes"], mouth=stored["mouth"], modelled=True, nape=person.head.nape),
         kept=stored["kept"],
         template_faces=stored["template_faces"],
         template_uv_faces=stored["template_uv_faces"],
@@ -61,15 +94,16 @@ def _unpack(stored: dict[str, np.ndarray]) -> Body:
     )
 
 
-def _dress(*, skirt: bool) -> dict[str, np.ndarray]:
-    baked = baked_body()
+def _dress(person: Subject, *, skirt: bool) -> dict[str, np.ndarray]:
+    baked = baked_body(person.number)
+    measures = Measures.of(baked)
     skeleton = make_skeleton(dict(zip([name for name, _ in JOINTS], baked["heads"], strict=True)))
-    body, chart, density = _clothed(baked, "loose" if skirt else "tight")
-    tubes = [_shoe(skeleton, side) for side in SIDES]
+    body, chart, density = _clothed(baked, person, "loose" if skirt else "tight")
+    tubes = [_shoe(skeleton, side, measures.foot) for side in SIDES]
     if skirt:
-        tubes.append(_skirt(body))
+        tubes.append(_skirt(body, person.skirt, measures.leg))
     for tube in tubes:
-        body = _append(body, tube, skeleton)
+        body = _append(body, tube, skeleton, measures.leg)
         chart = np.concatenate([chart, np.full(len(body.faces) - len(chart), chart.max() + 1)])
         density = np.append(density, 1.0)
     body = pack(body, chart, density, gutter=0.004)
@@ -101,19 +135,24 @@ def _dress(*, skirt: bool) -> dict[str, np.ndarray]:
     }
 
 
-def _clothed(baked: dict[str, np.ndarray], fit: str) -> tuple[Charted, np.ndarray, np.ndarray]:
+def _clothed(
+    baked: dict[str, np.ndarray], person: Subject, fit: str
+) -> tuple[Charted, np.ndarray, np.ndarray]:  # fmt: skip
     """Skin, hair, eyes, shirt and trousers as one mesh, the chart of each face, and each chart's texel density."""
-    bare, kind, group = _bare(baked, feet=False)
+    bare, kind, group = _bare(baked, person, feet=False)
+    leg = Measures.of(baked).leg
     centre = bare.vertices[bare.faces].mean(axis=1)
     neck = baked["heads"][[name for name, _ in JOINTS].index("neck")]
     collar = (np.linalg.norm((centre - neck) * [1, 0.8, 1], axis=1) < 0.085) | (centre[:, 1] > neck[1] + 0.01)
     trunk = kind == "body"
     worn = {
-        "shirt": trunk & (centre[:, 1] > WAIST - UNTUCKED) & ~collar,
-        "trousers": trunk & (centre[:, 1] <= WAIST) & (centre[:, 1] > CUFF),
+        "shirt": trunk & (centre[:, 1] > leg * (WAIST - UNTUCKED)) & ~collar & ~_past_sleeve(centre, baked, person),
+        "trousers": trunk & (centre[:, 1] <= leg * WAIST) & (centre[:, 1] > leg * person.trousers.cuff),
     }
+    # Beneath a chin some faces may lie as far from the neck as a shirt does.
+    worn["shirt"] = largest_piece(bare.faces, worn["shirt"])
     kept = beside(bare.faces, ~(worn["shirt"] | worn["trousers"]), rings=BAND)
-    pieces, groups, kinds = [select(_with_hair(bare), kept)], [group[kept]], [kind[kept]]
+    pieces, groups, kinds = [select(_with_hair(bare, person.head.depth), kept)], [group[kept]], [kind[kept]]
     for layer, (name, faces) in enumerate(worn.items()):
         piece, source = cut_garment(bare, faces, name=name, fit=fit)
         pieces.append(piece)
@@ -125,7 +164,7 @@ def _clothed(baked: dict[str, np.ndarray], fit: str) -> tuple[Charted, np.ndarra
 
 def body_parts(baked: dict[str, np.ndarray]) -> tuple[Charted, np.ndarray, np.ndarray]:
     """The naked body with its feet, the chart of each face, and each chart's texel density."""
-    mesh, kind, group = _bare(baked, feet=True)
+    mesh, kind, group = _bare(baked, FIRST, feet=True)
     return mesh, *_charts(mesh, kind, group)
 
 
@@ -134,7 +173,18 @@ def _charts(mesh: Charted, kind: np.ndarray, group: np.ndarray) -> tuple[np.ndar
     return chart, np.array([DENSITY.get(str(kind[chart == k][0]), 1.0) for k in range(chart.max() + 1)])
 
 
-def _bare(baked: dict[str, np.ndarray], *, feet: bool) -> tuple[Charted, np.ndarray, np.ndarray]:
+def _past_sleeve(points: np.ndarray, baked: dict[str, np.ndarray], person: Subject) -> np.ndarray:
+    """Which points lie on an arm, beyond the end of the shirt's sleeve."""
+    beyond = np.zeros(len(points), dtype=bool)
+    names = [name for name, _ in JOINTS]
+    for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
+        shoulder, wrist = (baked["heads"][names.index(f"{bone}_{side}")] for bone in ("upper_arm", "hand"))
+        share = (points - shoulder) @ (wrist - shoulder) / np.sum((wrist - shoulder) ** 2)
+        beyond |= (share > person.shirt.sleeve) & (sign * points[:, 0] > abs(shoulder[0]))
+    return beyond & (person.shirt.sleeve < 1)
+
+
+def _bare(baked: dict[str, np.ndarray], person: Subject, *, feet: bool) -> tuple[Charted, np.ndarray, np.ndarray]:
     """Split quads, drop what is never seen (mouth, sockets, feet in shoes), and label hair and eyes.
 
     Also what each face is of (body, head, hand, eye, foot), and its limb or original chart, which the atlas is cut by.
@@ -143,6 +193,8 @@ def _bare(baked: dict[str, np.ndarray], *, feet: bool) -> tuple[Charted, np.ndar
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     uv_faces = np.concatenate([uv_quads[:, [0, 1, 2]], uv_quads[:, [0, 2, 3]]])
     vertices, weights = baked["vertices"], baked["weights"]
+    measures = Measures.of(baked)
+    ankle = ANKLE * measures.foot
     centre = vertices[faces].mean(axis=1)
     original = uv_charts(uv_faces, np.zeros(len(faces), dtype=np.int64))
     sizes = np.bincount(original)
@@ -155,15 +207,15 @@ def _bare(baked: dict[str, np.ndarray], *, feet: bool) -> tuple[Charted, np.ndar
             names[k] = "body" if k == body else "head"
         elif abs(middle[0]) > 0.35:
             names[k] = "hand"
-        elif feet and middle[1] < 2 * ANKLE:
+        elif feet and middle[1] < 2 * ankle:
             names[k] = "foot"
         elif eye < 0.03 and sizes[k] < 200 and middle[2] > baked["eyes"][0, 2]:
             names[k] = "eye"
     kind = names[original]
     part = np.full(len(faces), PARTS.index("skin"))
     part[kind == "eye"] = PARTS.index("eyes")
-    part[(kind == "head") & _is_scalp(centre)] = PARTS.index("hair")
-    seen = (kind != "none") & (feet | ~((kind == "body") & (centre[:, 1] < ANKLE)))
+    part[(kind == "head") & _is_scalp(centre - measures.head, person.head.nape)] = PARTS.index("hair")
+    seen = (kind != "none") & (feet | ~((kind == "body") & (centre[:, 1] < ankle)))
     group = np.where(kind == "body", _limb(weights[faces].mean(axis=1)), 10 + original)
     mesh = Charted(vertices=vertices, weights=weights, faces=faces, uvs=baked["uvs"], uv_faces=uv_faces, part=part)
     return select(mesh, seen), kind[seen], group[seen]
@@ -179,11 +231,11 @@ def _merge_small(chart: np.ndarray, group: np.ndarray) -> np.ndarray:
     return np.unique(result, return_inverse=True)[1].reshape(-1)
 
 
-def _is_scalp(points: np.ndarray) -> np.ndarray:
-    """Above a slanted hairline, and not on the ears."""
+def _is_scalp(points: np.ndarray, nape: float) -> np.ndarray:
+    """Above a hairline that slants by `nape`, and not on the ears, for a head that lies where subject 0's does."""
     x, y, z = points.T
     ears = (np.abs(x) > 0.074) & (y < 1.65) & (z > 0.0) & (z < 0.085)
-    return (y > 1.553 + 0.98 * z) & ~ears
+    return (y > 1.553 + 0.98 * z + (nape - 0.98) * (z - EYES[2])) & ~ears
 
 
 def _limb(weights: np.ndarray) -> np.ndarray:
@@ -195,22 +247,22 @@ def _limb(weights: np.ndarray) -> np.ndarray:
     return np.argmax(shares, axis=1)
 
 
-def _with_hair(mesh: Charted) -> Charted:
-    """Push the scalp outwards, less towards the hairline."""
+def _with_hair(mesh: Charted, most: float) -> Charted:
+    """Push the scalp outwards, by `most` metres, less towards the hairline."""
     hair = mesh.part == PARTS.index("hair")
     inner, hairy = np.zeros(len(mesh.vertices), dtype=bool), np.zeros(len(mesh.vertices), dtype=bool)
     hairy[mesh.faces[hair]] = True
     inner[mesh.faces[hair]] = True
     inner[mesh.faces[~hair]] = False
-    depth = neighbour_mean(np.where(inner, HAIR, 0.0), mesh.faces, rounds=4) * hairy
+    depth = neighbour_mean(np.where(inner, most, 0.0), mesh.faces, rounds=4) * hairy
     return replace(mesh, vertices=mesh.vertices + depth[:, None] * soft_normals(mesh))
 
 
-def _shoe(skeleton: Skeleton, side: str) -> Tube:
+def _shoe(skeleton: Skeleton, side: str, scale: float) -> Tube:
     ankle, ball = (skeleton.heads[skeleton.names.index(f"{name}_{side}")] for name in ("foot", "toe"))
     middle = np.array([(ankle[0] + ball[0]) / 2, 0, ball[2]])
     # Each ring: distance in front of the ball, height of its centre, half its width, half its height.
-    rings = np.array(
+    rings = scale * np.array(
         [
             (0.107, 0.028, 0.002, 0.002), (0.104, 0.028, 0.016, 0.012), (0.09, 0.030, 0.034, 0.022),
             (0.04, 0.034, 0.050, 0.031), (-0.02, 0.039, 0.050, 0.038),
@@ -227,31 +279,36 @@ def _shoe(skeleton: Skeleton, side: str) -> Tube:
     )  # fmt: skip
 
 
-def _skirt(body: Charted) -> Tube:
+def _skirt(body: Charted, skirt: Skirt, leg: float) -> Tube:
     """A flared skirt that leaves room for the legs."""
     clothed = np.unique(body.faces[np.isin(body.part, [PARTS.index("shirt"), PARTS.index("trousers")])])
     points = body.vertices[clothed]
-    points = points[(np.abs(points[:, 0]) < 0.3) & (points[:, 1] < 1.05)]
+    points = points[(np.abs(points[:, 0]) < 0.3) & (points[:, 1] < 1.05 * leg)]
+    shape = np.array(FLARE)
+    top = shape[-1, 0]
+    longer = skirt.length / FIRST.skirt.length
     knots, radii = [], []
-    for height, flare in ((0.52, 0.115), (0.62, 0.095), (0.74, 0.072), (0.86, 0.05), (0.95, 0.022), (1.01, 0.006)):
-        ring = points[np.abs(points[:, 1] - height) < 0.02]
+    for height, flare in np.round(np.stack([top - (top - shape[:, 0]) * longer, shape[:, 1]], axis=1), 9) * [leg, 1]:
+        # Below shorts there is no cloth to measure: the skirt goes on as wide as it is there.
+        ring = points[np.abs(points[:, 1] - max(height, points[:, 1].min() + 0.03)) < 0.02]
         low, high = ring.min(axis=0), ring.max(axis=0)
         knots.append([0, height, (low[2] + high[2]) / 2])
-        radii.append([(high[0] - low[0]) / 2 + flare, (high[2] - low[2]) / 2 + flare])
+        radii.append([(high[k] - low[k]) / 2 + flare * skirt.fullness for k in (0, 2)])
     return Tube(
         part="skirt", knots=np.array(knots), radii=np.array(radii), front=(0.0, 0.0, 1.0), chain=("pelvis",),
-        borders=(), rings=20, segments=56, chart=(0, 0, 1.5, 0.5),
+        borders=(), rings=round(20 * longer), segments=56,
+        chart=(0.0, 0.0, 1.5 * max(1.0, skirt.fullness**0.5), 0.5 * longer),
     )  # fmt: skip
 
 
-def _append(mesh: Charted, tube: Tube, skeleton: Skeleton) -> Charted:
+def _append(mesh: Charted, tube: Tube, skeleton: Skeleton, leg: float) -> Charted:
     points, along = lattice(tube, tube.rings, tube.segments)
     flat = points.reshape(-1, 3)
     if tube.part == "shoes":
         flat[:, 1] = np.maximum(flat[:, 1], 0)  # A flat sole.
         weights = np.repeat(chain_weights(tube, along, skeleton.names), tube.segments, axis=0)
     else:
-        weights = skirt_weights(flat, skeleton.names, top=1.0, length=0.48)
+        weights = skirt_weights(flat, skeleton.names, top=leg, length=0.48 * leg)
     faces = grid_faces(tube.rings, tube.segments, stride=tube.segments, wrap=tube.segments)
     uv_faces = grid_faces(tube.rings, tube.segments, stride=tube.segments + 1, wrap=tube.segments + 1)
     return Charted(

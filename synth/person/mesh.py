@@ -88,6 +88,14 @@ def beside(faces: np.ndarray, chosen: np.ndarray, *, rings: int) -> np.ndarray:
     return chosen
 
 
+def largest_piece(faces: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Of the chosen faces `[f]` bool, the connected piece that has the most."""
+    piece = uv_charts(faces[chosen], np.zeros(chosen.sum(), dtype=np.int64))
+    result = np.zeros(len(faces), dtype=bool)
+    result[np.flatnonzero(chosen)[piece == np.argmax(np.bincount(piece))]] = True
+    return result
+
+
 def select(mesh: Charted, chosen: np.ndarray) -> Charted:
     """Only the chosen faces `[f]`; all vertices and UVs stay."""
     return replace(mesh, faces=mesh.faces[chosen], uv_faces=mesh.uv_faces[chosen], part=mesh.part[chosen])

@@ -11,6 +11,8 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from synth.person.body import PARTS, Body, vertex_normals
+from synth.person.cast import FIRST, Complexion, Shirt, Shoes, Skirt, Subject, Trousers
+from synth.person.prints import edge, mix, plain, printed, stripes
 
 SKIN, HAIR, SHIRT = (PARTS.index(name) for name in ("skin", "hair", "shirt"))
 LIMBS = ("torso", "left arm", "right arm", "left leg", "right leg")
@@ -90,8 +92,11 @@ def locate(body: Body, size: int) -> Texels:
     )
 
 
-def paint(body: Body, *, size: int, seed: int) -> np.ndarray:
-    """Paint the body and its clothes: uint8 sRGB `[size, size, 3]`, row 0 at v = 1; colours run past chart borders."""
+def paint(body: Body, *, size: int, seed: int, subject: Subject = FIRST) -> np.ndarray:
+    """Paint a subject's body and clothes: uint8 sRGB `[size, size, 3]`, row 0 at v = 1.
+
+    Colours run past chart borders.
+    """
     rng = np.random.default_rng(seed)
     texels = locate(body, size)
     grain = _grain(rng, size)[texels.rows, texels.columns]
@@ -107,13 +112,13 @@ def paint(body: Body, *, size: int, seed: int) -> np.ndarray:
     part = np.where(throat, SKIN, np.where(beyond, SHIRT, part))
     colour = np.empty((len(part), 3))
     painters = {
-        "skin": lambda m: _skin(body, texels.position[m], grain[m]),
-        "hair": lambda m: _hair(body, texels.position[m], grain[m]),
-        "eyes": lambda m: _eyes(body, texels.position[m]),
-        "shirt": lambda m: _shirt(body, _pick(texels, m), along[m], grain[m]),
-        "trousers": lambda m: _trousers(body, _pick(texels, m), along[m], grain[m]),
-        "skirt": lambda m: _skirt(texels.position[m], grain[m]),
-        "shoes": lambda m: _shoes(texels.position[m], grain[m]),
+        "skin": lambda m: _skin(body, subject.head, texels.position[m], grain[m]),
+        "hair": lambda m: _hair(subject.head, texels.position[m], grain[m]),
+        "eyes": lambda m: _eyes(body, subject.head, texels.position[m]),
+        "shirt": lambda m: _shirt(body, subject.shirt, _pick(texels, m), along[m], grain[m]),
+        "trousers": lambda m: _trousers(body, subject.trousers, _pick(texels, m), along[m], grain[m]),
+        "skirt": lambda m: _skirt(subject.skirt, texels.position[m], grain[m]),
+        "shoes": lambda m: _shoes(subject.shoes, texels.position[m], grain[m]),
     }
     for index, name in enumerate(PARTS):
         chosen = part == index
@@ -169,26 +174,6 @@ def _along(body: Body, texels: Texels) -> np.ndarray:
     return result
 
 
-def _edge(x: np.ndarray, width: float) -> np.ndarray:
-    """A step at zero, softened over `width` metres."""
-    return np.clip(x / width + 0.5, 0, 1)
-
-
-def _stripes(x: np.ndarray, period: float, share: float = 0.5, soft: float = 0.0015) -> np.ndarray:
-    """1 on stripes, 0 between them."""
-    phase = (x / period) % 1.0
-    distance = np.minimum(np.abs(phase - share / 2), np.abs(phase - 1 - share / 2))
-    return _edge((share / 2 - distance) * period, soft)
-
-
-def _mix(base: np.ndarray, colour: tuple[float, float, float], amount: np.ndarray) -> np.ndarray:
-    return base + amount[:, None] * (np.array(colour) - base)
-
-
-def _plain(count: int, colour: tuple[float, float, float]) -> np.ndarray:
-    return np.tile(np.array(colour, dtype=np.float64), (count, 1))
-
-
 def _weave(position: np.ndarray, grain: np.ndarray, strength: float = 0.06) -> np.ndarray:
     """Threads of 4 mm crossing each other, and grain."""
     x, y, z = position.T
@@ -216,80 +201,87 @@ def _stamp(words: str, x: np.ndarray, y: np.ndarray, *, width: float) -> np.ndar
     return result
 
 
-def _shirt(body: Body, texels: Texels, along: np.ndarray, grain: np.ndarray) -> np.ndarray:
+def _around(body: Body, texels: Texels) -> np.ndarray:
+    """Metres around the trunk, or around an arm, from its back."""
+    x, _, z = texels.position.T
+    result = np.arctan2(x, z) * 0.14
+    for side, limb in (("left", 1), ("right", 2)):
+        start, end = (
+            body.skeleton.heads[body.skeleton.names.index(f"{bone}_{side}")] for bone in ("upper_arm", "hand")
+        )
+        axis = (end - start) / np.linalg.norm(end - start)
+        chosen = texels.limb == limb
+        apart = texels.position[chosen] - start
+        front = np.array([0.0, 0.0, 1.0]) - axis[2] * axis
+        result[chosen] = np.arctan2(apart @ np.cross(axis, front), apart @ front) * 0.05
+    return result
+
+
+def _shirt(body: Body, shirt: Shirt, texels: Texels, along: np.ndarray, grain: np.ndarray) -> np.ndarray:
     position, normal = texels.position, texels.normal
-    colour = _mix(_plain(len(position), (0.74, 0.71, 0.64)), (0.3, 0.37, 0.54), _stripes(along, 0.044))
+    colour = printed(shirt.cloth, _around(body, texels), along)
     torso = texels.limb == 0
     chest = body.skeleton.heads[body.skeleton.names.index("chest")]
     y = position[:, 1] - chest[1] - 0.1
-    for words, facing in (("ASH 24", 1.0), ("BENCH", -1.0)):
+    for words, facing in zip(shirt.words or (), (1.0, -1.0), strict=False):
         side = torso & (normal[:, 2] * facing > 0.2)
-        panel = side * _edge(0.055 - np.abs(y), 0.002) * _edge(0.125 - np.abs(position[:, 0]), 0.002)
-        colour = _mix(colour, (0.93, 0.72, 0.2), panel)
-        colour = _mix(colour, (0.1, 0.08, 0.12), panel * _stamp(words, facing * position[:, 0], y, width=0.2))
+        panel = side * edge(0.055 - np.abs(y), 0.002) * edge(0.125 - np.abs(position[:, 0]), 0.002)
+        colour = mix(colour, shirt.panel, panel)
+        colour = mix(colour, shirt.ink, panel * _stamp(words, facing * position[:, 0], y, width=0.2))
     collar = body.collar(position)
-    colour = _mix(colour, (0.75, 0.16, 0.14), torso * _edge(0.018 - collar, 0.003))
-    seam = torso * _edge(0.0025 - np.abs(position[:, 2]), 0.001)
-    colour = _mix(colour, (0.08, 0.1, 0.2), 0.6 * seam)
+    colour = mix(colour, shirt.collar, torso * edge(0.018 - collar, 0.003))
+    seam = torso * edge(0.0025 - np.abs(position[:, 2]), 0.001)
+    colour = mix(colour, shirt.seam, 0.6 * seam)
     return colour * _weave(position, grain)[:, None]
 
 
-def _trousers(body: Body, texels: Texels, along: np.ndarray, grain: np.ndarray) -> np.ndarray:
+def _trousers(body: Body, trousers: Trousers, texels: Texels, along: np.ndarray, grain: np.ndarray) -> np.ndarray:
     position = texels.position
-    colour = _plain(len(position), (0.2, 0.27, 0.36))
     around = np.arctan2(position[:, 0] - np.where(position[:, 0] > 0, 0.095, -0.095), position[:, 2]) * 0.07
-    lozenge = _stripes(along + around, 0.05, 0.35) * _stripes(along - around, 0.05, 0.35)
-    colour = _mix(colour, (0.5, 0.5, 0.46), 0.85 * lozenge)
-    thread = _stripes(along + around, 0.05, 0.06) + _stripes(along - around, 0.05, 0.06)
-    colour = _mix(colour, (0.6, 0.25, 0.2), 0.6 * np.clip(thread, 0, 1))
+    colour = printed(trousers.cloth, around, along)
     outer = np.abs(position[:, 0]) - 0.095
-    colour = _mix(colour, (0.85, 0.5, 0.15), (outer > 0) * _edge(0.006 - np.abs(position[:, 2]), 0.002))
+    colour = mix(colour, trousers.line, (outer > 0) * edge(0.006 - np.abs(position[:, 2]), 0.002))
     waist = body.skeleton.heads[0][1] + 0.06
-    belt = _edge(0.02 - np.abs(position[:, 1] - waist), 0.002)
-    colour = _mix(colour, (0.25, 0.13, 0.07), belt)
-    buckle = belt * _edge(0.03 - np.abs(position[:, 0]), 0.002) * (texels.normal[:, 2] > 0)
-    colour = _mix(colour, (0.85, 0.78, 0.5), buckle)
+    belt = edge(0.02 - np.abs(position[:, 1] - waist), 0.002)
+    colour = mix(colour, trousers.belt, belt)
+    buckle = belt * edge(0.03 - np.abs(position[:, 0]), 0.002) * (texels.normal[:, 2] > 0)
+    colour = mix(colour, trousers.buckle, buckle)
     return colour * _weave(position, grain, 0.1)[:, None]
 
 
-def _skirt(position: np.ndarray, grain: np.ndarray) -> np.ndarray:
+def _skirt(skirt: Skirt, position: np.ndarray, grain: np.ndarray) -> np.ndarray:
     around = np.arctan2(position[:, 0], position[:, 2]) * 0.2
     height = position[:, 1]
-    colour = _plain(len(position), (0.55, 0.1, 0.14))
-    wide = 0.5 * _stripes(around, 0.08, 0.5) + 0.5 * _stripes(height, 0.08, 0.5)
-    colour = _mix(colour, (0.08, 0.2, 0.16), wide)
-    colour = _mix(colour, (0.72, 0.6, 0.45), np.maximum(_stripes(around, 0.08, 0.07), _stripes(height, 0.08, 0.07)))
+    colour = printed(skirt.cloth, around, height)
     twill = 0.06 * np.sin(2 * np.pi * (around + height) / 0.005)
-    hem = _edge(0.012 - (height - height.min()), 0.002)
-    colour = _mix(colour, (0.8, 0.68, 0.42), hem)
+    hem = edge(0.012 - (height - height.min()), 0.002)
+    colour = mix(colour, skirt.hem, hem)
     return colour * (1 + twill + 0.03 * grain)[:, None]
 
 
-def _shoes(position: np.ndarray, grain: np.ndarray) -> np.ndarray:
+def _shoes(shoes: Shoes, position: np.ndarray, grain: np.ndarray) -> np.ndarray:
     x, y, z = position.T
-    colour = _plain(len(position), (0.2, 0.2, 0.23))
-    sole = _edge(0.022 - y, 0.002)
-    colour = _mix(colour, (0.88, 0.86, 0.82), sole)
+    colour = plain(len(position), shoes.leather)
+    sole = edge(0.022 - y, 0.002)
+    colour = mix(colour, shoes.sole, sole)
     middle = np.abs(np.abs(x) - 0.105)
-    laces = _stripes(z, 0.016, 0.4) * _edge(0.022 - middle, 0.002) * (y > 0.045) * (z > -0.02) * (z < 0.09)
-    colour = _mix(colour, (0.95, 0.9, 0.85), laces)
-    colour = _mix(
-        colour, (0.85, 0.2, 0.15), (1 - sole) * _stripes(z - 0.4 * y, 0.03, 0.25) * (middle > 0.03) * (z < 0.06)
-    )
+    laces = stripes(z, 0.016, 0.4) * edge(0.022 - middle, 0.002) * (y > 0.045) * (z > -0.02) * (z < 0.09)
+    colour = mix(colour, shoes.laces, laces)
+    colour = mix(colour, shoes.stripes, (1 - sole) * stripes(z - 0.4 * y, 0.03, 0.25) * (middle > 0.03) * (z < 0.06))
     return colour * (1 + 0.04 * grain)[:, None]
 
 
-def _hair(body: Body, position: np.ndarray, grain: np.ndarray) -> np.ndarray:
+def _hair(head: Complexion, position: np.ndarray, grain: np.ndarray) -> np.ndarray:
     x, y, z = position.T
     around = np.arctan2(x, z - 0.01)
     strand = np.sin(260 * around + 25 * np.sin(60 * y) + 2.5 * grain) + 0.6 * np.sin(97 * around + 40 * y)
-    base = _plain(len(position), (0.2, 0.12, 0.07))
+    base = plain(len(position), head.hair)
     return base * (1 + 0.28 * strand + 0.1 * grain)[:, None]
 
 
-def _skin(body: Body, position: np.ndarray, grain: np.ndarray) -> np.ndarray:
+def _skin(body: Body, head: Complexion, position: np.ndarray, grain: np.ndarray) -> np.ndarray:
     x, y, z = position.T
-    colour = _plain(len(position), (0.82, 0.62, 0.5)) * (1 + 0.018 * grain)[:, None]
+    colour = plain(len(position), head.skin) * (1 + 0.018 * grain)[:, None]
     eyes, mouth = body.face.eyes, body.face.mouth
     front = z > eyes[0, 2] - 0.06
     gap = eyes[0, 0] - eyes[1, 0]
@@ -297,31 +289,31 @@ def _skin(body: Body, position: np.ndarray, grain: np.ndarray) -> np.ndarray:
         dx, dy = (x - eye[0]) / gap, (y - eye[1]) / gap
         brow = (
             front
-            * _edge(0.045 - np.abs(dy - 0.3 + 0.25 * (dx - 0.05 * sign) ** 2), 0.02)
-            * _edge(0.36 - np.abs(dx - 0.04 * sign), 0.06)
+            * edge(0.045 - np.abs(dy - 0.3 + 0.25 * (dx - 0.05 * sign) ** 2), 0.02)
+            * edge(0.36 - np.abs(dx - 0.04 * sign), 0.06)
         )
-        colour = _mix(colour, (0.17, 0.1, 0.06), 0.85 * brow)
+        colour = mix(colour, head.brow, 0.85 * brow)
         blush = front * np.exp(-((dx - 0.15 * sign) ** 2 + (dy + 0.65) ** 2) / 0.06)
-        colour = _mix(colour, (0.86, 0.45, 0.4), 0.3 * blush)
+        colour = mix(colour, head.blush, 0.3 * blush)
         if not body.face.modelled:
-            white = front * _edge(1 - np.hypot(dx / 0.27, dy / 0.13), 0.15)
-            iris = front * _edge(1 - np.hypot(dx, dy) / 0.12, 0.15)
-            colour = _mix(_mix(colour, (0.95, 0.95, 0.93), white), (0.15, 0.25, 0.3), iris * white)
+            white = front * edge(1 - np.hypot(dx / 0.27, dy / 0.13), 0.15)
+            iris = front * edge(1 - np.hypot(dx, dy) / 0.12, 0.15)
+            colour = mix(mix(colour, (0.95, 0.95, 0.93), white), (0.15, 0.25, 0.3), iris * white)
     wide, tall = (x - mouth[0]) / gap, (y - mouth[1]) / gap
-    lips = front * _edge(1 - np.hypot(wide / 0.4, tall / (0.14 * np.maximum(1 - 0.5 * np.abs(wide), 0.3))), 0.2)
-    colour = _mix(colour, (0.7, 0.3, 0.3), 0.8 * lips)
-    colour = _mix(colour, (0.4, 0.15, 0.15), 0.8 * lips * _edge(0.018 - np.abs(tall), 0.02))
+    lips = front * edge(1 - np.hypot(wide / 0.4, tall / (0.14 * np.maximum(1 - 0.5 * np.abs(wide), 0.3))), 0.2)
+    colour = mix(colour, head.lips, 0.8 * lips)
+    colour = mix(colour, head.mouth, 0.8 * lips * edge(0.018 - np.abs(tall), 0.02))
     return colour
 
 
-def _eyes(body: Body, position: np.ndarray) -> np.ndarray:
+def _eyes(body: Body, head: Complexion, position: np.ndarray) -> np.ndarray:
     """Eyeballs: white, iris, pupil, seen from the front."""
-    colour = _plain(len(position), (0.93, 0.93, 0.91))
+    colour = plain(len(position), (0.93, 0.93, 0.91))
     for eye in body.face.eyes:
         near = np.abs(position[:, 0] - eye[0]) < 0.03
         radius = np.hypot(position[:, 0] - eye[0], position[:, 1] - eye[1]) + np.where(
             near & (position[:, 2] > eye[2]), 0, 1
         )
-        colour = _mix(colour, (0.25, 0.36, 0.3), _edge(0.0062 - radius, 0.0006))
-        colour = _mix(colour, (0.03, 0.03, 0.03), _edge(0.0028 - radius, 0.0006))
+        colour = mix(colour, head.iris, edge(0.0062 - radius, 0.0006))
+        colour = mix(colour, (0.03, 0.03, 0.03), edge(0.0028 - radius, 0.0006))
     return colour

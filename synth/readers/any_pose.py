@@ -8,10 +8,11 @@ import numpy as np
 from ash.capture.dataset import Camera, Capture, Pose, surface_path
 from ash.files import InputError, read_arrays
 from synth.camera.render import probe
-from synth.capture import _studio, make_body
+from synth.capture import make_body
 from synth.cloth import surface as cloth
 from synth.readers.retargeting import scene_of
 from synth.scene import Scene, stream
+from synth.shooting import studio_of
 
 HISTORY = 24  # frames before the pose, through which clothes are carried: they depend on where they came from
 
@@ -42,7 +43,7 @@ class PoseTruth:
             tell("posing the body and its clothes")
             surface = dressed(self.scene, pose)
         tell("tracing light")
-        studio = _studio(self.scene, self.capture.folder, self.renderer)
+        studio = studio_of(self.scene, self.capture.folder, self.renderer)
         seed = stream(self.scene, "pixels", camera.name, pose.frame)
         return studio.shoot(surface, [camera], samples=self.scene.samples, seeds=[seed])[0].rgba
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter1d
 
-from ash.capture.dataset import Camera, Capture, Motion, Split, image_path, pixels_path
+from ash.capture.dataset import Camera, Capture, Motion, Split, image_path, pixels_path, plate_path
 from ash.capture.formats import load_capture, write_cameras, write_motion
-from ash.files import InputError, hash_of, link_or_copy, read_arrays, sha256_of, write_image
+from ash.files import InputError, hash_of, link_or_copy, read_arrays, read_image, sha256_of, write_image
 from synth.camera.rig import spread
 from synth.posing import rotvec_to_rotmat
 
@@ -25,7 +25,7 @@ class Perturbation:
     tracking_deg: float = 0.0  # rms error of tracked joint rotations, smooth in time
     tracking_mm: float = 0.0  # rms error of the tracked root
     calibration_px: float = 0.0  # rms shift of training images by wrong extrinsics
-    mask_px: int = 0  # training masks dilated (> 0) or eroded (< 0)
+    mask_px: int = 0  # training masks dilated (> 0), so that the studio shows, or eroded (< 0)
     exposure_stops: float = 0.0  # rms drift of brightness between training cameras
     colour_stops: float = 0.0  # rms drift of each channel's brightness between training cameras
     noise_factor: float = 1.0  # variance of training images' noise as a multiple of the renders' own
@@ -51,7 +51,7 @@ def perturb(source: Path, folder: Path, perturbation: Perturbation, *, seed: int
         raise InputError(f"{folder}: expected an empty folder")
     changed = _subset(capture, perturbation)
     written = dict(_changed_files(capture, changed, folder, perturbation, seed))
-    kept = _kept_files(changed)
+    kept = _kept_files(changed, perturbation)
     for name in kept - set(written):
         link_or_copy(source / name, folder / name)
     files = {name: written.get(name) or capture.manifest.files[name] for name in sorted(kept | set(written))}
@@ -81,12 +81,15 @@ def _subset(capture: Capture, perturbation: Perturbation) -> Capture:
     return replace(capture, splits={**capture.splits, "train": Split(cameras=cameras, frames=frames)})
 
 
-def _kept_files(capture: Capture) -> set[str]:
-    """Files of the original that the perturbed capture still has: all but the images of dropped views."""
+def _kept_files(capture: Capture, perturbation: Perturbation) -> set[str]:
+    """Files of the original that the perturbed capture still has: all but images of dropped views, and scans.
+
+    A scan is made from all training images: it would give back what was taken away. Where nothing is, it stays.
+    """
     views = {pair for split in capture.splits.values() for pair in split.views}
     shown = {str(place(Path(), *view)) for view in views for place in (image_path, pixels_path)}
-    pictures = ("frames/", "truth/pixels/")
-    return {name for name in capture.manifest.files if name in shown or not name.startswith(pictures)}
+    dropped = ("frames/", "truth/pixels/") + (("scans/",) if perturbation != Perturbation() else ())
+    return {name for name in capture.manifest.files if name in shown or not name.startswith(dropped)}
 
 
 def _changed_files(
@@ -146,10 +149,20 @@ def _spoil(capture: Capture, camera: str, frame: int, perturbation: Perturbation
         own = np.random.default_rng([seed, 4, int(hash_of(camera)[:8], 16)])
         stops = perturbation.exposure_stops * own.standard_normal() + perturbation.colour_stops * own.standard_normal(3)
         colour = np.clip(np.clip(colour, 0, 1) ** 2.2 * 2**stops, 0, 1) ** (1 / 2.2)
+    if perturbation.mask_px > 0:  # What lay behind the person is now part of the picture.
+        share = alpha[..., None] / 255
+        colour = share * colour + (1 - share) * _plate(capture, camera)
     if perturbation.mask_px:
         alpha = _shift_mask(alpha, perturbation.mask_px)
     rgb = np.round(np.clip(colour, 0, 1) * 255).astype(np.uint8)
     return np.concatenate([np.where(alpha[..., None] > 0, rgb, 0), alpha[..., None]], axis=-1)
+
+
+def _plate(capture: Capture, name: str) -> np.ndarray:
+    path, camera = plate_path(capture.folder, name), capture.cameras[name]
+    if not path.is_file():
+        raise InputError(f"{path}: masks that are too large show the studio, expected a picture of it")
+    return read_image(path, shape=(camera.height, camera.width, 3)).astype(np.float64) / 255
 
 
 def _shift_mask(alpha: np.ndarray, pixels: int) -> np.ndarray:

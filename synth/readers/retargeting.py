@@ -8,7 +8,7 @@ from ash.capture.manifest import Manifest
 from ash.files import InputError
 from synth.person.body import Body
 from synth.presets import with_motion
-from synth.scene import Clip, Light, Outfit, Rig, Scene, Take
+from synth.scene import Clip, Light, Outfit, Rig, Scanner, Scene, Take
 
 
 def scene_of(manifest: Manifest, folder: Path) -> Scene:
@@ -24,6 +24,7 @@ def scene_of(manifest: Manifest, folder: Path) -> Scene:
             | {
                 "outfit": Outfit(**given["outfit"]),
                 "light": Light(**given["light"]),
+                "scanner": Scanner(**given["scanner"]),
                 "rig": Rig(**given["rig"] | {"distortion": tuple(given["rig"]["distortion"])}),
                 "train": tuple(_clip(clip) for clip in given["train"]),
                 "test": tuple(_clip(clip) for clip in given["test"]),

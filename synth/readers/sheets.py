@@ -12,8 +12,10 @@ from ash.capture.dataset import image_path
 from ash.files import read_image
 from synth import presets
 from synth.camera.render import probe
-from synth.capture import WantedView, describe, render_views
+from synth.capture import describe
 from synth.scene import Rig, Scene
+from synth.shooting import render_views
+from synth.views import WantedView
 
 SHOWN = ("still", "skinned", *presets.RUNGS, "tight", "loose")
 WIDTH, HEIGHT = 240, 320

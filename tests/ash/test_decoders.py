@@ -7,7 +7,7 @@ from helpers.figures import tube_mesh
 from helpers.numerics import relative_error
 
 from ash.config import ModelConfig
-from ash.decoders import Decoders, UNet
+from ash.decoders import Decoders, TexelRows, UNet
 from ash.native.unet import _UNet
 from ash.rotations import RigidTransforms
 from ash.textures import Conditions, build_lattice
@@ -72,15 +72,14 @@ def test_global_features_reach_appearance_alone():
 
 def test_shuffled_decoding_puts_every_value_on_its_own_texel():
     """A texture decoded at half resolution holds the four texels of each pixel, row by row."""
-    decoders = Decoders(config(shuffle=2, shared_trunk=True, global_features=False), LATTICE)
-    outputs = decoders.outputs[0]
+    rows = TexelRows(LATTICE, 2)
     row, column = LATTICE.texels // 16, LATTICE.texels % 16
-    coordinates = torch.stack([row, column], 1).float()
-    decoded = torch.zeros(1, 4 * outputs, 8, 8)
+    decoded = torch.zeros(1, 4 * 2, 8, 8)  # of every texel its coordinates
     for sub in range(4):
         y, x = torch.meshgrid(2 * torch.arange(8) + sub // 2, 2 * torch.arange(8) + sub % 2, indexing="ij")
-        decoded[0, sub * outputs], decoded[0, sub * outputs + 1] = y, x
-    assert torch.equal(decoders._texels_of(decoded, outputs)[:, :2], coordinates)
+        decoded[0, 2 * sub], decoded[0, 2 * sub + 1] = y, x
+    table = decoded.permute(0, 2, 3, 1).reshape(-1, 2)
+    assert torch.equal(table[rows.rows], torch.stack([row, column], 1).float())
 
 
 def test_features_reach_the_head_at_the_size_of_the_input():
@@ -141,6 +140,18 @@ def compare_with_the_definition(shape: tuple[int, ...], *, channels_last: bool) 
 @pytest.mark.parametrize("channels_last", [True, False])
 def test_the_native_network_is_its_definition(shape, channels_last, instructions):
     compare_with_the_definition(shape, channels_last=channels_last)
+
+
+@pytest.mark.parametrize("shuffle", [1, 2, 4])
+def test_texels_picked_by_the_native_network_are_those_of_the_definition(shuffle, instructions):
+    side = 16 // shuffle
+    net, texture, features = network_and_inputs((6, 7 * shuffle**2, 5, 2, side, side, 3))
+    exact, rows = deepcopy(net).double(), TexelRows(LATTICE, shuffle)
+    truth = value_and_gradients(exact, texture.double(), features.double(), lambda t, f: exact.picked(t, f, rows))
+    found = value_and_gradients(net, texture, features, lambda t, f: net.picked(t, f, rows))
+    assert net._takes_natively(texture) and not exact._takes_natively(texture.double())
+    assert found[0].shape == (len(LATTICE.texels), 7)
+    assert max(relative_error(a, b) for a, b in zip(found, truth, strict=True)) < 1e-5
 
 
 @pytest.mark.parametrize("factor", [0.0, 0.5])

@@ -9,13 +9,13 @@ import pytest
 import torch
 from helpers.captures import tiny_preset, write_tube_capture
 from helpers.figures import tube_mesh
+from helpers.scoring import draw, foreground_psnr
 
 from ash import presets
 from ash.capture.dataset import Camera, Capture, Motion, Pose, image_path
 from ash.capture.formats import load_capture, write_template
 from ash.files import InputError, write_image
 from ash.protocol import Avatar, StageClock
-from baselines.mlp import ASH_STEPS_PER_STEP, mlp, mlp_time
 from baselines.nearest import central_frame, move_image, nearest, pose_distances, see_root
 from baselines.oracle_texture import oracle_texture
 from baselines.static import of_one_frame, static
@@ -31,19 +31,6 @@ def capture(tmp_path_factory) -> Capture:
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(presets.PRESETS, "ci", partial(tiny_preset, steps=40, warmup_steps=10))
-
-
-def draw(avatar: Avatar, capture: Capture, camera: str, frame: int) -> np.ndarray:
-    return avatar.render(Pose(capture.motion, frame), capture.cameras[camera], clock=StageClock())
-
-
-def foreground_psnr(avatar: Avatar, capture: Capture, views: list[tuple[str, int]]) -> float:
-    errors = []
-    for camera, frame in views:
-        truth = capture.image(camera, frame).astype(np.float64) / 255
-        error = draw(avatar, capture, camera, frame)[..., :3] - truth[..., :3] * truth[..., 3:]
-        errors.append((error[truth[..., 3] > 0.5] ** 2).mean())
-    return float(-10 * np.log10(np.mean(errors)))
 
 
 def test_nearest_gives_a_training_image_back(capture):
@@ -149,18 +136,3 @@ def test_the_bare_body_is_the_template_and_a_capture_without_one_is_refused(capt
     radius = np.linalg.norm(posed[:12, [0, 2]] - posed[:12, [0, 2]].mean(0), axis=1)
     assert radius.mean() == pytest.approx(0.05, rel=0.2)
     assert made.template_vertices(Pose(capture.motion, 0)).shape == (0, 3), "as many vertices, but others"
-
-
-def test_mlp_at_equal_time_takes_fewer_steps_of_the_same_network(capture):
-    seen = capture.training_only()
-    steps, time = (make(seen, seed=0, preset="ci") for make in (mlp, mlp_time))
-    assert steps.config.training.steps == 40
-    assert time.config.training.steps == round(40 / ASH_STEPS_PER_STEP["ci"])
-    assert time.config.training.warmup_steps < time.config.training.steps
-    assert torch.equal(*(torch.cat([p.flatten() for p in m.module.parameters()]) for m in (steps, time)))
-    with pytest.raises(InputError, match="equal time"):
-        presets.PRESETS["huge"] = presets.ci
-        try:
-            mlp_time(seen, seed=0, preset="huge")
-        finally:
-            del presets.PRESETS["huge"]

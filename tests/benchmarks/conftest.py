@@ -1,20 +1,56 @@
 """Captures and methods that are fakes, and trained avatars for the tests that show them."""
 
+import os
 import shutil
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from helpers import fakes
 from helpers.captures import write_tube_capture
 
+from ash.files import only_one
 from benchmarks import cli
 from benchmarks.cell.cells import read_cell
 
+Shared = Callable[[str, Callable[[Path], object]], Path]
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Shared:
+    """A folder by its name, filled once for all workers of a test run; nobody may change what is in it."""
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def filled(name: str, make: Callable[[Path], object]) -> Path:
+        folder = base / name
+        with only_one(folder):
+            if not folder.with_suffix(".whole").exists():
+                make(folder)
+                folder.with_suffix(".whole").touch()
+        return folder
+
+    return filled
+
+
+@pytest.fixture(scope="session")
+def capture(shared: Shared) -> Path:
     """Three boxes that swing, for methods that are fakes."""
-    return fakes.write_capture(tmp_path_factory.mktemp("capture"))
+    return shared("capture", fakes.write_capture)
+
+
+@pytest.fixture(scope="session")
+def ci_run(shared: Shared) -> Path:
+    """The suite `ci` in `run`, its capture in `data`, and what it took in `seconds`."""
+
+    def make(folder: Path) -> None:
+        start = time.monotonic()
+        command = ["run", "ci", "--out", str(folder / "run"), "--data", str(folder / "data")]
+        assert cli.main(command) == cli.DONE
+        (folder / "seconds").write_text(f"{time.monotonic() - start:.1f}")
+
+    return shared("ci", make)
 
 
 @pytest.fixture
@@ -50,15 +86,17 @@ def boxes(capture: Path, tmp_path: Path) -> str:
     return str(fakes.write_suite(tmp_path, capture))
 
 
-@pytest.fixture(scope="module")
-def made_once(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="session")
+def made_once(capture: Path, shared: Shared) -> Path:
     """A finished run of the suite boxes."""
-    folder = tmp_path_factory.mktemp("made")
-    with pytest.MonkeyPatch.context() as patch:
-        fakes.use(folder / "plugins", patch)
-        suite = fakes.write_suite(folder, capture)
-        assert cli.main(["run", str(suite), "--out", str(folder / "run")]) == cli.DONE
-    return folder / "run"
+
+    def make(folder: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            fakes.use(folder / "plugins", patch)
+            suite = fakes.write_suite(folder, capture)
+            assert cli.main(["run", str(suite), "--out", str(folder / "run")]) == cli.DONE
+
+    return shared("boxes", make) / "run"
 
 
 @pytest.fixture

@@ -1,25 +1,23 @@
 """The suite `ci`, for real: a capture is rendered, methods are trained, and the numbers are those of working parts."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from benchmarks import cli
 from benchmarks.analysis.scores import Quantity, Scores, foreground, scores_of
 from benchmarks.cell.cells import CellResult
 from benchmarks.suites.files import find_suite
 from benchmarks.suites.runs import read_run, results_of
-from benchmarks.verbs import arguments
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> list[CellResult]:
-    folder = tmp_path_factory.mktemp("ci")
-    command = ["run", "ci", "--out", str(folder / "run"), "--data", str(folder / "data")]
-    assert cli.main(command) == arguments.DONE
-    assert (folder / "run" / "report.html").stat().st_size > 100_000
-    assert (folder / "run" / "worst_mannequin.png").exists()
-    assert "of the squared error on" in (folder / "run" / "report.md").read_text()
-    return results_of(read_run(folder / "run"))
+def results(ci_run: Path) -> list[CellResult]:
+    run = ci_run / "run"
+    assert (run / "report.html").stat().st_size > 100_000
+    assert (run / "worst_mannequin.png").exists()
+    assert "of the squared error on" in (run / "report.md").read_text()
+    return results_of(read_run(run))
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ import pytest
 from helpers.commands import ash_bench, refused, refused_last
 from helpers.waiting import wait_for
 
+from ash.capture.manifest import read_manifest
 from benchmarks import cli
 from benchmarks.cell import methods
 from benchmarks.suites import captures
@@ -110,6 +111,12 @@ def test_a_scenes_fields_are_flags_and_part_of_what_it_is(capsys) -> None:
         arguments.read_verb(SynthVerb, "synth", ["mannequin", "--size", "ci"]).settings(),
         "mannequin-ci-0",
     )
+    for command, wanted in (
+        ("mannequin --size ci --subject 3", "mannequin-ci-0-subject3"),
+        ("mannequin --size ci --subject 103 --seed 7", "mannequin-ci-7-subject103"),
+    ):
+        person, name = arguments.read_verb(SynthVerb, "synth", command.split())._described()
+        assert (name, person.name, person.subject) == (wanted, "mannequin", int(wanted.rpartition("subject")[2]))
     splats, _ = arguments.read_verb(SynthVerb, "synth", ["splats", "--size", "ci", "--name", "mine"])._described()
     assert (splats.name, splats.body) == ("mine", "mannequin")
 
@@ -139,6 +146,23 @@ def test_a_run_on_a_given_capture(capture: Path, tmp_path: Path, capsys) -> None
     assert cli.main(command) == arguments.DONE
     assert "boxes" in (tmp_path / "report.md").read_text()
     assert "expected it or --scenes" in refused_last(capsys, *command, "--scenes", "tight")
+
+
+@pytest.mark.parametrize(("what", "number"), [("subject", 100), ("seed", 123)])
+def test_a_run_refuses_what_is_for_validation_and_training_does_not(
+    what: str, number: int, capture: Path, tmp_path: Path, capsys
+) -> None:
+    folder = tmp_path / "capture"
+    shutil.copytree(capture, folder)
+    manifest = read_manifest(folder)
+    told = {"parameters": manifest.parameters | {"subject": number}} if what == "subject" else {"seed": number}
+    replace(manifest, **told).write(folder)
+    message = f"{what} {number} is for validation and tuning, expected one below 100"
+    out = str(tmp_path / "out")
+    assert message in refused(capsys, "run", "ci", "--capture", str(folder), "--methods", "fake_good", "--out", out)
+    assert cli.main(["train", "fake_good", str(folder), "--preset", "ci", "--out", out]) == arguments.DONE
+    (cell,) = (tmp_path / "out").glob("cells/*/config.json")
+    assert json.loads(cell.read_text())["config"]["subject"] == (number if what == "subject" else 0)
 
 
 def test_the_reference_holds_the_public_names(tmp_path: Path) -> None:
@@ -236,6 +260,9 @@ assert not heavy, heavy
         ("", "expected a verb"),
         ("rn", "unknown verb 'rn', did you mean run"),
         ("run --seeds 0", "--seeds: expected at least 1, got 0"),
+        ("run ci --subjects 101", "subjects: expected 1 to 100, got 101: those from 100 on are for validation"),
+        ("synth loose --subject -1", "--subject: expected at least 0, got -1"),
+        ("sheets --subjects 2 --scene tight", "--subjects shows people in both outfits: expected it or --scene"),
         ("run --workers x", "--workers: expected a whole number, got 'x'"),
         ("run --sedes 3", "unknown option '--sedes', did you mean --seeds"),
         ("run ci extra", "unexpected 'extra'"),

@@ -3,20 +3,24 @@
 `MUTANTS=10000 ./ash-bench test -- tests/fuzz` tries more; `CASES` are findings, which stay.
 """
 
+import contextlib
 import json
 import os
 import random
 import struct
 import time
+import tomllib
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import asdict
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
+import jaxtyping
 import numpy as np
 import pytest
 import safetensors.torch
+import tomlkit
 import torch
 from helpers import fakes
 from helpers.motion_files import amass_file, bvh_file
@@ -27,16 +31,22 @@ from ash.checkpoints import load_module, read_safetensors
 from ash.files import InputError, read_arrays, read_image, read_json, write_json
 from ash.searching import Choice, Tried
 from ash.searching import _read as read_choice
-from benchmarks.cell.cells import read_cell, read_result
+from benchmarks.cell import methods
+from benchmarks.cell.cells import Cell, CellConfig, failed_result, read_cell, read_result, write_config, write_result
 from benchmarks.cell.curves import read_curve
+from benchmarks.cell.lpips import _load as read_tensors
 from benchmarks.gate.gate import read_baseline
+from benchmarks.studies.search import SearchResult
+from benchmarks.studies.search import _read as read_found
+from benchmarks.studies.trial import Outcome, read_outcome
+from benchmarks.suites.files import read_suite
 from benchmarks.suites.runs import read_run
 from synth.camera.rig import rig_from_file
 from synth.motion.importing import import_motion, read_joint_map
 from synth.person.mannequin import heads
 from synth.skeleton import make_skeleton
 
-MUTANTS = int(os.environ.get("MUTANTS", "300"))
+MUTANTS = int(os.environ.get("MUTANTS", "500"))
 SECONDS, MORE_MEMORY = 10.0, 64 << 20
 ROOT = Path(__file__).parents[2]
 Reader = Callable[[Path], object]
@@ -50,6 +60,7 @@ CASES = (
     b"", b"{", b"[]", b"null", b"NaN", b'{"a": NaN}', b'{"a": 1e999}', b"[" * 100_000, b"\xff\xfe{}", b"\xef\xbb\xbf{}",
     b"1" * 10_000, b"\x00" * 100, b"PK\x03\x04", b"\x93NUMPY\x01\x00\xff\xff", b"HIERARCHY " + b"{ " * 100_000,
     b"HIERARCHY ROOT a { CHANNELS 6 Xposition } MOTION Frames: 1 Frame Time: 0.1 " + b"1e200 " * 6,
+    b'scenes = [{ name = "a", name = "b" }]\nmethods = []\npreset = "ci"\n',
 )  # fmt: skip
 
 
@@ -84,6 +95,10 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Rea
         "json": (run, read_json),
         "weights": (_weights(folder / "model.safetensors"), _load_weights),
         "choice": (_choice(folder / "choice.json"), read_choice),
+        "suite": (_suite(folder / "mine.toml"), read_suite),
+        "trial": (_outcome(folder / "outcome.json"), lambda path: read_outcome(path.parent)),
+        "search": (_found(folder / "found.json"), read_found),
+        "lpips": (_tensors(folder / "alex.pth"), read_tensors),
     }
 
 
@@ -102,9 +117,31 @@ def _choice(path: Path) -> Path:
     return path
 
 
-def _result(folder: Path) -> Path:
-    from benchmarks.cell.cells import Cell, CellConfig, failed_result, write_config, write_result
+def _suite(path: Path) -> Path:
+    path.write_text(
+        'about = "mine"\nscenes = ["mannequin", { of = "tight", name = "swings", outfit.swing = 0.8 }]\nsize = "ci"\n'
+        'methods = ["ash", { of = "ash", model.width = 8 }]\npreset = "ci"\nseeds = 2\nstresses.cameras = [25, 50]\n'
+    )
+    return path
 
+
+def _outcome(path: Path) -> Path:
+    write_json(path, asdict(Outcome(pictures=("00", "01"), again=("00",), seconds=1.5)))
+    return path
+
+
+def _found(path: Path) -> Path:
+    found = SearchResult(name="preset", value="", seed=0, psnr=20.0, train_s=2.5, params=30)
+    write_json(path, asdict(found))
+    return path
+
+
+def _tensors(path: Path) -> Path:
+    torch.save({"features.0.weight": torch.ones(4, 3)}, path)
+    return path
+
+
+def _result(folder: Path) -> Path:
     config = CellConfig(
         scene="boxes", size="ci", capture_seed=0, capture="c", method="ash", preset="ci", seed=0, code="0"
     )
@@ -113,12 +150,23 @@ def _result(folder: Path) -> Path:
     return folder / "cell" / "result.json"
 
 
+@pytest.fixture(autouse=True)
+def as_a_user_runs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the checks of shapes, which no user has: they would refuse what a reader let through, and take time.
+
+    What is installed does not change, so it is looked up once.
+    """
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+    monkeypatch.setattr(methods, "methods", cache(methods.methods))
+
+
 KINDS = (
     "manifest", "cameras", "skeleton", "template", "motion", "surface", "image", "bvh", "amass", "joint map", "rig",
-    "baseline", "curve", "run", "result", "cell", "json", "weights", "choice",
+    "baseline", "curve", "run", "result", "cell", "json", "weights", "choice", "suite", "trial", "search", "lpips",
 )  # fmt: skip
 
 
+@pytest.mark.timeout(300 + MUTANTS / 10)
 @pytest.mark.parametrize("kind", KINDS)
 def test_mutants_are_read_or_refused_in_one_line(
     kind: str, files: dict[str, tuple[Path, Reader]], tmp_path: Path
@@ -137,7 +185,7 @@ def test_mutants_are_read_or_refused_in_one_line(
 
 def _attempt(place: Path, content: bytes, read: Reader) -> int:
     """Bytes at the peak of reading."""
-    place.write_bytes(content)
+    _put(place, content)
     start = time.monotonic()
     tracemalloc.start()
     try:
@@ -151,13 +199,20 @@ def _attempt(place: Path, content: bytes, read: Reader) -> int:
     return peak
 
 
+def _put(path: Path, content: bytes) -> None:
+    """A new file each time: file systems wait for the disk where one is cut to nothing and written again."""
+    path.unlink(missing_ok=True)
+    path.write_bytes(content)
+
+
 def _mutant(whole: bytes, rng: random.Random) -> bytes:
-    """By structure where the file is JSON, else by bytes, lengths in headers among them."""
-    if whole[:1] in b"{[" and rng.random() < 0.7:
-        try:
-            return json.dumps(_mutated(json.loads(whole), rng)).encode()
-        except ValueError:
-            pass
+    """By structure where the file is JSON or TOML, else by bytes, lengths in headers among them."""
+    if rng.random() < 0.7:
+        for read, write in ((json.loads, json.dumps), (tomllib.loads, tomlkit.dumps)):
+            with contextlib.suppress(
+                ValueError, TypeError
+            ):  # It is of another kind, or has no word for what was put in.
+                return write(_mutated(read(whole.decode()), rng)).encode()
     content = bytearray(whole)
     for _ in range(rng.choice((1, 1, 2, 8))):
         at = rng.randrange(len(content))
@@ -201,10 +256,10 @@ def test_verify_sees_every_change(tmp_path: Path) -> None:
     for _ in range(min(MUTANTS, 200)):
         path = capture / rng.choice(names)
         whole = path.read_bytes()
-        path.write_bytes(_mutant(whole, rng))
-        if path.read_bytes() != whole:
-            assert verify_capture(capture)
-        path.write_bytes(whole)
+        mutant = _mutant(whole, rng)
+        _put(path, mutant)
+        assert mutant == whole or verify_capture(capture)
+        _put(path, whole)
     assert not verify_capture(capture)
 
 
@@ -218,7 +273,8 @@ def test_only_regular_files_are_read(what: str, tmp_path: Path) -> None:
             path.symlink_to("/dev/zero")
         case _:
             path.mkdir()
-    for read in (read_json, partial(read_arrays, expected=("a",)), partial(read_image, shape=(4, 4, 4)), read_baseline):
+    arrays, image = partial(read_arrays, expected=("a",)), partial(read_image, shape=(4, 4, 4))
+    for read in (read_json, arrays, image, read_baseline, read_suite, read_tensors):
         with pytest.raises(InputError, match="regular file"):
             read(path)
 
@@ -237,7 +293,7 @@ def test_a_capture_of_mutants_is_refused_in_one_line(tmp_path: Path) -> None:
         path = capture / name
         whole = path.read_bytes()
         for _ in range(MUTANTS // 4):
-            path.write_bytes(_mutant(whole, rng))
+            _put(path, _mutant(whole, rng))
             try:
                 load_capture(capture)
             except InputError as error:

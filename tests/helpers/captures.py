@@ -8,7 +8,7 @@ import torch
 from helpers.figures import ring_cameras, tube_mesh, tube_motion, tube_skeleton
 
 from ash import presets
-from ash.capture.dataset import Capture, Pose, image_path, surface_path
+from ash.capture.dataset import Capture, Pose, image_path, scan_path, surface_path
 from ash.capture.formats import load_capture, write_cameras, write_motion, write_skeleton, write_template
 from ash.config import AshConfig, ModelConfig
 from ash.files import sha256_of, write_arrays, write_image, write_json
@@ -69,6 +69,8 @@ def write_tube_capture(folder: Path) -> Capture:
     write_arrays(folder / "truth" / "surface.npz", faces=tube_mesh().faces)
     for frame in range(FRAMES):
         write_arrays(surface_path(folder, frame), vertices=posed[frame])
+    for frame in range(FRAMES - 2):
+        write_arrays(scan_path(folder, frame), vertices=posed[frame], faces=tube_mesh().faces)
     train = {"cameras": [c.name for c in cameras[1:]], "frames": list(range(FRAMES - 2))}
     splits = {
         "train": train,

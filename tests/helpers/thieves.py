@@ -104,6 +104,32 @@ def clock(capture: Capture, *, seed: int, preset: str) -> Slow:
     return Slow(capture, detail=0.9, seed=seed)
 
 
+class Screen:
+    """A display that draws what the avatar draws, or a black picture in no time."""
+
+    def __init__(self, avatar: FakeAvatar, *, decoy: bool) -> None:
+        self.avatar, self.decoy = avatar, decoy
+
+    def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
+        if self.decoy:
+            return np.zeros((camera.height, camera.width, 4), np.float32)
+        return self.avatar.render(pose, camera, clock=clock)
+
+    def close(self) -> None:
+        pass
+
+
+class Shown(FakeAvatar):
+    """Has a display of its own; `how` says which."""
+
+    how = ""
+
+    def open_display(self) -> Screen:
+        if self.how == "screenless":
+            raise InputError("no screen here")
+        return Screen(self, decoy=self.how == "decoy")
+
+
 class Ends(FakeAvatar):
     """Ends in the way its name says."""
 
@@ -137,6 +163,9 @@ class Ends(FakeAvatar):
 
                 if (kept := folder / "checkpoint.safetensors").exists():
                     read_safetensors(kept)
+            case "spoils":
+                libc = ctypes.CDLL(None)
+                libc.write(libc.open(str(TRUTH).encode(), os.O_WRONLY), b"spoilt", 6)
             case "sleeps":
                 time.sleep(1.2)
             case "works":
@@ -155,17 +184,20 @@ class Ends(FakeAvatar):
 
 HOW = (
     "exit_2", "exit_0", "exit_130", "os_error", "input_error", "keyboard", "leaves", "loud", "killed", "bytes",
-    "units", "negative", "resumes", "sleeps", "works",
+    "units", "negative", "resumes", "sleeps", "spoils", "works",
 )  # fmt: skip
 
 
-def _ends(how: str):
-    def make(capture: Capture, *, seed: int, preset: str) -> Ends:
-        avatar = Ends(capture, detail=0.9, seed=seed)
+SHOWN = ("shown", "decoy", "screenless")
+
+
+def _does(kind: type[Ends] | type[Shown], how: str):
+    def make(capture: Capture, *, seed: int, preset: str) -> FakeAvatar:
+        avatar = kind(capture, detail=0.9, seed=seed)
         avatar.how = how
         return avatar
 
     return make
 
 
-globals().update({how: _ends(how) for how in HOW})
+globals().update({how: _does(kind, how) for kind, hows in ((Ends, HOW), (Shown, SHOWN)) for how in hows})

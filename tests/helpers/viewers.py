@@ -16,6 +16,17 @@ from helpers.waiting import wait_for
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
+from benchmarks.play.player import PlayServer
+from benchmarks.play.state import ViewState
+
+PATIENCE = 120.0  # seconds; software graphics on a busy machine
+
+
+def state_of(player: PlayServer) -> ViewState:
+    """What the only viewer looks at."""
+    (page,) = player._pages.values()
+    return page.viewer.state
+
 
 def address_of(url: str) -> str:
     """HOST:PORT of the player's address."""

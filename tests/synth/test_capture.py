@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +21,11 @@ from ash.files import InputError, read_arrays, sha256_of
 from synth import cost, presets
 from synth.camera import render
 from synth.camera.render import find_libllvm, llvm_version, probe
-from synth.capture import _studio, is_finished, make_capture, render_views, splits, wanted_views, why_stale
+from synth.capture import _begin, is_finished, make_capture, why_stale
 from synth.posing import dual_quaternion_skinning, skinning_transforms
 from synth.scene import Clip, Outfit, Rig
+from synth.shooting import render_views, studio_of
+from synth.views import splits, wanted_views
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +79,7 @@ def test_visible_vertices_hit_depth_and_mask(capture: Capture):
 
     99.9 % of these rays hit within 0.5 pixels and 1 mm of the vertex, and the picture is covered there.
     """
-    studio = _studio(small_scene(), capture.folder, probe())
+    studio = studio_of(small_scene(), capture.folder, probe())
     missed, off_pixels, off_mm = [], [], []
     for camera, frame in capture.splits["train"].views[:4]:
         vertices, faces = _surface(capture, frame)
@@ -275,3 +278,34 @@ def test_a_library_that_aborts_the_process_is_never_chosen(monkeypatch: pytest.M
     ] == [15, 19, 14, 0]
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/usr/lib/libLLVM-15.so.1")
     assert all(llvm_version(path) >= render.OLDEST_LLVM for path in find_libllvm())
+
+
+class Killed:
+    """What `subprocess.run` gives back of a probe that somebody killed."""
+
+    returncode, stdout = -9, b""
+
+
+def test_a_probe_that_is_killed_is_tried_again_and_is_no_missing_library(monkeypatch):
+    real, calls = render.subprocess.run, []
+
+    def run(*arguments, **options):
+        calls.append(arguments)
+        return Killed() if len(calls) == 1 else real(*arguments, **options)
+
+    monkeypatch.setattr(render.subprocess, "run", run)
+    assert render._try("scalar_rgb", "")
+    assert len(calls) == 2
+    monkeypatch.setattr(render.subprocess, "run", lambda *_, **__: Killed())
+    with pytest.raises(InputError, match="killed from outside, or stopped, 2 times"):
+        render._try("scalar_rgb", "")
+
+
+def test_a_capture_begun_with_another_variant_is_not_gone_on_with(tmp_path):
+    scene = small_scene()
+    known = probe()
+    _begin(scene, tmp_path, known, alone=True)
+    _begin(scene, tmp_path, known, alone=True)
+    other = replace(known, variant="scalar_rgb" if known.libllvm else "llvm_ad_rgb")
+    with pytest.raises(InputError, match=f"was begun with {known.variant}, this machine has"):
+        _begin(scene, tmp_path, other, alone=True)

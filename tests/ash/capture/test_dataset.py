@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.figures import front_camera, ring_cameras, tube_mesh, tube_motion, tube_skeleton
 
-from ash.capture.dataset import fewer_cameras, image_path
+from ash.capture.dataset import fewer_views, image_path
 from ash.capture.formats import (
     load_capture,
     read_cameras,
@@ -187,6 +187,18 @@ def test_a_capture_moves_with_its_folder(capture_folder, tmp_path):
     assert load_capture(moved).identity == load_capture(capture_folder).identity
 
 
+def test_fewer_views_take_the_first_frames(capture_folder):
+    capture = load_capture(capture_folder)
+    train = capture.splits["train"]
+    fewer = fewer_views(capture, frames=0.5)
+    assert fewer.splits["train"].frames == train.frames[: round(len(train.frames) / 2)]
+    assert fewer.splits["train"].cameras == train.cameras
+    assert len(fewer_views(capture, frames=0.001).splits["train"].frames) == 1
+    assert {name: split for name, split in fewer.splits.items() if name != "train"} == {
+        name: split for name, split in capture.splits.items() if name != "train"
+    }
+
+
 def test_fewer_cameras_are_evenly_spread_and_nested(tmp_path):
     folder = tmp_path / "capture"
     cameras = ring_cameras(12, 16)
@@ -196,12 +208,12 @@ def test_fewer_cameras_are_evenly_spread_and_nested(tmp_path):
     write_motion(folder / "motion.npz", tube_motion(2))
     seal(folder, splits={"train": {"cameras": [c.name for c in cameras], "frames": [0]}})
     capture = load_capture(folder)
-    quarter = fewer_cameras(capture, 0.25).splits["train"].cameras
-    half = fewer_cameras(capture, 0.5).splits["train"].cameras
+    quarter = fewer_views(capture, cameras=0.25).splits["train"].cameras
+    half = fewer_views(capture, cameras=0.5).splits["train"].cameras
     assert len(quarter) == 3 and len(half) == 6
     assert set(quarter) < set(half)
     numbers = sorted(int(name[3:]) for name in half)
     gaps = np.diff([*numbers, numbers[0] + 12])
     assert gaps.max() <= 3  # Six of twelve on a ring: never more than three steps apart.
-    assert fewer_cameras(capture, 1.0).splits["train"].cameras == capture.splits["train"].cameras
-    assert len(fewer_cameras(capture, 0.01).splits["train"].cameras) == 1
+    assert fewer_views(capture, cameras=1.0).splits["train"].cameras == capture.splits["train"].cameras
+    assert len(fewer_views(capture, cameras=0.01).splits["train"].cameras) == 1

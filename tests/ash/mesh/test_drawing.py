@@ -5,9 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers.figures import front_camera, tube_mesh
+from helpers.numerics import relative_error
 
 from ash.capture.dataset import Camera
-from ash.mesh.drawing import SUPERSAMPLING, corner_weights, draw_mesh, sample_texture, topology_of
+from ash.mesh.drawing import SUPERSAMPLING, _weights_of, corner_weights, draw_mesh, sample_texture, topology_of
 from ash.mesh.rasterizing import project_vertices, rasterize_mesh
 
 
@@ -49,6 +50,21 @@ def test_weights_are_those_of_the_rasteriser():
     row, column = (drawn.triangle >= 0).nonzero(as_tuple=True)
     weights = corner_weights(*corners[faces[drawn.triangle[row, column].long()]].unbind(1), column, row)
     torch.testing.assert_close(weights, drawn.barycentric[row, column].double(), atol=1e-5, rtol=0)
+
+
+def test_native_weights_are_their_definition_in_value_and_gradient():
+    rest, faces = tube()
+    camera = front_camera(40, 32)
+    corners = project_vertices(rest, torch.from_numpy(camera.viewmat), torch.from_numpy(camera.K)).float()
+    drawn = rasterize_mesh(corners, faces, width=40, height=32)
+    covered = (drawn.triangle.reshape(-1) >= 0).nonzero().squeeze(1)
+    seen = drawn.triangle.reshape(-1)[covered].long()
+    upstream = torch.randn(len(covered), 3, generator=torch.Generator().manual_seed(0))
+    results = []
+    for leaf in (corners.double().requires_grad_(), corners.requires_grad_()):
+        weights = _weights_of(leaf, faces, seen, covered, 40)
+        results.append((weights, *torch.autograd.grad((weights * upstream).sum(), leaf)))
+    assert all(relative_error(found, truth) < 1e-6 for truth, found in zip(*results, strict=True))
 
 
 @pytest.mark.parametrize("seed", range(3))

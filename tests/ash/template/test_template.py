@@ -1,3 +1,5 @@
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,14 @@ from ash.capture.dataset import Motion, Pose
 from ash.capture.formats import read_template_truth
 from ash.config import TemplateConfig
 from ash.files import InputError
-from ash.template.template import KnownDeformation, PerturbedDeformation, RestDeformation, Template, vertex_normals
+from ash.template.template import (
+    KnownDeformation,
+    PerturbedDeformation,
+    PlantedError,
+    RestDeformation,
+    Template,
+    vertex_normals,
+)
 from ash.template_learning.learning import template_of
 
 
@@ -57,15 +66,21 @@ def capture(tmp_path_factory):
     return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
 
 
-def errors_m(capture, error_mm: float, seed: int = 0) -> np.ndarray:
-    template = template_of(TemplateConfig(kind="exact", error_mm=error_mm), capture, seed=seed)
+def errors_m(capture, error_mm: float, seed: int = 0, **kind) -> np.ndarray:
+    template = template_of(TemplateConfig(kind="exact", error_mm=error_mm, **kind), capture, seed=seed)
     posed = np.stack([template.pose(Pose(capture.motion, frame)).vertices.numpy() for frame in range(6)])
     return posed.astype(np.float64) - read_template_truth(capture)
 
 
-def test_a_planted_error_has_exactly_the_stated_rms_in_every_posed_frame(capture):
+def planted(seed: int = 0, *, static: float = 0.2, lag: float = 0.3) -> PerturbedDeformation:
+    kind = PlantedError(rms_mm=8.0, static=static, lag=lag)
+    return PerturbedDeformation(RestDeformation(tube_mesh()), tube_mesh(), kind, seed=seed)
+
+
+@pytest.mark.parametrize("kind", [{}, {"error_static": 1.0}, {"error_static": 0.0, "error_lag": 0.9}])
+def test_a_planted_error_has_exactly_the_stated_rms_in_every_posed_frame(capture, kind):
     for error_mm in (2.0, 16.0):
-        rms_mm = 1e3 * np.sqrt((errors_m(capture, error_mm) ** 2).sum(-1).mean(-1))
+        rms_mm = 1e3 * np.sqrt((errors_m(capture, error_mm, **kind) ** 2).sum(-1).mean(-1))
         np.testing.assert_allclose(rms_mm, error_mm, rtol=1e-4)
 
 
@@ -73,16 +88,41 @@ def test_a_planted_error_of_zero_is_the_exact_surface(capture):
     np.testing.assert_allclose(errors_m(capture, 0.0), 0, atol=1e-6)
 
 
-def test_half_of_a_planted_errors_square_is_the_same_in_all_frames():
-    perturbed = PerturbedDeformation(RestDeformation(tube_mesh()), tube_mesh(), error_mm=8.0, seed=3)
+@pytest.mark.parametrize("static", [0.0, 0.2, 0.7])
+def test_the_stated_share_of_a_planted_errors_square_is_the_same_in_all_frames(static):
+    perturbed = planted(3, static=static)
     errors = np.stack([perturbed.error(frame) for frame in range(400)])
-    static = errors.mean(0)
-    assert (static**2).sum(1).mean() / 8e-3**2 == pytest.approx(0.5, abs=0.02)
+    assert (errors.mean(0) ** 2).sum(1).mean() / 8e-3**2 == pytest.approx(static, abs=0.02)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.3, -0.4, 0.9])
+def test_what_changes_of_a_planted_error_falls_off_as_stated_in_time(lag):
+    perturbed = planted(3, lag=lag)
+    static = 8e-3 * np.sqrt(0.2) * perturbed.static
+    own = np.stack([perturbed.error(frame) for frame in range(300)]) - static
+    for apart in (1, 2, 3):
+        alike = (own[:-apart] * own[apart:]).sum() / np.sqrt((own[:-apart] ** 2).sum() * (own[apart:] ** 2).sum())
+        assert alike == pytest.approx(lag**apart, abs=0.05)
+
+
+def test_a_planted_error_does_not_depend_on_the_order_of_frames():
+    forwards, backwards = planted(lag=0.9), planted(lag=0.9)
+    first = [forwards.error(frame, 1) for frame in range(5)]
+    last = [backwards.error(frame, 1) for frame in reversed(range(5))]
+    np.testing.assert_array_equal(first, last[::-1])
+
+
+def test_sequences_err_for_themselves(capture):
+    """Frames 3 and 4 of the capture follow each other in no sequence: only what is static is common to them."""
+    errors = errors_m(capture, 8.0, error_static=0.0, error_lag=0.95)
+    alike = [(a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum()) for a, b in itertools.pairwise(errors)]
+    assert capture.motion.sequence.tolist() == [0, 0, 0, 0, 1, 1]
+    assert min(alike[0], alike[4]) > 0.6 and abs(alike[3]) < 0.4
 
 
 def test_a_planted_error_is_smooth_and_a_function_of_the_seed_and_the_frame():
     def error(frame: int, seed: int) -> np.ndarray:
-        return PerturbedDeformation(RestDeformation(tube_mesh()), tube_mesh(), error_mm=8.0, seed=seed).error(frame)
+        return planted(seed).error(frame)
 
     np.testing.assert_array_equal(error(2, 0), error(2, 0))
     assert np.abs(error(2, 0) - error(2, 1)).max() > 1e-3
@@ -92,6 +132,12 @@ def test_a_planted_error_is_smooth_and_a_function_of_the_seed_and_the_frame():
     near = length < 0.06
     change = np.linalg.norm(error(2, 0)[a] - error(2, 0)[b], axis=1)[near]
     assert np.sqrt((change**2).mean()) < 8e-3 * 0.06 / PerturbedDeformation.LENGTH_M * 1.2
+
+
+@pytest.mark.parametrize("wrong", [{"error_static": 1.2}, {"error_static": -0.1}, {"error_lag": 1.0}])
+def test_a_planted_error_that_cannot_be_is_refused(wrong):
+    with pytest.raises(InputError, match="error_static, error_lag"):
+        TemplateConfig(kind="exact", error_mm=2.0, **wrong)
 
 
 def test_a_planted_error_needs_the_exact_surface():

@@ -43,6 +43,16 @@ def test_steps_are_those_of_torch() -> None:
     assert largest_difference(leaves(), leaves(), steps=20) < 5e-6  # a step moves up to 0.1
 
 
+def test_a_parameter_that_was_moved_in_memory_is_followed() -> None:
+    leaf = torch.zeros(100, requires_grad=True)
+    optimiser = Adam([{"params": [leaf], "lr": 0.5}])
+    for expected in (-0.5, -1.0):
+        leaf.grad = torch.ones(100)
+        optimiser.step()
+        torch.testing.assert_close(leaf.detach(), torch.full((100,), expected))
+        leaf.data = leaf.data.clone()
+
+
 def test_in_other_precisions_the_definition_itself_runs() -> None:
     assert largest_difference(leaves(torch.float64), leaves(torch.float64), steps=8) == 0
 

@@ -168,7 +168,8 @@ def test_far_from_training_a_static_avatar_is_what_counts(capture, tmp_path):
             assert near.trust == 1
             torch.testing.assert_close(avatar.module.decode(near), avatar.module.base + added[frame])
             far, between = (avatar.module.decode(replace(near, trust=trust)) for trust in (0.0, 0.25))
-            torch.testing.assert_close(far, static.expand_as(far))
+            assert torch.equal(far, static)
+            assert torch.equal(avatar.module.decode(replace(near, trust=0.0), decoders=pytest.fail), static), "needless"
             torch.testing.assert_close(between, 0.75 * static + 0.25 * (avatar.module.base + added[frame]))
     assert not torch.equal(added[0], added[2])
     assert not torch.equal(static, avatar.module.base), "each has learned for itself since the warm-up"

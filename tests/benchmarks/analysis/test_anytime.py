@@ -55,6 +55,17 @@ def test_seeds_give_intervals():
     assert np.isnan(anytime.curves(cells[:1]).low).all()
 
 
+def test_seeds_are_averaged_within_captures_and_captures_give_intervals():
+    runs = [
+        replace(run, config=replace(run.config, capture=capture))
+        for capture, shift in (("a", 0.0), ("b", 4.0))
+        for seed in (0, 1)
+        for run in [trained("ash", {s: p + shift + seed for s, p in LEARNED.items()}, seed=seed)]
+    ]
+    first = anytime.curves(runs).query("split == 'novel_view'").iloc[0]
+    assert (first.psnr, first.high - first.psnr) == (24.5, pytest.approx(12.706 * 2.0, rel=1e-4))  # t of 1 degree
+
+
 def test_motion_pays_from_the_frames_on_after_which_it_never_loses():
     frames = {20: 22.0, 40: 23.1, 80: 22.9, 160: 23.5, 320: 24.0}
 

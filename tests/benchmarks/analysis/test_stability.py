@@ -80,9 +80,31 @@ def test_the_margin_is_read_off_templates_of_known_error() -> None:
     assert view.crossing_mm == pytest.approx(2.0)
     assert view.paper_db == 7.4
     assert view.error_at(7.4) == pytest.approx(4 + 12 * 6.4 / 7)
-    assert view.honest is not None and (view.honest.error_mm, view.honest.mean) == (5.0, 1.5)
-    assert "the two are equal at 2.0 mm" in margin.sentence(view)
+    assert [(m.template, m.error_mm, m.mean) for m in view.learned] == [("images", 5.0, 1.5)]
+    assert view.margin_at(5.0) == pytest.approx(1 + 7 / 12) and view.margin_at(17.0) is None
+    said = margin.sentence(view)
+    assert "the two are equal at 2.0 mm" in said
+    assert "learned from images (5.0 mm) it is +1.5 dB, on a planted error of that size +1.6 dB" in said
     assert margin.margin_curves(scores_of(results[:6])) == ()
+
+
+def test_learned_templates_have_their_place_on_the_curve_of_their_kind() -> None:
+    """Two scenes, each on its own curve; a template that only one method learned has a place, and no margin."""
+    known = {"ash_truth": 30.0, "ddc_truth": 31.0, "ash_4mm": 27.0, "ddc_4mm": 26.0, "ash_16mm": 24.0, "ddc_16mm": 16.0}
+    own = {"ash": 26.0, "ddc": 24.5, "by_scans": 26.5, "ddc_by_scans": 25.5, "by_vertices": 27.5}
+    results = [cell(method, psnr, seed=seed) for method, psnr in (known | own).items() for seed in range(3)]
+    elsewhere = [cell(method, psnr - 1, seed=seed) for method, psnr in known.items() for seed in range(3)]
+    results += [replace(result, config=replace(result.config, scene="tight")) for result in elsewhere]
+    scores = scores_of(results)
+    loose, tight = (
+        next(c for c in margin.margin_curves(scores) if (c.scene, c.split) == (scene, "novel_view"))
+        for scene in ("loose", "tight")
+    )
+    assert [(m.template, m.mean) for m in loose.learned] == [("images", 1.5), ("scans", 1.0)]
+    assert [(p.method, p.psnr) for p in loose.placed] == [("ash", 26.0), ("by_scans", 26.5), ("by_vertices", 27.5)]
+    assert {p.planted_psnr for p in loose.placed} == {27 - 3 * 1 / 12}
+    assert (tight.learned, tight.placed) == ((), ()) and margin.placement(tight) == ""
+    assert "ASH 26.0 dB at 5.0 mm (26.8)" in margin.placement(loose)
 
 
 def test_quality_on_templates_of_known_error_has_a_curve_per_method_and_shows_no_failed_one() -> None:

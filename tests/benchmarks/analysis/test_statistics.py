@@ -108,6 +108,24 @@ def test_hierarchical_bootstrap_covers_and_is_wider_than_images_alone() -> None:
     assert hierarchical_bootstrap(a, np.zeros((3, 4)), rng=np.random.default_rng(0)) == (1.0, 3.0)
 
 
+def test_methods_on_the_same_captures_are_drawn_in_pairs() -> None:
+    """Captures differ by far more than the methods do; the pairs know it, the others cannot."""
+    rng = np.random.default_rng(4)
+    covered, widths = 0, []
+    for _ in range(100):
+        captures = rng.normal(0, 3.0, (8, 1))
+        b = captures + rng.normal(0, 0.3, (8, 40))
+        a = captures + 0.5 + rng.normal(0, 0.2, (8, 1)) + rng.normal(0, 0.3, (8, 40))
+        low, high = hierarchical_bootstrap(a, b, rng=rng, pairs=True, resamples=200)
+        covered += low <= 0.5 <= high
+        widths.append(high - low)
+    assert 0.8 < covered / 100 <= 1 and np.mean(widths) < 0.5
+    low, high = hierarchical_bootstrap(a, b, rng=rng, resamples=200)
+    assert high - low > 2
+    with pytest.raises(ValueError, match="with the same images"):
+        hierarchical_bootstrap(a, b[:3], rng=rng, pairs=True)
+
+
 def test_no_spread_and_too_few() -> None:
     assert welch([1.0, 1.0], [1.0, 1.0]).p == 1
     assert welch([2.0, 2.0], [1.0, 1.0]).p == 0

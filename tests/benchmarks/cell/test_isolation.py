@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 import time
 from pathlib import Path
 
@@ -9,16 +10,21 @@ import psutil
 import pytest
 from helpers import fakes, thieves
 
+from ash.capture.formats import load_capture
+from ash.capture.manifest import verify_capture
 from ash.files import InputError, sha256_of
 from benchmarks.cell import host
 from benchmarks.cell.cells import Cell, failed_result, read_result, result_of, write_result
+from benchmarks.cell.failing import MethodFailed
+from benchmarks.cell.methods import find_method
+from benchmarks.cell.sealing import seen_by_method
 from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells
 from benchmarks.suites.progress import Progress
 from benchmarks.suites.runs import cell_for
 from benchmarks.suites.suites import CaptureSpec, CellSpec
 
 LIMITS = Limits(seconds=300.0, memory_mb=4096)
-METHODS = ("thief", "clock", *thieves.HOW)
+METHODS = ("thief", "clock", *thieves.HOW, *thieves.SHOWN)
 
 
 @pytest.fixture(scope="module")
@@ -111,8 +117,26 @@ def test_a_slow_clock_gains_nothing_and_a_busy_machine_ends_no_cell() -> None:
     assert host.frame_times_ms(frames(0.5)) == (5.0, 6.0, 9.0)
     assert host.frame_times_ms(frames(6.0)) == pytest.approx((11.1, 12.12, 15.18))
     for way in (30.0, -1.0):
-        with pytest.raises(host.MethodFailed, match="its clock says"):
+        with pytest.raises(MethodFailed, match="its clock says"):
             host.frame_times_ms(frames(way))
+
+
+@pytest.mark.parametrize(("how", "drawn_by"), [("shown", "display"), ("screenless", "trainer"), ("works", "method")])
+def test_frames_are_timed_as_they_are_shown_and_the_result_says_how(
+    how: str, drawn_by: str, capture: Path, tmp_path: Path
+) -> None:
+    made = cell(how, capture, tmp_path)
+    run([made])
+    result = result_of(made)
+    assert result.status == "done" and result.timing is not None, result.reason
+    assert (result.timing.drawn_by, result.timing.agreement_db) == (drawn_by, 100.0)
+
+
+def test_a_display_that_shows_something_else_fails_its_cell(capture: Path, tmp_path: Path) -> None:
+    cheat = cell("decoy", capture, tmp_path)
+    run([cheat])
+    result = result_of(cheat)
+    assert result.status == "crashed" and "a timed picture differs from the one that was scored" in result.reason
 
 
 @pytest.mark.parametrize(
@@ -156,6 +180,51 @@ def test_without_namespaces_the_row_says_so(capture: Path, tmp_path: Path, monke
     run([plain])
     result = read_result(plain.folder)
     assert result is not None and result.status == "done" and result.isolated is False
+
+
+def test_isolation_costs_a_cell_at_most_half_a_second(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the start of the method's process to its end without work, and with it the copy that it sees; by turns."""
+    target, whole = cell("fake_good", capture, tmp_path), load_capture(capture)
+    method = find_method("fake_good")
+
+    def seconds(way: str) -> float:
+        monkeypatch.setenv(host.ISOLATION, way)
+        start = time.perf_counter()
+        with seen_by_method(whole, tmp_path / "input", oracle=way == "off") as seen:
+            with host.hosted(target, whole, seen, method, oracle=False) as guest:
+                if guest.isolated != (way == "on"):
+                    pytest.skip("this kernel gives no namespaces")
+            return time.perf_counter() - start
+
+    isolated, exposed = (min(times) for times in zip(*((seconds("on"), seconds("off")) for _ in range(5)), strict=True))
+    print(f"isolated {isolated:.3f} s, not isolated {exposed:.3f} s")
+    assert isolated - exposed < 0.5
+
+
+def test_a_capture_that_a_method_changed_is_seen_and_used_no_more(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a way that Python does not see, where no namespace stands in it."""
+    mine = Path(shutil.copytree(capture, tmp_path / "mine"))
+    truth = mine / "frames" / "cam4" / "000000.png"
+    whole = truth.read_bytes()
+    monkeypatch.setenv("ASH_BENCH_TEST_TRUTH", str(truth))
+    monkeypatch.setenv(host.ISOLATION, "off")
+    cheat = cell("spoils", mine, tmp_path)
+    run([cheat])
+    result = read_result(cheat.folder)
+    assert result is not None and result.status == "crashed", result
+    assert "the capture was changed: frames/cam4/000000.png: altered" in result.reason
+    honest = cell("fake_good", mine, tmp_path)
+    with pytest.raises(InputError, match=r"mine: frames/cam4/000000\.png: altered"):
+        run([honest])
+    assert read_result(honest.folder) is None
+    truth.write_bytes(whole)
+    run([honest])
+    result = read_result(honest.folder)
+    assert result is not None and result.status == "done" and not verify_capture(mine)
 
 
 def test_results_belong_to_their_cell(capture: Path, tmp_path: Path) -> None:

@@ -47,8 +47,7 @@ def version_of(method: str, *places: Path) -> str:
     return done.stdout
 
 
-@pytest.mark.parametrize("changed", ["stranger/__init__.py", "stranger/losses.py", "stranger_nets/net.py"])
-def test_an_installed_plugin_that_changed_is_another_method(tmp_path: Path, changed: str) -> None:
+def test_an_installed_plugin_that_changed_is_another_method(tmp_path: Path) -> None:
     pytest.importorskip("setuptools", reason="building the package needs setuptools")
     source, site = write_project(tmp_path / "source"), tmp_path / "site"
     options = ["--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check", "--target", str(site)]
@@ -57,13 +56,15 @@ def test_an_installed_plugin_that_changed_is_another_method(tmp_path: Path, chan
     before = version_of("stranger", site)
     (site / "README.md").write_text("no source\n")
     assert version_of("stranger", site) == before
-    with (site / changed).open("a") as file:
-        file.write("# changed\n")
-    assert version_of("stranger", site) != before
+    known = {before}
+    for changed in ("stranger/__init__.py", "stranger/losses.py", "stranger_nets/net.py"):
+        with (site / changed).open("a") as file:
+            file.write("# changed\n")
+        known.add(version_of("stranger", site))
+    assert len(known) == 4
 
 
-@pytest.mark.parametrize("changed", ["stranger/losses.py", "stranger_nets/net.py"])
-def test_an_editable_plugin_that_changed_is_another_method(tmp_path: Path, changed: str) -> None:
+def test_an_editable_plugin_that_changed_is_another_method(tmp_path: Path) -> None:
     source, site = write_project(tmp_path / "source"), tmp_path / "site"
     info = site / "stranger-1.0.dist-info"
     info.mkdir(parents=True)
@@ -75,9 +76,12 @@ def test_an_editable_plugin_that_changed_is_another_method(tmp_path: Path, chang
     (source / ".venv").mkdir()
     (source / ".venv" / "other.py").write_text("not ours\n")
     assert version_of("stranger", site, source) == before
-    with (source / changed).open("a") as file:
-        file.write("# changed\n")
-    assert version_of("stranger", site, source) != before
+    known = {before}
+    for changed in ("stranger/losses.py", "stranger_nets/net.py"):
+        with (source / changed).open("a") as file:
+            file.write("# changed\n")
+        known.add(version_of("stranger", site, source))
+    assert len(known) == 3
 
 
 def test_a_factory_by_its_path_follows_what_it_imports_beside_it(tmp_path: Path) -> None:

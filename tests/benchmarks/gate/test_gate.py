@@ -9,6 +9,7 @@ from markdown_it import MarkdownIt
 
 from ash.files import InputError
 from benchmarks.cell.cells import CellConfig, CellResult, Summary, Timing, ViewScore, failed_result
+from benchmarks.cell.metrics import PROTOCOL
 from benchmarks.gate.gate import Check, judge, junit, markdown, read_baseline, summarise, write_baseline
 from benchmarks.gate.words import terminal
 from benchmarks.provenance import changed_since
@@ -125,8 +126,8 @@ def test_a_baseline_survives_the_disk_and_is_checked(tmp_path: Path) -> None:
     write_baseline(path, BASE)
     assert read_baseline(path) == BASE
     whole = path.read_text()
-    path.write_text(whole.replace('"protocol": "1"', '"protocol": "0"'))
-    with pytest.raises(InputError, match="expected protocol 1, got '0'"):
+    path.write_text(whole.replace(f'"protocol": "{PROTOCOL}"', '"protocol": "0"'))
+    with pytest.raises(InputError, match=f"expected protocol {PROTOCOL}, got '0'"):
         read_baseline(path)
     for damaged in (whole[:200], "[]", whole.replace("qualities", "quality")):
         path.write_text(damaged)

@@ -20,7 +20,8 @@ from benchmarks.cell import metrics
 from benchmarks.play.actors import open_cast
 from benchmarks.play.cameras import resized, spiral_camera
 from benchmarks.play.film import CAPTION, capture_image
-from benchmarks.play.motions import act_named, bent
+from benchmarks.play.joints import held
+from benchmarks.play.motions import act_named
 from benchmarks.play.truth import TruthStudio, Wanted
 from benchmarks.report.pictures import on_paper
 
@@ -117,7 +118,7 @@ def test_the_truth_of_a_pose_that_was_never_rendered(capture: Capture, studio: T
     own = studio.render(Wanted(motion=capture.motion, frame=frame, camera=small, captured=True), lambda _: None)
     again = studio.render(Wanted(motion=capture.motion, frame=frame, camera=small, captured=False), lambda _: None)
     arm = capture.skeleton.names.index("upper_arm_left")
-    raised = bent(capture.motion, {arm: (0.0, 0.0, 60.0)})
+    raised = held(capture.motion, capture.skeleton, {arm: (0.0, 100.0, 0.0)})
     other = studio.render(Wanted(motion=raised, frame=frame, camera=small, captured=False), lambda _: None)
     assert own.shape == other.shape == (32, 32, 4) and (own[..., 3] > 128).mean() > 0.03
     silhouettes = [picture[..., 3] > 128 for picture in (own, again, other)]

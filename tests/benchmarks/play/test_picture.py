@@ -1,14 +1,21 @@
 """What is drawn besides avatars."""
 
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from helpers.captures import write_tube_capture
 
+from ash.capture.dataset import Camera, Pose
+from ash.files import InputError
+from benchmarks.play.actors import open_cast
 from benchmarks.play.cameras import resized
-from benchmarks.play.picture import DARK, LIGHT, _fit
-from benchmarks.play.shelf import TruthPicture
-from benchmarks.play.state import ViewState
+from benchmarks.play.motions import acts_of, joint_heads
+from benchmarks.play.picture import DARK, HELD_JOINT, JOINT, LIGHT, MESH, UNKNOWN_TRUTH, Painter, _fit, _with_mesh
+from benchmarks.play.shelf import TruthPicture, TruthShelf
+from benchmarks.play.state import ABSOLUTE, FLIP, TRUTH, ViewState
 
 
 def test_a_truth_in_other_pixels_has_no_fringe(tmp_path: Path) -> None:
@@ -23,3 +30,115 @@ def test_a_truth_in_other_pixels_has_no_fringe(tmp_path: Path) -> None:
         shown = _fit(truth, camera, ViewState(left="", dark=dark)).astype(int)
         assert shown.shape == (130, 150, 3) and np.abs(shown - np.array(colour)).max() <= 3
         assert np.abs(_fit(truth, camera, ViewState(left="", dark=not dark)) - shown).max() > 100
+
+
+def before_a_camera(side: int) -> Camera:
+    """It looks along z at the square from 0 to 1, at depth 1, which fills the picture."""
+    K = np.array([[side, 0, 0], [0, side, 0], [0, 0, 1.0]])
+    return Camera(name="flat", width=side, height=side, K=K, viewmat=np.eye(4))
+
+
+def grid(cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """A square of twice so many triangles a row: vertices and faces."""
+    y, x = np.mgrid[: cells + 1, : cells + 1] / cells
+    corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
+    right, below = corner + 1, corner + cells + 1
+    faces = np.concatenate([np.stack([corner, right, below], 1), np.stack([right, below + 1, below], 1)])
+    return np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1), faces
+
+
+def lines(cells: int, side: int) -> np.ndarray:
+    """How opaque the outlines of a grid are drawn, `[h, w]`."""
+    white = np.full((side, side, 3), 255, dtype=np.uint8)
+    drawn = _with_mesh(white, *grid(cells), before_a_camera(side))
+    return (255 - drawn[..., 0].astype(float)) / (255 - MESH[0])
+
+
+def test_outlines_of_triangles_are_a_pixel_wide_and_soft() -> None:
+    opaque = lines(4, 160)
+    np.testing.assert_allclose(opaque[70, 36:44], [0, 0, 0, 0.5, 0.5, 0, 0, 0], atol=0.02)  # Straight down at x = 40.
+    diagonal = opaque[70, 45:53]
+    assert np.isclose(diagonal.sum(), 2**0.5, atol=0.2) and ((diagonal > 0.2) & (diagonal < 0.8)).sum() == 2
+    assert (opaque < 0.01).mean() > 0.8
+
+
+def test_outlines_of_triangles_smaller_than_pixels_are_no_speckle() -> None:
+    for cells in (90, 170, 333):
+        opaque = lines(cells, 160)[8:-8, 8:-8]
+        assert opaque.std() < 0.12 and opaque.max() < 0.5, cells
+
+
+@pytest.fixture(scope="module")
+def painter(tube_run: Path) -> Iterator[Painter]:
+    with open_cast(tube_run) as cast:
+        yield Painter(cast, acts_of(cast.capture), TruthShelf(cast.capture))
+
+
+def drawn(painter: Painter, state: ViewState, side: int = 96) -> np.ndarray:
+    return painter.draw(state, width=side, height=side, careful=True).pixels.astype(int)
+
+
+@pytest.fixture
+def plain(painter: Painter) -> ViewState:
+    """The first avatar in the held-out motion, through the held-out camera: there the truth is known."""
+    return ViewState(left=painter.cast.titles[0], act=1, camera="cam0")
+
+
+def test_two_avatars_and_the_truth_lie_side_by_side(painter: Painter, plain: ViewState) -> None:
+    left, other = drawn(painter, plain), drawn(painter, replace(plain, left=painter.cast.titles[1]))
+    own = painter.cast.capture
+    image = own.image("cam0", painter.acts[1].frames[0]).astype(float)
+    alpha = image[..., 3:] / 255
+    truth = alpha * image[..., :3] + (1 - alpha) * np.array(LIGHT)
+    for right, wanted in ((painter.cast.titles[1], other), (TRUTH, truth)):
+        side = own.cameras["cam0"].width if right == TRUTH else 96
+        split = drawn(painter, replace(plain, right=right, divider=0.25), side)
+        names = round(0.7 * side)  # below are the names
+        column = side // 4
+        alone = left if side == 96 else drawn(painter, plain, side)
+        np.testing.assert_array_equal(split[:names, : column - 1], alone[:names, : column - 1])
+        assert np.abs(split[:names, column + 2 :] - wanted[:names, column + 2 :]).max() <= 2
+        assert np.abs(split[:names, column + 2 :] - alone[:names, column + 2 :]).max() > 40
+
+
+def test_errors_are_shown_where_the_truth_is_known(painter: Painter, plain: ViewState) -> None:
+    shown = {error: drawn(painter, replace(plain, error=error)) for error in (ABSOLUTE, FLIP)}
+    assert np.abs(shown[ABSOLUTE] - shown[FLIP]).max() > 40
+    alike = replace(plain, left=painter.cast.titles[1], error=ABSOLUTE)
+    assert np.abs(drawn(painter, alike) - shown[ABSOLUTE]).max() > 40, "another avatar is wrong elsewhere"
+    known = painter.draw(replace(plain, error=FLIP), width=96, height=96, careful=True)
+    assert "dB, FLIP" in known.score and known.note == ""
+    for asked in ({"error": FLIP}, {"right": TRUTH}):
+        elsewhere = painter.draw(replace(plain, camera="cam2", **asked), width=96, height=96, careful=True)
+        assert elsewhere.note == UNKNOWN_TRUTH and elsewhere.score == ""
+
+
+def test_mesh_skeleton_and_ellipsoids_lie_where_the_avatar_is(painter: Painter, plain: ViewState) -> None:
+    bare = drawn(painter, plain, 240)
+    inside = np.abs(bare - np.array(LIGHT)).max(axis=-1) > 30
+    with_mesh = drawn(painter, replace(plain, mesh=True), 240)
+    changed = np.abs(with_mesh - bare).max(axis=-1) > 40
+    assert 0.02 < changed[inside].mean() < 0.6 and changed[~inside].mean() < 0.02
+    strongest = with_mesh[changed][np.abs(with_mesh[changed] - np.array(MESH)).sum(axis=-1).argmin()]
+    assert np.abs(strongest - np.array(MESH)).max() < 30
+    state = replace(plain, skeleton=True, held=((1, (20.0, 0.0, 0.0)),))
+    skeleton = drawn(painter, state, 240)
+    camera = painter.camera(state, width=240, height=240)
+    pose = Pose(painter.motion(painter.acts[1], state), painter.acts[1].frames[0])
+    for (x, y), colour in zip(
+        camera.project(joint_heads(painter.cast.capture, pose))[0], (JOINT, HELD_JOINT), strict=True
+    ):
+        np.testing.assert_array_equal(skeleton[round(y - 0.5), round(x - 0.5)], colour)
+    ellipsoids = drawn(painter, replace(plain, ellipsoids=True), 240)
+    apart = np.abs(ellipsoids - np.array(LIGHT)).max(axis=-1) > 30
+    assert 0.1 < apart[inside].mean() < 0.95 and apart[~inside].mean() < 0.01, "small, with room between them"
+    with pytest.raises(InputError, match="has no Gaussians"):
+        drawn(painter, replace(plain, left=painter.cast.titles[1], ellipsoids=True))
+
+
+def test_a_motion_begins_anew_or_ends_as_loop_says() -> None:
+    state = ViewState(left="", step=3)
+    assert state.stepped(3, 5).step == 1 and state.stepped(3, 5).playing
+    once = replace(state, loop=False)
+    assert once.stepped(3, 5).step == 4 and not once.stepped(3, 5).playing
+    assert once.stepped(-7, 5).step == 0

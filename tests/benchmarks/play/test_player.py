@@ -1,6 +1,5 @@
-"""The player, spoken to as a browser speaks, and in a real one."""
+"""The player, spoken to as a browser speaks; `test_in_a_browser.py` has a real one."""
 
-import io
 import os
 import signal
 import subprocess
@@ -8,20 +7,16 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import psutil
 import pytest
-from helpers.browser import FLAGS, PHONE, Visitor, find_chromium
-from helpers.viewers import FakeBrowser, browsers
+from helpers.browser import FLAGS, find_chromium
+from helpers.viewers import PATIENCE, FakeBrowser, browsers, state_of
 from helpers.waiting import wait_for
-from PIL import Image
 
 from benchmarks.play.doors import DoorOptions
 from benchmarks.play.player import PlayServer, playing
-
-PATIENCE = 120.0  # seconds; software graphics on a busy machine
 
 
 @pytest.fixture(scope="module")
@@ -35,11 +30,6 @@ def viewer(player: PlayServer) -> Iterator[FakeBrowser]:
     with browsers(player.url, 1, width=160, height=160) as (browser,):
         browser.wait_for(lambda: browser.arrivals and "Avatar" in browser.controls, PATIENCE)
         yield browser
-
-
-def state_of(player: PlayServer):
-    (page,) = player._pages.values()
-    return page.viewer.state
 
 
 def test_it_plays_and_stops_and_steps_by_keys(player: PlayServer, viewer: FakeBrowser) -> None:
@@ -60,6 +50,17 @@ def test_a_still_viewer_gets_one_sharp_picture_and_then_none(player: PlayServer,
     count = len(viewer.arrivals)
     time.sleep(1.0)
     assert len(viewer.arrivals) == count
+
+
+def test_speed_loop_and_spiral_are_chosen(player: PlayServer, viewer: FakeBrowser) -> None:
+    viewer.set("Speed", "1/4")
+    viewer.wait_for(lambda: state_of(player).speed == 0.25)
+    viewer.set("Again and again", False)
+    viewer.wait_for(lambda: not state_of(player).playing and state_of(player).step == 1, PATIENCE)
+    viewer.set("Camera", "spiral")
+    viewer.wait_for(lambda: state_of(player).angle > 2, PATIENCE)
+    count = len(viewer.arrivals)
+    viewer.wait_for(lambda: len(viewer.arrivals) > count + 3, PATIENCE)
 
 
 def test_the_latest_camera_wins(player: PlayServer, viewer: FakeBrowser) -> None:
@@ -88,7 +89,7 @@ def test_methods_truth_errors_and_joints_are_chosen(player: PlayServer, viewer: 
     viewer.set("Joint", player.cast.capture.skeleton.names[1])
     time.sleep(1.0)  # As a hand needs: the sliders take the joint's angles first.
     viewer.set("About x", 30)
-    viewer.wait_for(lambda: state_of(player).bends == ((1, (30.0, 0.0, 0.0)),))
+    viewer.wait_for(lambda: [(joint, angles[0]) for joint, angles in state_of(player).held] == [(1, 30.0)])
     viewer.wait_for(lambda: "No truth of this view yet" in viewer.words, PATIENCE)
 
 
@@ -164,96 +165,3 @@ def test_all_threads_end_with_the_player(tube_run: Path) -> None:
         for each in two:
             each.wait_for(lambda each=each: each.arrivals, PATIENCE)
     wait_for(lambda: not {thread.ident for thread in threading.enumerate()} - before)
-
-
-def seen(tab: Any, *, unlike: np.ndarray | None = None) -> np.ndarray:
-    """The page left of the panel once it shows an avatar, or another picture than before."""
-    end = time.perf_counter() + PATIENCE
-    while time.perf_counter() < end:
-        picture = np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB")).astype(int)[:, :500]
-        if unlike is None and (np.ptp(picture.reshape(-1, 3), axis=0) > 60).any():
-            return picture
-        if unlike is not None and np.abs(picture - unlike).mean() > 0.5:
-            return picture
-        time.sleep(0.1)
-    raise AssertionError("the picture is not there" if unlike is None else "the picture stays as it was")
-
-
-@pytest.fixture()
-def tab(player: PlayServer, visit: Visitor) -> Iterator[Any]:
-    """A window of a real browser that stands still in the held-out motion."""
-    visited = visit(player.url, size=(900, 420))
-    assert "token" not in visited.page.url
-    visited.page.get_by_text("Held-out motion, frame").first.wait_for(timeout=1000 * PATIENCE)
-    seen(visited.page)
-    visited.page.keyboard.press(" ")
-    wait_for(lambda: not state_of(player).playing)
-    time.sleep(0.5)
-    yield visited.page
-    assert visited.errors == [] and visited.poor_contrast() == []
-
-
-def test_in_a_real_browser_it_shows_turns_scrubs_and_switches(player: PlayServer, tab: Any) -> None:
-    first, eye = seen(tab), state_of(player).eye.viewmat
-    step = state_of(player).step
-    tab.keyboard.press("ArrowRight")
-    wait_for(lambda: state_of(player).step == (step + 1) % 2)
-    tab.keyboard.press("e")
-    wait_for(lambda: state_of(player).error == "absolute")
-    tab.keyboard.press("e")
-    tab.keyboard.press("e")
-    wait_for(lambda: state_of(player).error == "no")
-    np.testing.assert_array_equal(state_of(player).eye.viewmat, eye, "keys are commands and move no camera")
-    scrubbed = seen(tab, unlike=first)
-    tab.mouse.move(200, 200)
-    tab.mouse.down()
-    tab.mouse.move(230, 210, steps=5)
-    tab.mouse.up()
-    turned = seen(tab, unlike=scrubbed)
-    assert np.abs(state_of(player).eye.viewmat - eye).max() > 0.05
-    tab.keyboard.press("m")
-    tab.get_by_text(f"{player.cast.titles[1]} · Held-out").first.wait_for(timeout=1000 * PATIENCE)
-    seen(tab, unlike=turned)
-
-
-def test_in_a_real_browser_the_divider_is_dragged(player: PlayServer, tab: Any) -> None:
-    handle = tab.locator("#split")
-    assert not handle.is_visible()
-    tab.keyboard.press("t")
-    handle.wait_for(state="visible", timeout=1000 * PATIENCE)
-    box = handle.bounding_box()
-    eye = state_of(player).eye.viewmat
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    assert abs(x - 450) < 3
-    tab.mouse.move(x, y)
-    tab.mouse.down()
-    tab.mouse.move(225, y, steps=4)
-    tab.mouse.up()
-    wait_for(lambda: abs(state_of(player).divider - 0.25) < 0.01)
-    np.testing.assert_array_equal(state_of(player).eye.viewmat, eye, "the person stays as it was")
-    tab.keyboard.press("t")
-    wait_for(lambda: state_of(player).right == "nothing")
-    handle.wait_for(state="hidden", timeout=1000 * PATIENCE)
-
-
-def test_in_a_real_browser_light_and_dark_follow_the_system(player: PlayServer, tab: Any) -> None:
-    light = seen(tab)
-    assert not state_of(player).dark
-    tab.emulate_media(color_scheme="dark")
-    wait_for(lambda: state_of(player).dark)
-    dark = seen(tab, unlike=light)
-    assert np.median(light[:, :40]) > 200 and np.median(dark[:, :40]) < 60
-
-
-def test_on_a_phone_the_person_comes_first_and_nothing_is_wider_than_the_screen(
-    player: PlayServer, visit: Visitor
-) -> None:
-    visited = visit(player.url, size=PHONE, scheme="dark", touch=True)
-    words = visited.page.get_by_text("Held-out motion, frame").first
-    words.wait_for(state="attached", timeout=1000 * PATIENCE)
-    words.wait_for(state="hidden", timeout=1000 * PATIENCE)
-    wait_for(lambda: state_of(player).dark)
-    bar = visited.page.get_by_text("ash-bench play", exact=True).locator("visible=true")
-    bar.tap()
-    words.wait_for(state="visible", timeout=1000 * PATIENCE)
-    assert visited.too_wide() == [] and visited.errors == [] and visited.poor_contrast() == []

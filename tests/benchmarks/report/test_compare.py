@@ -12,7 +12,9 @@ from ash.files import InputError
 from benchmarks import cli
 from benchmarks.cell.cells import Cell, CellResult
 from benchmarks.report.compare import Change, changes, verdict_of
-from benchmarks.suites.runs import gathered
+from benchmarks.suites import runs as runs_module
+from benchmarks.suites.files import read_suite
+from benchmarks.suites.runs import RunOptions, gathered, read_run, run_suite
 
 Rows = dict[tuple[str, str], list[tuple[Cell, CellResult]]]
 
@@ -62,8 +64,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
             suite = fakes.write_suite(folder / name, capture, f"fake_{method}")
             text = suite.read_text().replace(f"'fake_{method}'", f"{{ of = 'fake_{method}', name = 'mine' }}")
             suite.write_text(text)
-            assert cli.main(["run", str(suite), "--seeds", "2", "--out", str(folder / name / "run")]) == 0
-            made.append(folder / name / "run")
+            options = RunOptions(out=folder / name / "run", data=folder, workers=2)
+            made.append(run_suite(read_suite(suite).narrowed(seeds=2), options).folder)
     return made[0], made[1]
 
 
@@ -101,9 +103,17 @@ def test_captures_of_one_name_are_told_apart(runs: tuple[Path, Path], tmp_path: 
     assert {each.config.scene for each in run.cells} == {"capture", "other"}
 
 
+def test_subjects_of_a_scene_stay_one_scene(runs: tuple[Path, Path], tmp_path: Path, monkeypatch) -> None:
+    run = read_run(runs[0])
+    for subjects, names in (((0, 1), {"boxes"}), ((1, 1), {"capture"})):
+        told = zip(run.cells, subjects, strict=False)
+        cells = tuple(replace(c, config=replace(c.config, subject=k, truth=str(n))) for n, (c, k) in enumerate(told))
+        monkeypatch.setattr(runs_module, "read_run", lambda _, cells=cells: replace(run, cells=cells))
+        assert {each.config.scene for each in gathered([runs[0]], tmp_path, command="").cells} == names
+
+
 def test_runs_without_a_common_row_are_refused(runs: tuple[Path, Path], tmp_path: Path) -> None:
     from benchmarks.report.compare import write_comparison
-    from benchmarks.suites.runs import read_run
 
     run = read_run(runs[0])
     renamed = replace(run, cells=tuple(replace(c, config=replace(c.config, scene="other")) for c in run.cells))

@@ -18,6 +18,7 @@ from ash.protocol import TrainingOutcome
 from benchmarks import cli
 from benchmarks.analysis.scores import Quantity, scores_of
 from benchmarks.cell.cells import CellResult, Summary, failed_result
+from benchmarks.cell.metrics import PROTOCOL
 from benchmarks.report import sentences, tables
 from benchmarks.report.page import publish, write_report
 from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells
@@ -93,7 +94,7 @@ def test_the_page_is_whole_and_needs_nothing_else(run: Run) -> None:
         "fake_good is best on held-out views",
         "1 of 1 failed",
         "diverged",
-        "Protocol 1",
+        f"Protocol {PROTOCOL}",
         "noise ceiling 39.9",
         "This is a smoke test",
         "2 cameras, 4 frames",
@@ -265,6 +266,17 @@ def test_a_training_cut_short_and_dead_decoders_are_told_of() -> None:
     scores = scores_of(results)
     assert sentences.headline(scores, "loose").endswith("Not at their plateau when training ended: ASH.")
     assert any("Decoders carry nothing" in remark and "ASH" in remark for remark in sentences.remarks(scores, "loose"))
+
+
+def test_a_report_says_what_each_rows_template_was_learned_from() -> None:
+    def on(method: str, template: str, seed: int = 0) -> CellResult:
+        end = TrainingOutcome(steps=9, seconds=1.0, ended_by="steps", template=template)
+        return replace(scored(method, view=27.0, pose=20.0, seed=seed), training=end)
+
+    images, scans = "learned from images: ridge 1", "learned from scans: ridge 3"
+    results = [on("ash", images), on("ash", images, 1), on("ddc", images), on("by_scans", scans), on("static", "")]
+    remarks = sentences.remarks(scores_of(results), "loose")
+    assert f"Templates: {images} (ASH, DDC); {scans} (by_scans)." in remarks
 
 
 @pytest.fixture(params=[(DESKTOP, "light"), (DESKTOP, "dark"), (PHONE, "light"), (PHONE, "dark")], ids=str)

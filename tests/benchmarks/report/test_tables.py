@@ -92,7 +92,7 @@ def test_results_csv_has_the_stable_columns_and_all_digits(tmp_path: Path) -> No
     header = "scene,method,seed,split,region,metric,value,unit,direction,protocol,subject,capture"
     assert ",".join(table.columns) == header == ",".join(COLUMNS)
     row = table[(table.method == "ash") & (table.metric == "psnr")].iloc[0]
-    assert (row["value"], row["unit"], row["direction"], str(row["protocol"])) == (1 / 3, "dB", "up", "1")
+    assert (row["value"], row["unit"], row["direction"], str(row["protocol"])) == (1 / 3, "dB", "up", "2")
     assert set(table.metric) <= set(METRICS)
     failed = table[table.method == "ddc"]
     assert failed[failed.metric == "failed"]["value"].item() == 1
@@ -103,11 +103,13 @@ def test_results_csv_has_the_stable_columns_and_all_digits(tmp_path: Path) -> No
 def test_several_captures_of_a_scene_are_the_unit_and_their_seeds_are_averaged() -> None:
     values = {0: (24.0, 26.0), 1: (27.0, 29.0)}
     results = [
-        replace(result(seed=seed, psnr=psnr), config=replace(config(seed=seed), capture_seed=subject))
+        replace(result(seed=seed, psnr=psnr), config=replace(config(seed=seed), subject=subject))
         for subject, scores in values.items()
         for seed, psnr in enumerate(scores)
     ]
     scores = scores_of(results)
+    assert list(scores.rows["subject"].unique()) == [0, 1]
+    assert list(scores.rows["capture"].unique()) == ["boxes-ci-0", "boxes-ci-0-subject1"]
     assert scores.values("boxes", "ash", foreground()) == [25.0, 28.0] and scores.captures("boxes") == 2
     assert scores.get("boxes", "ash", foreground()).seeds == 2
 

@@ -13,7 +13,7 @@ from ash.inference import Player
 from ash.presets import named
 from ash.training.batches import load_training_images
 from benchmarks.speed import frames, profile
-from benchmarks.speed.frames import PictureAgreement, Subject, scaled_camera, subjects
+from benchmarks.speed.frames import PictureAgreement, TimedAvatar, scaled_camera, subjects
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def capture(tmp_path_factory):
 
 def test_the_table_has_every_stage_and_fast_images_agree_with_the_definitions(capture, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(frames, "captured", lambda folder: capture)
-    subject = Subject(name="ci", config=named("ci"), width=64, height=64, trains=True)
+    subject = TimedAvatar(name="ci", config=named("ci"), width=64, height=64, trains=True)
     results = list(frames.speed_frame(capture, timed=(subject,), rounds=2))
     monkeypatch.setattr(frames, "speed_frame", lambda capture: iter(results))
     before = torch.get_num_threads()

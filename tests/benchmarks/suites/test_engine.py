@@ -13,6 +13,7 @@ from helpers.waiting import wait_for
 
 from ash.files import InputError
 from benchmarks.cell.cells import Cell, read_result
+from benchmarks.cell.metrics import PROTOCOL
 from benchmarks.suites import engine
 from benchmarks.suites.engine import CellPlan, Limits, make_executor, plan_cells, run_cells, run_in_process, shard_of
 from benchmarks.suites.progress import Progress
@@ -97,8 +98,8 @@ def test_a_damaged_result_is_an_error_and_stays_as_it_is(capture: Path, tmp_path
         with pytest.raises(InputError, match=r"result\.json.*remove"):
             plan_cells([broken])
         assert path.read_bytes() == content
-    path.write_bytes(whole.replace(b'"protocol": "1"', b'"protocol": "0"'))
-    with pytest.raises(InputError, match="protocol 1, got 0"):
+    path.write_bytes(whole.replace(b'"protocol": "%s"' % PROTOCOL.encode(), b'"protocol": "0"'))
+    with pytest.raises(InputError, match=f"protocol {PROTOCOL}, got 0"):
         plan_cells([broken])
 
 

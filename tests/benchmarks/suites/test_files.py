@@ -1,5 +1,6 @@
 """A suite's file: ours and a user's, and errors that name file, line and key."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,7 @@ from helpers import fakes
 
 from ash.files import InputError
 from benchmarks.cell.methods import WRONG_BY_MM, is_oracle
+from benchmarks.suites.captures import described
 from benchmarks.suites.files import find_suite, given_captures, line_of, read_suite, suite_files
 from benchmarks.suites.suites import SceneSpec, varied_name
 
@@ -68,6 +70,8 @@ def test_a_capture_that_is_there_is_a_scene(tmp_path: Path) -> None:
     [
         ("seeds", "sedes", 10, "unknown key 'sedes', did you mean seeds"),
         ("seeds = 2", "seeds = 0", 10, "seeds: expected at least 1"),
+        ("seeds = 2", "subjects = 0", 10, "subjects: expected 1 to 100, got 0"),
+        ("seeds = 2", "subjects = 101", 10, "those from 100 on are for validation"),
         ("seeds = 2", 'seeds = "two"', 10, "seeds: expected a whole number, got 'two'"),
         ("seeds = 2", "seeds = = 2", 10, "not valid TOML"),
         ('"tight",', '"tihgt",', 2, "unknown scene 'tihgt', did you mean tight"),
@@ -78,6 +82,12 @@ def test_a_capture_that_is_there_is_a_scene(tmp_path: Path) -> None:
         ("model.width = 4", "model.width = 'x'", 6, "model.width: expected a whole number, got 'x'"),
         ("model.width = 4", "width = 4", 6, "unknown key 'width', did you mean model.width"),
         ("texture = 256", "texture = 256, seed = 3", 7, "seed: a row has none of its own"),
+        (
+            "outfit.swing = 0.8",
+            "subject = 3",
+            2,
+            "subject: a row has none of its own, the suite's `subjects` counts them",
+        ),
         ('of = "ddc"', 'of = "nearest"', 7, "nearest: offers no configuration, and so has no key 'texture'"),
         ('preset = "brief"', 'preset = "chaep"', 7, "preset: expected one of ci, brief"),
         ('name = "mesh"', 'name = "ash"', 4, "two methods are called 'ash'"),
@@ -140,6 +150,18 @@ def test_our_suites_are_such_files() -> None:
         assert suite.name == name and suite.about and list(suite.cells)
     template = {row.name for row in find_suite("template").methods}
     assert {method for row in WRONG_BY_MM.values() for method in row} <= template
+
+
+def test_every_subject_has_its_captures_and_subject_0_keeps_its_names(tmp_path: Path) -> None:
+    suite = read_suite(written(tmp_path, GOOD.replace("seeds = 2", "subjects = 2")))
+    names = [capture.name for capture in suite.captures if capture.stress is None]
+    assert names == ["tight-ci-0", "tight_swing-ci-0", "tight-ci-0-subject1", "tight_swing-ci-0-subject1"]
+    assert len(suite.captures) == 2 * 2 * (1 + 2)
+    scene = described(suite.captures[-1])
+    assert (scene.name, scene.subject, scene.outfit.swing) == ("tight_swing", 1, 0.8)
+    assert suite.narrowed(subjects=1).captures == suite.captures[:6]
+    given = replace(suite, scenes=(SceneSpec(name="mine", folder=tmp_path),), stresses=(), subjects=8)
+    assert [capture.name for capture in given.captures] == ["mine-ci-0"]
 
 
 def test_a_suite_is_narrowed_and_widened() -> None:

@@ -2,7 +2,7 @@ import numpy as np
 
 from synth.person.body import PARTS
 from synth.person.garments import HEM, THICKNESS, cut_garment, straightened
-from synth.person.mesh import Charted, beside, joined, open_edges, select, uv_charts
+from synth.person.mesh import Charted, beside, joined, largest_piece, open_edges, select, uv_charts
 from synth.person.tubes import chart_uvs, grid_faces
 
 ROWS, COLUMNS, RADIUS = 25, 32, 0.1
@@ -94,4 +94,7 @@ def test_pieces_are_joined_and_selected_without_renumbering():
     np.testing.assert_array_equal(both.uvs[both.uv_faces[len(bare.faces) :]], garment.uvs[garment.uv_faces])
     low = bare.vertices[bare.faces].mean(axis=1)[:, 1] < 0.1
     assert len(select(bare, low).faces) == low.sum()
+    high = bare.vertices[bare.faces].mean(axis=1)[:, 1] > 0.4
+    assert high.sum() < low.sum()
+    np.testing.assert_array_equal(largest_piece(bare.faces, low | high), low)
     assert low.sum() < beside(bare.faces, low, rings=1).sum() < beside(bare.faces, low, rings=2).sum()

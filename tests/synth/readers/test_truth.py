@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from helpers.scenes import small_capture
 
-from ash.capture.dataset import Capture, pixels_path
+from ash.capture.dataset import Capture, pixels_path, plate_path
 from ash.capture.formats import load_capture, read_cameras, write_cameras
 from ash.capture.manifest import verify_capture
-from ash.files import InputError, write_arrays
+from ash.files import InputError, read_image, write_arrays
 from synth.camera.rig import held_out, make_cameras, rig_from_file, spread
 from synth.person.body import PARTS
 from synth.readers import truth
@@ -110,6 +110,33 @@ def test_perturbations_touch_training_only_and_follow_their_seed(capture: Captur
     assert (first.image(camera, frame)[..., 3] > 127).sum() > (capture.image(camera, frame)[..., 3] > 127).sum() + 50
     truths = {name: value for name, value in capture.manifest.files.items() if name.startswith("truth/")}
     assert {name: value for name, value in first.manifest.files.items() if name in truths}.items() <= truths.items()
+
+
+def test_a_mask_that_is_too_large_shows_the_studio(capture: Capture, tmp_path: Path):
+    spoilt = load_capture(perturb(capture.folder, tmp_path / "grown", Perturbation(mask_px=3)))
+    camera, frame = capture.splits["train"].views[0]
+    before, after = capture.image(camera, frame), spoilt.image(camera, frame)
+    plate = read_image(plate_path(capture.folder, camera), shape=before[..., :3].shape)
+    ring = (before[..., 3] == 0) & (after[..., 3] == 255)
+    assert ring.sum() > 50
+    np.testing.assert_array_equal(after[ring, :3], plate[ring])
+    inside = before[..., 3] == 255
+    np.testing.assert_array_equal(after[inside], before[inside])
+    (bare := tmp_path / "bare").mkdir()
+    shutil.copytree(capture.folder, bare, dirs_exist_ok=True)
+    shutil.rmtree(bare / "plates")
+    with pytest.raises(InputError, match="masks that are too large show the studio"):
+        perturb(bare, tmp_path / "again", Perturbation(mask_px=3))
+
+
+def test_the_studio_is_textured_and_every_camera_sees_another_part_of_it(capture: Capture):
+    plates = [
+        read_image(plate_path(capture.folder, name), shape=(camera.height, camera.width, 3)).astype(float)
+        for name, camera in capture.cameras.items()
+    ]
+    assert all(plate.std() > 10 and 20 < plate.mean() < 200 for plate in plates)
+    assert min(np.abs(a - b).mean() for i, a in enumerate(plates) for b in plates[:i]) > 5
+    assert all(name in capture.manifest.files for name in (f"plates/{camera}.png" for camera in capture.cameras))
 
 
 def test_severities_are_what_they_say(capture: Capture):

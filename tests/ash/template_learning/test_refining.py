@@ -1,4 +1,4 @@
-"""What images add to a template: through the mesh of DDC, through the splats of ASH, and from videos alone."""
+"""What images add to a template: through the mesh of DDC, and through the splats of ASH."""
 
 from dataclasses import replace
 
@@ -11,14 +11,11 @@ from helpers.figures import tube_mesh
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture, Pose, image_path
 from ash.config import TemplateConfig
-from ash.files import InputError, write_image
+from ash.files import write_image
 from ash.mesh.drawing import blend, draw_mesh, sample_texture, topology_of
 from ash.presets import named
-from ash.template.graph import build_graph
-from ash.template.refining import UNIT_M, Refinement
 from ash.template.template import skinned_template
-from ash.template_learning.image_tracking import track_images
-from ash.template_learning.tracking import track_vertices
+from ash.template_learning.refining import UNIT_M, MotionRefinement, Refinement, refined_template
 from baselines.ddc import DdcAvatar, ddc_config
 
 
@@ -58,7 +55,62 @@ def test_a_refinement_starts_at_nothing_and_is_smooth():
     assert (refinement.rough.grad > 0).all()
 
 
-def ddc(capture: Capture, *, refine: bool) -> DdcAvatar:
+def moving(capture: Capture) -> MotionRefinement:
+    """A refinement whose networks say something."""
+    refinement = MotionRefinement(TemplateConfig(nodes=30), capture.template, capture.skeleton)
+    torch.manual_seed(0)
+    for net in (refinement.nets.graph_net, refinement.nets.displacement_net):
+        torch.nn.init.normal_(net.head.weight, std=0.01)
+    return refinement
+
+
+def test_a_refinement_that_follows_the_motion_starts_at_nothing_and_fades_with_trust(capture):
+    blank = MotionRefinement(TemplateConfig(nodes=30), capture.template, capture.skeleton)
+    window = blank.window(Pose(capture.motion, 1))
+    torch.testing.assert_close(blank(window), torch.zeros(len(capture.template.vertices), 3), atol=1e-6, rtol=0)
+    refinement = moving(capture)
+    whole, half, none = (refinement(window, trust).detach() for trust in (1.0, 0.5, 0.0))
+    assert float(whole.norm(dim=1).max()) > 1e-4
+    torch.testing.assert_close(half, 0.5 * whole)
+    assert not none.any()
+    assert not torch.equal(whole, refinement(refinement.window(Pose(capture.motion, 3))).detach())
+
+
+def test_a_refined_template_is_the_old_one_moved_and_all_that_is_drawn_from_it_follows(capture):
+    old = skinned_template(capture)
+    refined, refinement = refined_template(old, TemplateConfig(nodes=30))
+    pose = Pose(capture.motion, 2)
+    torch.testing.assert_close(refined.pose(pose).vertices, old.pose(pose).vertices, atol=1e-6, rtol=0)
+    refinement.load_state_dict(moving(capture).state_dict())
+    refined.forget()
+    shift = refinement(refinement.window(pose)).detach()
+    after, before = refined.pose(pose), old.pose(pose)
+    torch.testing.assert_close(after.canonical, before.canonical + shift)
+    assert not torch.allclose(after.normals, before.normals, atol=1e-4)
+    learning = refined.pose_anew(pose)
+    (learning.vertices.square().sum() + learning.normals[:, 0].sum()).backward()
+    parameters = [*refinement.nets.networks(), refinement.shared.rough]
+    assert all(p.grad is not None and p.grad.any() for p in parameters if p.requires_grad)
+
+
+def test_splats_of_a_refined_template_see_textures_redrawn_from_it(capture):
+    avatar = AshAvatar(replace(named("ci"), model=tube_model_config(refine=True)), capture)
+    before = avatar._conditions_of(1)
+    assert before.canonical.requires_grad and before.normals.requires_grad and not before.textures.requires_grad
+    avatar.module.refinement.load_state_dict(moving_like(avatar, capture))
+    after = avatar._conditions_of(1)
+    assert not torch.allclose(after.textures, before.textures, atol=1e-4)
+    assert not torch.allclose(after.canonical, before.canonical, atol=1e-5)
+
+
+def moving_like(avatar: AshAvatar, capture: Capture) -> dict[str, torch.Tensor]:
+    """The weights of the avatar's refinement, with heads that say something."""
+    state = avatar.module.refinement.state_dict()
+    torch.manual_seed(0)
+    return {name: torch.randn_like(v) * 0.05 if ".head.weight" in name else v for name, v in state.items()}
+
+
+def ddc(capture: Capture, *, refine: str) -> DdcAvatar:
     ash = named("ci")
     model = replace(ash.model, texels=16, width=4, levels=2, window=2)
     training = replace(ash.training, steps=120, warmup_steps=60, base_learning_rate=0.1)
@@ -66,12 +118,14 @@ def ddc(capture: Capture, *, refine: bool) -> DdcAvatar:
     return DdcAvatar(replace(config, refine=refine), capture)
 
 
-def test_ddc_moves_its_vertices_to_where_the_images_show_them(capture, tmp_path):
-    learner = ddc(capture, refine=True)
+@pytest.mark.parametrize("refine", ["static", "motion"])
+def test_ddc_moves_its_vertices_to_where_the_images_show_them(refine, capture, tmp_path):
+    learner = ddc(capture, refine=refine)
     assert learner.module.refinement is not None
     rest = torch.from_numpy(capture.template.vertices).float()
     learner.fit(capture, folder=tmp_path)
-    after = excess_mm(rest + learner.module.refinement().detach())
+    shared = learner.module.refinement if refine == "static" else learner.module.refinement.shared
+    after = excess_mm(rest + shared().detach())
     assert excess_mm(rest) > 14 and after < 12  # A pixel is 32 mm wide.
     posed = learner.template_vertices(Pose(capture.motion, 5))  # A frame of the test motion: refined there too.
     before = learner.template.pose(Pose(capture.motion, 5)).vertices.numpy()
@@ -79,29 +133,29 @@ def test_ddc_moves_its_vertices_to_where_the_images_show_them(capture, tmp_path)
 
 
 def test_without_refine_ddc_draws_the_template_it_was_given(capture):
-    still = ddc(capture, refine=False)
+    still = ddc(capture, refine="none")
     assert still.module.refinement is None
     posed = still.template.pose(Pose(capture.motion, 2))
-    assert still.module.refined(posed) is posed
+    assert still.module.refined(posed, still.module.conditions(Pose(capture.motion, 2))) is posed
     np.testing.assert_array_equal(still.template_vertices(Pose(capture.motion, 2)), posed.vertices.numpy())
 
 
 def test_an_exact_surface_is_not_refined():
     exact, off = (TemplateConfig(kind="exact", error_mm=mm) for mm in (0.0, 4.0))
-    assert not ddc_config(named("ci"), seed=0, template=exact).refine
-    assert ddc_config(named("ci"), seed=0, template=off).refine
+    assert ddc_config(named("ci"), seed=0, template=exact).refine == "none"
+    assert ddc_config(named("ci"), seed=0, template=off).refine == "static"
 
 
 def test_splats_pull_at_the_template_where_refine_is_on(capture, tmp_path):
     ash = named("ci")
     training = replace(ash.training, steps=100, warmup_steps=50, base_learning_rate=0.05)
-    config = replace(ash, model=tube_model_config(refine=True), training=training)
+    config = replace(ash, model=tube_model_config(refine=True, offset=False), training=training)
     learner = AshAvatar(config, capture)
     rest = torch.from_numpy(capture.template.vertices).float()
     before = learner.template_vertices(Pose(capture.motion, 1))
     learner.fit(capture, folder=tmp_path)
     assert learner.module.refinement is not None
-    assert excess_mm(rest + learner.module.refinement().detach()) < excess_mm(rest) - 1
+    assert excess_mm(rest + learner.module.refinement.shared().detach()) < excess_mm(rest) - 1
     assert np.abs(learner.template_vertices(Pose(capture.motion, 1)) - before).max() > 1e-3
     learner.save(tmp_path / "model.safetensors")
     again = AshAvatar(config, capture)
@@ -109,19 +163,3 @@ def test_splats_pull_at_the_template_where_refine_is_on(capture, tmp_path):
     assert np.array_equal(
         again.template_vertices(Pose(capture.motion, 1)), learner.template_vertices(Pose(capture.motion, 1))
     )
-
-
-def test_refining_needs_the_offset_it_moves_gaussians_by():
-    with pytest.raises(InputError, match="needs offset=True"):
-        tube_model_config(refine=True, offset=False)
-
-
-def test_videos_alone_show_where_the_surface_is(capture, monkeypatch):
-    for name, value in {"STEPS": 120, "SHARED_STEPS": 60, "TEXTURE": 32, "RATE": 0.1, "MOVE_RATE": 0.2}.items():
-        monkeypatch.setattr(f"ash.template_learning.image_tracking.{name}", value)
-    skinned = skinned_template(capture)
-    rest = torch.from_numpy(capture.template.vertices).float()
-    tracked = track_images(capture, skinned, build_graph(capture.template, nodes=30), seed=0)
-    true = track_vertices(capture, skinned)
-    assert tracked.canonical.shape == true.canonical.shape
-    assert np.mean([abs(excess_mm(frame)) for frame in tracked.canonical]) < 0.65 * excess_mm(rest)

@@ -1,0 +1,115 @@
+"""The template from the training videos alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.captures import write_tube_capture
+from helpers.figures import ring_cameras, tube_mesh, tube_motion
+
+from ash.capture.dataset import Capture, Pose, image_path
+from ash.config import TemplateConfig
+from ash.files import InputError, write_image
+from ash.mesh.drawing import draw_mesh, textured, topology_of
+from ash.template.graph import build_graph
+from ash.template.template import skinned_template
+from ash.template_learning.image_tracking import track_images
+from ash.template_learning.observing import observe, sample
+
+SIZE, FRAMES = 96, 6
+
+
+def bulge(frame: int) -> np.ndarray:
+    """How the tube's true canonical vertices differ from those at rest: outwards, up to 2 cm, more in odd frames."""
+    rest = tube_mesh().vertices
+    height = np.exp(-(((rest[:, 1:2] - 0.6) / 0.25) ** 2))
+    return (0.008 + 0.012 * (frame % 2)) * height * rest * [10, 0, 10]
+
+
+def paint() -> torch.Tensor:
+    """A texture with something to see everywhere."""
+    rng = np.random.default_rng(0)
+    v, u = np.meshgrid(np.linspace(0, 1, 64), np.linspace(0, 1, 64), indexing="ij")
+    waves = [np.sin(2 * np.pi * (a * u + b * v) + c) for a, b, c in rng.uniform([2, 2, 0], [6, 8, 6], (9, 3))]
+    return torch.from_numpy(0.5 + 0.15 * np.stack(waves).reshape(3, 3, 64, 64).sum(1)).float().clamp(0, 1)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """The tube with a painted, bulging surface, seen by eight cameras."""
+    made = write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
+    cameras, motion, mesh = ring_cameras(8, SIZE), tube_motion(FRAMES), tube_mesh()
+    at_rest, topology = skinned_template(made), topology_of(torch.from_numpy(mesh.faces))
+    uvs, uv_faces = torch.from_numpy(mesh.uvs).float(), torch.from_numpy(mesh.uv_faces)
+    for frame in range(FRAMES):
+        posed = at_rest.pose(Pose(motion, frame))
+        vertices = posed.transforms.apply(torch.from_numpy(mesh.vertices + bulge(frame)).float())
+        shade = textured(paint(), uvs, uv_faces, posed.normals, topology.faces, None)
+        for camera in cameras:
+            drawn = draw_mesh(vertices, topology, camera, shade, torch.zeros(3)).numpy()
+            straight = np.where(drawn[..., 3:] > 0, drawn[..., :3] / np.maximum(drawn[..., 3:], 1e-3), 0)
+            rgba = np.concatenate([straight, drawn[..., 3:]], -1)
+            write_image(image_path(made.folder, camera.name, frame), np.round(255 * rgba.clip(0, 1)).astype(np.uint8))
+    train = replace(made.splits["train"], cameras=tuple(c.name for c in cameras), frames=tuple(range(FRAMES)))
+    return replace(made, cameras={c.name: c for c in cameras}, motion=motion, splits={"train": train})
+
+
+def errors_m(capture: Capture, *, passes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Distances from the truth of what was tracked, and of the rest shape, `[t, v]`."""
+    template = skinned_template(capture)
+    tracked = track_images(capture, template, build_graph(tube_mesh(), nodes=30), passes=passes)
+    true = np.stack([tube_mesh().vertices + bulge(frame) for frame in tracked.frames])
+    found, before = tracked.canonical.numpy() - true, tube_mesh().vertices - true
+    return np.linalg.norm(found, axis=-1), np.linalg.norm(before, axis=-1)
+
+
+def test_images_alone_tell_where_the_surface_is(capture: Capture) -> None:
+    left, before = errors_m(capture, passes=4)
+    middle = np.abs(tube_mesh().vertices[:, 1] - 0.6) < 0.3  # Elsewhere there is hardly anything to find.
+    assert np.sqrt((left[:, middle] ** 2).mean()) < 0.55 * np.sqrt((before[:, middle] ** 2).mean())
+    for frame in (0, 1):  # Of each frame its own bulge, not the mean of both.
+        assert left[frame, middle].mean() < 0.5 * before[frame, middle].mean()
+
+
+def test_more_passes_find_more_and_the_same_every_time(capture: Capture) -> None:
+    one, four, again = (errors_m(capture, passes=passes)[0] for passes in (1, 4, 4))
+    assert np.array_equal(four, again)
+    assert four.mean() < one.mean()
+
+
+def test_every_frame_counts_also_when_there_is_one(capture: Capture) -> None:
+    train = replace(capture.splits["train"], frames=(1,))
+    left, before = errors_m(replace(capture, splits={"train": train}), passes=3)
+    assert left.mean() < 0.6 * before.mean()
+
+
+def test_passes_are_at_least_one() -> None:
+    with pytest.raises(InputError, match="passes"):
+        TemplateConfig(passes=0)
+
+
+def test_a_view_is_cut_out_around_the_subject_with_its_outline() -> None:
+    """A disc of radius 10.25 pixels, drawn with the coverage that its pixels have."""
+    fine = np.indices((64 * 8, 64 * 8)).transpose(1, 2, 0) / 8 + 1 / 16
+    inside = np.hypot(fine[..., 1] - 30, fine[..., 0] - 34) < 10.25
+    alpha = inside.reshape(64, 8, 64, 8).mean((1, 3))
+    rgba = np.zeros((64, 64, 4), np.uint8)
+    rgba[..., 0], rgba[..., 3] = 200, np.round(255 * alpha)
+    camera = ring_cameras(1, 64)[0]
+    view = observe(rgba, camera, (19, 23, 41, 45), blur=0.5)
+    shift = camera.K[:2, 2] - view.camera.K[:2, 2]
+    outline = view.outline + shift
+    assert len(outline) > 60
+    np.testing.assert_allclose(np.hypot(outline[:, 0] - 30, outline[:, 1] - 34), 10.25, atol=0.12)
+    away = (outline - [30, 34]) / 10.25
+    assert ((away * view.outward).sum(1) > 0.98).all()
+    row, column = (np.array([34, 30]) - shift[::-1]).astype(int)
+    np.testing.assert_allclose(view.colours[row, column], [200 / 255, 0, 0, 0, 0, 0, 0, 0, 0, 1], atol=1e-5)
+    assert view.colours[int(34 - shift[1]), int(41 - shift[0]), 9] == 0  # The rim's colours do not count.
+
+
+def test_samples_are_bilinear_with_centres_at_a_half() -> None:
+    image = np.arange(12.0).reshape(3, 4, 1)
+    points = np.array([[0.5, 0.5], [1.0, 0.5], [1.5, 2.0], [-3.0, 9.0], [3.5, 2.5]])
+    np.testing.assert_allclose(sample(image, points)[:, 0], [0, 0.5, 7, 8, 11])

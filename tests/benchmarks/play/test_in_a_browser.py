@@ -1,0 +1,291 @@
+"""The player in a real browser: what people do with mouse, keys and fingers, and what they then see."""
+
+import io
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.browser import PHONE, Visitor
+from helpers.scenes import small_capture
+from helpers.viewers import PATIENCE, state_of
+from helpers.waiting import wait_for
+from PIL import Image
+
+from ash.capture.dataset import Pose
+from ash.inference import psnr
+from ash.protocol import StageClock
+from benchmarks import cli
+from benchmarks.play.actors import on_colour
+from benchmarks.play.cameras import START, middle_of, resized
+from benchmarks.play.joints import ranges_of
+from benchmarks.play.picture import LIGHT, _fit
+from benchmarks.play.player import PlayServer, playing
+from benchmarks.play.standpoint import BLOCKS_M
+
+WINDOW = (900, 420)  # CSS pixels; the panel covers the right third
+
+
+@pytest.fixture(scope="module")
+def player(tube_run: Path) -> Iterator[PlayServer]:
+    with playing(tube_run) as player:
+        yield player
+
+
+@pytest.fixture(scope="module")
+def person(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PlayServer]:
+    """A player of somebody whose truth can be rendered: a mannequin, learned from for a moment."""
+    out = tmp_path_factory.mktemp("person")
+    short = ["--preset", "ci", "--training.steps", "20", "--training.warmup_steps", "10"]
+    assert cli.main(["train", "ash", str(small_capture()), *short, "--out", str(out)]) == cli.DONE
+    with playing(out) as player:
+        yield player
+
+
+def shot(tab: Any) -> np.ndarray:
+    """What the window shows, `[h, w, 3]`."""
+    return np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB")).astype(int)
+
+
+def seen(tab: Any, *, unlike: np.ndarray | None = None) -> np.ndarray:
+    """The page left of the panel once it shows an avatar, or another picture than before."""
+    end = time.perf_counter() + PATIENCE
+    while time.perf_counter() < end:
+        picture = shot(tab)[:, :500]
+        if unlike is None and (np.ptp(picture.reshape(-1, 3), axis=0) > 60).any():
+            return picture
+        if unlike is not None and np.abs(picture - unlike).mean() > 0.5:
+            return picture
+        time.sleep(0.1)
+    raise AssertionError("the picture is not there" if unlike is None else "the picture stays as it was")
+
+
+@contextmanager
+def standing(player: PlayServer, visit: Visitor) -> Iterator[Any]:
+    """A window that stands still in the held-out motion, and nothing went wrong in it."""
+    visited = visit(player.url, size=WINDOW)
+    assert "token" not in visited.page.url
+    visited.page.get_by_text("Held-out motion, frame").first.wait_for(timeout=1000 * PATIENCE)
+    seen(visited.page)
+    visited.page.keyboard.press(" ")
+    wait_for(lambda: not state_of(player).playing)
+    time.sleep(0.5)
+    yield visited.page
+    assert visited.errors == [] and visited.poor_contrast() == []
+
+
+@pytest.fixture()
+def tab(player: PlayServer, visit: Visitor) -> Iterator[Any]:
+    with standing(player, visit) as tab:
+        yield tab
+
+
+def test_it_shows_turns_scrubs_and_switches(player: PlayServer, tab: Any) -> None:
+    first, eye = seen(tab), state_of(player).eye.viewmat
+    step = state_of(player).step
+    tab.keyboard.press("ArrowRight")
+    wait_for(lambda: state_of(player).step == (step + 1) % 2)
+    tab.keyboard.press("e")
+    wait_for(lambda: state_of(player).error == "absolute")
+    tab.keyboard.press("e")
+    tab.keyboard.press("e")
+    wait_for(lambda: state_of(player).error == "no")
+    np.testing.assert_array_equal(state_of(player).eye.viewmat, eye, "keys are commands and move no camera")
+    scrubbed = seen(tab, unlike=first)
+    tab.mouse.move(200, 200)
+    tab.mouse.down()
+    tab.mouse.move(230, 210, steps=5)
+    tab.mouse.up()
+    turned = seen(tab, unlike=scrubbed)
+    assert np.abs(state_of(player).eye.viewmat - eye).max() > 0.05
+    tab.keyboard.press("m")
+    tab.get_by_text(f"{player.cast.titles[1]} · Held-out").first.wait_for(timeout=1000 * PATIENCE)
+    seen(tab, unlike=turned)
+
+
+def test_the_divider_is_dragged(player: PlayServer, tab: Any) -> None:
+    handle = tab.locator("#split")
+    assert not handle.is_visible()
+    tab.keyboard.press("t")
+    handle.wait_for(state="visible", timeout=1000 * PATIENCE)
+    box = handle.bounding_box()
+    eye = state_of(player).eye.viewmat
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    assert abs(x - 450) < 3
+    tab.mouse.move(x, y)
+    tab.mouse.down()
+    tab.mouse.move(225, y, steps=4)
+    tab.mouse.up()
+    wait_for(lambda: abs(state_of(player).divider - 0.25) < 0.01)
+    np.testing.assert_array_equal(state_of(player).eye.viewmat, eye, "the person stays as it was")
+    tab.keyboard.press("t")
+    wait_for(lambda: state_of(player).right == "nothing")
+    handle.wait_for(state="hidden", timeout=1000 * PATIENCE)
+
+
+def test_light_and_dark_follow_the_system(player: PlayServer, tab: Any) -> None:
+    light = seen(tab)
+    assert not state_of(player).dark
+    tab.emulate_media(color_scheme="dark")
+    wait_for(lambda: state_of(player).dark)
+    dark = seen(tab, unlike=light)
+    assert np.median(light[:, :40]) > 200 and np.median(dark[:, :40]) < 60
+
+
+def test_on_a_phone_the_person_comes_first_and_nothing_is_wider_than_the_screen(
+    player: PlayServer, visit: Visitor
+) -> None:
+    visited = visit(player.url, size=PHONE, scheme="dark", touch=True)
+    words = visited.page.get_by_text("Held-out motion, frame").first
+    words.wait_for(state="attached", timeout=1000 * PATIENCE)
+    words.wait_for(state="hidden", timeout=1000 * PATIENCE)
+    wait_for(lambda: state_of(player).dark)
+    eye, middle = state_of(player).eye, middle_of(player.cast.capture)
+    seen_at, _ = eye.camera(width=PHONE[0], height=PHONE[1]).project(middle)
+    np.testing.assert_allclose(seen_at, np.array(PHONE) / 2, atol=2, err_msg="it looks at the person's middle")
+    ahead = (eye.position - middle) / np.linalg.norm(eye.position - middle)
+    assert ahead @ np.array(START) > 0.99, "from the front"
+    bar = visited.page.get_by_text("ash-bench play", exact=True).locator("visible=true")
+    bar.tap()
+    words.wait_for(state="visible", timeout=1000 * PATIENCE)
+    assert visited.too_wide() == [] and visited.errors == [] and visited.poor_contrast() == []
+
+
+def test_a_click_on_a_camera_lands_in_its_view(player: PlayServer, tab: Any) -> None:
+    own = player.cast.capture.cameras
+    tab.get_by_text("Show cameras").click()
+    eye = state_of(player).eye
+    assert eye is not None and (eye.width, eye.height) == WINDOW
+    mine = eye.camera(width=eye.width, height=eye.height)
+    aims = {}
+    for name, camera in own.items():  # At the middle of each frustum that stands free.
+        (x, y), depth = mine.project(camera.position + 0.15 * camera.viewmat[2, :3])
+        if depth > 0 and 20 < x < 540 and 20 < y < 400 and np.linalg.norm(camera.position - eye.position) > BLOCKS_M:
+            aims[name] = (float(x), float(y))
+    assert aims, "one can be seen"
+    name, (x, y) = next(iter(aims.items()))
+    time.sleep(1.0)  # As a hand needs: the frustums are there.
+    (page,) = player._pages.values()
+    distances = {other: np.linalg.norm(own[other].position - eye.position) for other in own}
+    shown = {other: handle.visible for other, handle in page.standpoint._frustums.items()}
+    assert shown == {other: distance > BLOCKS_M for other, distance in distances.items()}
+    before = shot(tab)[:, :500]
+    tab.mouse.move(x, y)
+    tab.mouse.click(x, y)
+    wait_for(lambda: state_of(player).camera == name, PATIENCE)
+    chosen = "(name) => [...document.querySelectorAll('input')].some((box) => box.value === name)"
+    tab.wait_for_function(chosen, arg=name, timeout=1000 * PATIENCE)
+    wait_for(lambda: np.abs(state_of(player).eye.viewmat - own[name].viewmat).max() < 1e-3, PATIENCE)
+    seen(tab, unlike=before)
+    tab.get_by_text("Show cameras").click()
+    act, state = player.acts[1], state_of(player)
+    with torch.no_grad():
+        through = resized(own[name], width=WINDOW[0], height=WINDOW[1])
+        pose = Pose(act.motion, act.frames[state.step])
+        wanted = player.cast.actor(state.left).avatar.render(pose, through, clock=StageClock())
+    wait_for(lambda: agreement(shot(tab)[:, :560], on_colour(wanted, LIGHT)[:, :560]) > 25, PATIENCE)
+
+
+def test_truth_is_rendered_where_nobody_ever_looked(person: PlayServer, visit: Visitor) -> None:
+    """An arm is raised and a frame chosen with the page's own controls; the button renders, and the score appears."""
+    arm = person.cast.capture.skeleton.names.index("upper_arm_left")
+    with standing(person, visit) as tab:
+        step = state_of(person).step
+        frame = slider_named(tab, "Frame")
+        frame.fill(str((step + 1) % 2))
+        frame.blur()
+        wait_for(lambda: state_of(person).step == (step + 1) % 2, PATIENCE)
+        tab.get_by_role("tab", name="Pose").click()
+        tab.locator("input:visible").first.click()
+        tab.get_by_role("option", name="upper arm left", exact=True).click()
+        number = slider_named(tab, "Raised sideways")
+        number.wait_for(timeout=1000 * PATIENCE)
+        number.fill("500")
+        number.blur()
+        limits = ranges_of("upper_arm_left")[1]
+        assert limits is not None
+        wait_for(lambda: dict(state_of(person).held).get(arm, (0, 0, 0))[1] == limits.high, PATIENCE)
+        number.fill("120")
+        number.blur()
+        wait_for(lambda: dict(state_of(person).held)[arm][1] == 120, PATIENCE)
+        assert person.shelf.find(person.acts[1], state_of(person)) is None
+        tab.get_by_role("tab", name="Compare").click()
+        tab.get_by_role("button", name="Render truth here").click()
+        tab.get_by_role("progressbar").wait_for(timeout=1000 * PATIENCE)
+        tab.get_by_text("Truth: ").first.wait_for(timeout=1000 * PATIENCE)
+        tab.get_by_text("Truth rendered in").wait_for(timeout=1000 * PATIENCE)
+        tab.get_by_role("progressbar").wait_for(state="hidden", timeout=1000 * PATIENCE)
+        tab.get_by_text("Against the truth").first.wait_for(timeout=1000 * PATIENCE)
+        assert "dB, FLIP" in tab.get_by_text("Against the truth").first.inner_text()
+        state = state_of(person)
+        truth = person.shelf.find(person.acts[1], state)
+        assert truth is not None and (truth.on_black[..., 3] > 128).mean() > 0.02
+        wanted = _fit(truth, state.eye.camera(width=WINDOW[0], height=WINDOW[1]), state)
+        half = slice(470, 575)  # Right of the divider, left of the panel: the raised arm is there.
+        assert np.ptp(wanted[:, half].reshape(-1, 3), axis=0).max() > 60
+        wait_for(lambda: agreement(shot(tab)[:, half], wanted[:, half]) > 25, PATIENCE)
+
+
+def slider_named(tab: Any, label: str) -> Any:
+    """The number box of a slider."""
+    return tab.locator(f"xpath=//*[text()='{label}']/following::input[@inputmode][1]")
+
+
+def agreement(one: np.ndarray, other: np.ndarray) -> float:
+    """PSNR of two pictures of bytes."""
+    return psnr(one / 255, other / 255, np.ones(one.shape[:2]))
+
+
+class Fingers:
+    """Touches as a browser gets them from a screen."""
+
+    def __init__(self, tab: Any) -> None:
+        self._wire = tab.context.new_cdp_session(tab)
+
+    def drag(self, *paths: tuple[tuple[float, float], tuple[float, float]]) -> None:
+        """Each finger from a place to a place, all at once."""
+        self._send("touchStart", [start for start, _ in paths])
+        for share in np.linspace(0, 1, 9)[1:]:
+            self._send("touchMove", [tuple((1 - share) * np.array(a) + share * np.array(b)) for a, b in paths])
+            time.sleep(0.03)
+        self._send("touchEnd", [])
+
+    def _send(self, kind: str, places: list[tuple[float, float]]) -> None:
+        points = [{"x": float(x), "y": float(y), "id": number} for number, (x, y) in enumerate(places)]
+        self._wire.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+
+def test_fingers_turn_the_view_come_closer_and_move_the_divider(player: PlayServer, visit: Visitor) -> None:
+    visited = visit(player.url, size=PHONE, touch=True)
+    tab, fingers = visited.page, Fingers(visited.page)
+    tab.get_by_text("Held-out motion, frame").first.wait_for(state="attached", timeout=1000 * PATIENCE)
+    tab.get_by_text("Held-out motion, frame").first.wait_for(state="hidden", timeout=1000 * PATIENCE)
+    seen(tab)
+    tab.keyboard.press(" ")
+    wait_for(lambda: not state_of(player).playing)
+    time.sleep(0.5)
+    first, eye = seen(tab), state_of(player).eye
+    target = np.array([0.0, 0.5, 0.0])  # the tube's middle
+    fingers.drag(((100, 300), (220, 300)))
+    seen(tab, unlike=first)
+    turned = state_of(player).eye
+    reach, now = (np.linalg.norm(each.position - target) for each in (eye, turned))
+    assert np.linalg.norm(turned.position - eye.position) > 0.2 and abs(now / reach - 1) < 0.05, "around the person"
+    fingers.drag(((170, 300), (110, 300)), ((220, 300), (280, 300)))
+    wait_for(lambda: np.linalg.norm(state_of(player).eye.position - target) < 0.97 * reach, PATIENCE)
+    tab.keyboard.press("t")
+    handle = tab.locator("#split")
+    handle.wait_for(state="visible", timeout=1000 * PATIENCE)
+    time.sleep(0.5)
+    box, eye = handle.bounding_box(), state_of(player).eye
+    y = box["y"] + box["height"] / 2
+    fingers.drag(((PHONE[0] / 2, y), (0.25 * PHONE[0], y)))
+    wait_for(lambda: abs(state_of(player).divider - 0.25) < 0.01, PATIENCE)
+    np.testing.assert_array_equal(state_of(player).eye.viewmat, eye.viewmat, "the person stays as it was")
+    box = handle.bounding_box()
+    assert abs(box["x"] + box["width"] / 2 - 0.25 * PHONE[0]) < 3
+    assert visited.errors == []

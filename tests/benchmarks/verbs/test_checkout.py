@@ -1,0 +1,25 @@
+import subprocess
+from types import SimpleNamespace
+
+import pytest
+
+from benchmarks import cli
+from benchmarks.verbs import arguments
+
+
+@pytest.mark.parametrize("failing", ["", "pytest", "mypy", "ruff"])
+def test_whichever_check_fails_fails_the_whole(failing: str, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    asked = []
+
+    def run(command: list[str], **_: object) -> SimpleNamespace:
+        asked.append(command)
+        return SimpleNamespace(returncode=int(failing in command), stdout="as an example\n")
+
+    monkeypatch.setattr(subprocess, "run", run)
+    assert cli.main(["test", "--", "-k", "splatting"]) == (arguments.FAILED if failing else arguments.DONE)
+    (tests,) = (command for command in asked if "pytest" in command)
+    assert tests[-2:] == ["-k", "splatting"] and "loadfile" in tests
+    told = capsys.readouterr().out
+    assert all(f"--- {name}\n" in told for name in ("ruff check", "ruff format", "import-linter", "mypy"))
+    expected = {"": "all checks passed", "ruff": "failed: ruff check, ruff format"}.get(failing, f"failed: {failing}")
+    assert told.splitlines()[-1] == f"--- {expected}"
