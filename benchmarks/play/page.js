@@ -76,15 +76,15 @@ function follow(tries) {
   setTimeout(follow, 300, tries - 1);
 }
 dark.addEventListener("change", () => follow(10));
-follow(30);
+follow(200);
 
-// On a narrow screen viser opens its panel over the person; a touch on its bar opens it again.
+// On a narrow screen viser opens its panel over the person; a touch on its bar opens it again. A slow phone may take a minute to show it.
 function fold(tries) {
   const bar = [...document.body.querySelectorAll("*")].find((e) => !e.childElementCount && e.textContent === LABEL);
   if (bar) bar.click();
   else if (tries) setTimeout(fold, 200, tries - 1);
 }
-if (window.innerWidth < NARROW) setTimeout(fold, 800, 25);
+if (window.innerWidth < NARROW) setTimeout(fold, 800, 300);
 
 // viser warns of slow graphics; here the server draws, and the warning would lie over the person.
 const warned = new MutationObserver(() => {

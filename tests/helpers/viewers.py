@@ -23,7 +23,8 @@ PATIENCE = 120.0  # seconds; software graphics on a busy machine
 
 
 def state_of(player: PlayServer) -> ViewState:
-    """What the only viewer looks at."""
+    """What the only viewer looks at, once the one before has left."""
+    wait_for(lambda: len(player._pages) == 1, PATIENCE)
     (page,) = player._pages.values()
     return page.viewer.state
 
