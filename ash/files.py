@@ -229,7 +229,9 @@ def read_image(path: Path, *, shape: tuple[int, ...]) -> np.ndarray:
     """Read a PNG as uint8 of exactly `shape`, or raise an InputError that names the file."""
     expected = f"a PNG image of shape {shape}, uint8"
     try:
-        with open_regular(path, most=16 * LIMITS["image pixels"]) as file, Image.open(file, formats=["PNG"]) as image:
+        with open_regular(path, most=16 * LIMITS["image pixels"]) as file:
+            content = io.BytesIO(file.read())  # Pillow asks a file for as many bytes as a chunk claims to have.
+        with Image.open(content, formats=["PNG"]) as image:
             size, bands = (image.height, image.width), image.getbands()
             if size != shape[:2] or size[0] * size[1] > LIMITS["image pixels"] or len(bands) != (*shape, 1)[2]:
                 raise InputError(f"{path}: expected {expected}, got {image.mode} {size}")

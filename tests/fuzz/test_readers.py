@@ -28,7 +28,7 @@ from helpers.motion_files import amass_file, bvh_file
 from ash.capture.formats import load_capture, read_cameras, read_motion, read_skeleton, read_template
 from ash.capture.manifest import read_manifest, verify_capture
 from ash.checkpoints import load_module, read_safetensors
-from ash.files import InputError, read_arrays, read_image, read_json, write_json
+from ash.files import InputError, read_arrays, read_image, read_json, write_image, write_json
 from ash.searching import Choice, Tried
 from ash.searching import _read as read_choice
 from benchmarks.cell import methods
@@ -284,6 +284,15 @@ def test_a_small_archive_cannot_ask_for_much(tmp_path: Path) -> None:
     np.savez_compressed(path, a=np.zeros(40_000_000))
     with pytest.raises(InputError, match="bytes unpacked"):
         read_arrays(path, expected=("a",), most=1 << 20)
+
+
+def test_a_small_image_cannot_ask_for_much(tmp_path: Path) -> None:
+    """A mutant of 77 bytes made Pillow set 700 MB aside."""
+    path = tmp_path / "a.png"
+    write_image(path, np.zeros((64, 64, 4), np.uint8))
+    content = path.read_bytes()
+    at = content.index(b"IDAT") - 4
+    assert _attempt(path, content[:at] + b"\x2c" + content[at + 1 :], partial(read_image, shape=(64, 64, 4))) < 1 << 20
 
 
 def test_a_capture_of_mutants_is_refused_in_one_line(tmp_path: Path) -> None:
