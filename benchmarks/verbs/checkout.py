@@ -49,7 +49,7 @@ class SpeedVerb:
             return measure_frames(self.json, self.capture)
         from benchmarks.speed.kernels import main as measure
 
-        return measure(self.what, self.json)
+        return measure(self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
