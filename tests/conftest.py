@@ -1,10 +1,15 @@
 """What holds for every test."""
 
 import signal
+import sys
 from collections.abc import Iterator
+from functools import cache
 
 import pytest
 from helpers.browser import chromium, visit  # noqa: F401  (fixtures for all)
+from helpers.sharing import shared, small_capture  # noqa: F401
+
+from benchmarks.cell import methods
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -15,7 +20,17 @@ def can_be_interrupted() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
-LONG = ("test_kill", "test_conformance", "test_cli", "test_isolation", "test_engine", "test_launcher", "test_ci_suite")
+def pytest_sessionstart() -> None:
+    """What is installed follows `sys.path` here; to read it anew takes a tenth of a second at each look."""
+    look = methods.methods
+    seen = cache(lambda path: look())
+    methods.methods = lambda: seen(tuple(sys.path))
+
+
+LONG = (
+    "test_kill", "test_cli", "test_readers", "test_isolation", "test_launcher", "test_conformance", "test_rates",
+    "test_plugin", "test_in_a_browser", "test_engine", "test_ci_suite",
+)  # fmt: skip
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -1,5 +1,7 @@
 """Our world in the axes of others. Ours is right-handed, x to the person's left, y up, z out of the chest."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -14,11 +16,10 @@ HALF_TURN_ABOUT_X = (0.0, 1.0, 0.0, 0.0)  # wxyz: y up becomes y down, as in sce
 def turned(gaussians: Gaussians, quat: tuple[float, float, float, float]) -> Gaussians:
     """The Gaussians in a world that is turned by a unit quaternion (wxyz), the colours of directions with it."""
     every: Float[Tensor, "n 4"] = torch.tensor(quat).expand(len(gaussians.means), 4)
-    return Gaussians(
+    return replace(
+        gaussians,
         means=rotate(every, gaussians.means),
         quats=quat_multiply(every, gaussians.quats),
-        scales=gaussians.scales,
-        opacities=gaussians.opacities,
         sh=rotate_sh(every, gaussians.sh),
     )
 

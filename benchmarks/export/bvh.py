@@ -1,9 +1,11 @@
 """Skeleton and motion as BVH: metres, degrees, y up, rotations applied as Z, X, Y (the format's usual order)."""
 
+import warnings
+
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ash.capture.dataset import Motion, Skeleton
-from synth.posing import rotvec_to_rotmat
 
 ORDER = "Zrotation Xrotation Yrotation"
 TIP = (0.0, 0.05, 0.0)  # metres: a joint without children needs an end to be drawn at all
@@ -11,7 +13,9 @@ TIP = (0.0, 0.05, 0.0)  # metres: a joint without children needs an end to be dr
 
 def bvh_bytes(skeleton: Skeleton, motion: Motion) -> bytes:
     """The rest pose as the hierarchy's offsets, then a line per frame."""
-    angles = _angles_deg(rotvec_to_rotmat(motion.dofs[:, 3:].reshape(len(motion.dofs), -1, 3)))
+    rotations = Rotation.from_rotvec(motion.dofs[:, 3:].reshape(-1, 3))
+    with warnings.catch_warnings(action="ignore", category=UserWarning):  # Where x is a right angle, y is zero.
+        angles = rotations.as_euler("ZXY", degrees=True).reshape(len(motion.dofs), -1, 3)
     order = _depth_first(skeleton)
     root = skeleton.heads[0] + motion.dofs[:, :3]
     rows = np.concatenate([root, angles[:, order].reshape(len(angles), -1)], axis=1)
@@ -44,17 +48,3 @@ def _joint(skeleton: Skeleton, joint: int) -> list[str]:
 
 def _numbers(values: np.ndarray | tuple[float, ...]) -> str:
     return " ".join(f"{value:.6f}" for value in values)
-
-
-def _angles_deg(rotations: np.ndarray) -> np.ndarray:
-    """Angles about z, x, y `[..., 3]`, degrees, of R = Rz Rx Ry; where x is a right angle, y is taken as zero."""
-    sine = rotations[..., 2, 1].clip(-1, 1)
-    x = np.arcsin(sine)
-    locked = np.abs(sine) > 1 - 1e-9
-    z = np.where(
-        locked,
-        np.arctan2(rotations[..., 1, 0], rotations[..., 0, 0]),
-        np.arctan2(-rotations[..., 0, 1], rotations[..., 1, 1]),
-    )
-    y = np.where(locked, 0.0, np.arctan2(-rotations[..., 2, 0], rotations[..., 2, 2]))
-    return np.rad2deg(np.stack([z, x, y], axis=-1))

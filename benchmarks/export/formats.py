@@ -19,14 +19,13 @@ class Format:
 
     suffix: str
     write: Callable[[Gaussians], bytes]
-    about: str
 
 
 GAUSSIAN_FORMATS = {
-    "ply": Format(suffix=".ply", write=ply_bytes, about="Gaussians as 3D Gaussian splatting writes them"),
-    "splat": Format(suffix=".splat", write=splat_bytes, about="Gaussians in 32 bytes each, one colour from all sides"),
-    "spz": Format(suffix=".spz", write=spz_bytes, about="Gaussians compressed"),
-    "gltf": Format(suffix=".glb", write=gaussians_glb, about="Gaussians in glTF (KHR_gaussian_splatting)"),
+    "ply": Format(suffix=".ply", write=ply_bytes),  # as 3D Gaussian splatting writes them
+    "splat": Format(suffix=".splat", write=splat_bytes),  # 32 bytes each, one colour from all sides
+    "spz": Format(suffix=".spz", write=spz_bytes),  # compressed
+    "gltf": Format(suffix=".glb", write=gaussians_glb),  # KHR_gaussian_splatting
 }
 MESH, SKELETON = "glb", "bvh"
 FORMATS = (*GAUSSIAN_FORMATS, MESH, SKELETON)

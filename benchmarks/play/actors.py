@@ -24,6 +24,7 @@ from benchmarks.analysis.names import look_of
 from benchmarks.cell.cells import CHECKPOINT, Cell, is_trained, read_cell
 from benchmarks.cell.methods import is_oracle
 from benchmarks.cell.process import load_avatar
+from benchmarks.play.cameras import first_camera
 from benchmarks.suites.runs import RUN_FILE, read_run
 
 KEPT_POSES = 48  # Playing a short motion again, or turning the camera, decodes nothing anew.
@@ -39,7 +40,7 @@ class Actor:
         self._kept: OrderedDict[tuple[bytes, int], Gaussians] = OrderedDict()
         self._decoders = None
         if isinstance(avatar, AshAvatar):
-            engine = Player(avatar, capture.motion, next(iter(capture.cameras.values()))).engine
+            engine = Player(avatar, capture.motion, first_camera(capture)).engine
             self._decoders = None if engine is None else engine.decode
 
     @torch.no_grad()
@@ -70,13 +71,7 @@ class Actor:
         if not isinstance(self.avatar, PosesGaussians):
             raise InputError(f"{self.title} has no Gaussians to show as ellipsoids")
         full = self.gaussians(pose, clock)
-        shown = Gaussians(
-            means=full.means,
-            quats=full.quats,
-            scales=THIN * full.scales,
-            opacities=(full.opacities > 0.1).float(),
-            sh=full.sh,
-        )
+        shown = replace(full, scales=THIN * full.scales, opacities=(full.opacities > 0.1).float())
         with clock.stage("stg4"):
             return self._over(shown, camera, behind)
 
@@ -149,6 +144,16 @@ class Cast:
             avatar = self._stack.enter_context(_loaded(cell, self.capture, trust=self.trust))
             self._actors[title] = Actor(cell, title, avatar, self.capture)
         return self._actors[title]
+
+    def only(self) -> Actor:
+        """The one avatar that there is.
+
+        Raises:
+            InputError: there are several.
+        """
+        if len(self.titles) != 1:
+            raise InputError(f"expected one avatar, got {', '.join(self.titles)}; give the folder of a cell")
+        return self.actor(self.titles[0])
 
 
 @contextmanager

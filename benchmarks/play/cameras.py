@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ash.capture.dataset import Camera, Capture
 from ash.files import InputError
@@ -23,16 +24,37 @@ def resized(camera: Camera, *, width: int, height: int) -> Camera:
     return replace(camera, width=width, height=height, K=K)
 
 
+def fov_of(camera: Camera) -> float:
+    """A camera's field of view from bottom to top, radians."""
+    return float(2 * np.arctan2(camera.height / 2, camera.K[1, 1]))
+
+
+def first_camera(capture: Capture) -> Camera:
+    """The capture's first camera: viewers begin with its field of view, and as far away."""
+    return next(iter(capture.cameras.values()))
+
+
+def apart(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
+    """How far two cameras `[4, 4]` stand from each other, metres, and are turned, radians."""
+    moved = one[:3, :3].T @ one[:3, 3] - other[:3, :3].T @ other[:3, 3]
+    turned = Rotation.from_matrix(one[:3, :3] @ other[:3, :3].T).magnitude()
+    return float(np.linalg.norm(moved)), float(turned)
+
+
 def middle_of(capture: Capture) -> np.ndarray:
     """The middle of the resting person, `[3]` metres."""
     vertices = capture.template.vertices
     return (vertices.min(axis=0) + vertices.max(axis=0)) / 2
 
 
+def reach_of(capture: Capture) -> float:
+    """How far the first camera stands from the person's middle, metres."""
+    return float(np.linalg.norm(first_camera(capture).position - middle_of(capture)))
+
+
 def starting_place(capture: Capture) -> np.ndarray:
     """Where a new viewer stands, `[3]` metres: before the person, as far away as the capture's first camera."""
-    middle, first = middle_of(capture), next(iter(capture.cameras.values()))
-    return middle + float(np.linalg.norm(first.position - middle)) * np.array(START)
+    return middle_of(capture) + reach_of(capture) * np.array(START)
 
 
 def spiral_camera(capture: Capture, step: float, *, width: int, height: int) -> Camera:
@@ -40,13 +62,11 @@ def spiral_camera(capture: Capture, step: float, *, width: int, height: int) -> 
 
     It stands as far away as the capture's first camera, with its field of view.
     """
-    first = next(iter(capture.cameras.values()))
     middle = middle_of(capture)
-    reach = float(np.linalg.norm(first.position - middle))
     angle = 2 * np.pi * step / TURN_FRAMES
     side = np.array([np.sin(angle), 0.15 + RISE * np.sin(angle / 2), np.cos(angle)])
-    viewmat = look_at(middle + reach * side / np.linalg.norm(side), middle)
-    return resized(replace(first, name=SPIRAL, viewmat=viewmat), width=width, height=height)
+    viewmat = look_at(middle + reach_of(capture) * side / np.linalg.norm(side), middle)
+    return resized(replace(first_camera(capture), name=SPIRAL, viewmat=viewmat), width=width, height=height)
 
 
 def camera_named(capture: Capture, name: str) -> Camera:

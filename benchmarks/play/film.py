@@ -4,6 +4,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from ash.files import InputError
 from ash.protocol import StageClock
 from benchmarks.cell import metrics
 from benchmarks.play.actors import Cast
-from benchmarks.play.cameras import RIG, SPIRAL, camera_named, resized, spiral_camera
+from benchmarks.play.cameras import RIG, SPIRAL, camera_named, first_camera, resized, spiral_camera
 from benchmarks.play.motions import Act
 from benchmarks.play.truth import TruthStudio, Wanted
 from benchmarks.report.pictures import PAPER, on_paper
@@ -62,7 +63,7 @@ def shoot(cast: Cast, script: Script, tell: Callable[[str], None]) -> Iterator[n
 
 def cameras_of(capture: Capture, script: Script, step: int) -> list[Camera]:
     """The cameras of one frame of the film, at its size."""
-    first = next(iter(capture.cameras.values()))
+    first = first_camera(capture)
     size = {"height": script.height, "width": round(script.height * first.width / first.height)}
     if script.camera == SPIRAL:
         return [spiral_camera(capture, float(step), **size)]
@@ -158,7 +159,7 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> int:
     writer.send(None)
     count = 0
     try:
-        for frame in _after(first, frames):
+        for frame in chain([first], frames):
             writer.send(np.ascontiguousarray(frame))
             count += 1
     finally:
@@ -178,8 +179,3 @@ def _write_webp(path: Path, frames: Iterator[np.ndarray], fps: float) -> int:
         method=4,
     )
     return len(pictures)
-
-
-def _after(first: np.ndarray, others: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
-    yield first
-    yield from others

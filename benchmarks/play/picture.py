@@ -63,26 +63,19 @@ class Painter:
         camera = self.camera(state, width=width, height=height)
         truth = self.shelf.find(act, state)
         clock, note = StageClock(), ""
-        left = self._avatar(state, state.left, Pose(motion, frame), camera, clock)
-        if truth is not None and state.error != NO_ERROR:
-            left = self._error(state, state.left, Pose(motion, frame), truth, camera)
-        elif truth is None and (state.error != NO_ERROR or state.right == TRUTH):
+        pose = Pose(motion, frame)
+        if truth is None and (state.error != NO_ERROR or state.right == TRUTH):
             note = UNKNOWN_TRUTH
-        pixels = left
+        pixels = left = self._side(state, state.left, pose, truth, camera, clock)
         if state.right == TRUTH:
             shown = _blank(camera, state, "No truth of\nthis view yet") if truth is None else _fit(truth, camera, state)
             pixels = _divided(left, shown, state)
         elif state.right != NOTHING:
-            other = self._avatar(state, state.right, Pose(motion, frame), camera, StageClock())
-            if truth is not None and state.error != NO_ERROR:
-                other = self._error(state, state.right, Pose(motion, frame), truth, camera)
-            pixels = _divided(left, other, state)
+            pixels = _divided(left, self._side(state, state.right, pose, truth, camera, StageClock()), state)
         if state.mesh or state.skeleton:
-            pixels, missing = self._overlaid(pixels, state, Pose(motion, frame), camera)
+            pixels, missing = self._overlaid(pixels, state, pose, camera)
             note = missing or note
-        score = ""
-        if truth is not None and careful:
-            score = self._score(state, Pose(motion, frame), truth)
+        score = self._score(state, pose, truth) if truth is not None and careful else ""
         return Painting(pixels=pixels, stage_ms=dict(clock.ms), score=score, note=note)
 
     def camera(self, state: ViewState, *, width: int, height: int) -> Camera:
@@ -104,10 +97,14 @@ class Painter:
             self._held = key, held(act.motion, self.cast.capture.skeleton, dict(state.held))
         return self._held[1]
 
-    def _avatar(self, state: ViewState, title: str, pose: Pose, camera: Camera, clock: StageClock) -> np.ndarray:
+    def _side(
+        self, state: ViewState, title: str, pose: Pose, truth: TruthPicture | None, camera: Camera, clock: StageClock
+    ) -> np.ndarray:
+        """An avatar, or its error where that is wanted and the truth is known."""
         actor = self.cast.actor(title)
         draw = actor.ellipsoids if state.ellipsoids else actor.view
-        return draw(pose, camera, clock, DARK if state.dark else LIGHT)
+        drawn = draw(pose, camera, clock, DARK if state.dark else LIGHT)
+        return drawn if truth is None or state.error == NO_ERROR else self._error(state, title, pose, truth, camera)
 
     def _compared(
         self, state: ViewState, title: str, pose: Pose, truth: TruthPicture

@@ -11,7 +11,7 @@ import torch
 import viser
 
 from benchmarks.play.actors import Cast, open_cast
-from benchmarks.play.cameras import middle_of, starting_place
+from benchmarks.play.cameras import first_camera, fov_of, middle_of, starting_place
 from benchmarks.play.doors import DoorOptions, close_server, open_server
 from benchmarks.play.motions import acts_of
 from benchmarks.play.page import LABEL, Page
@@ -51,10 +51,10 @@ class PlayServer:
 
     def _set_stage(self) -> None:
         """Where a new viewer stands, and what the page looks like."""
-        first, start = next(iter(self.cast.capture.cameras.values())), self.server.initial_camera
+        start = self.server.initial_camera
         start.position, start.look_at = starting_place(self.cast.capture), middle_of(self.cast.capture)
         start.up = np.array([0.0, 1.0, 0.0])
-        start.fov = 2 * float(np.arctan2(first.height / 2, first.K[1, 1]))
+        start.fov = fov_of(first_camera(self.cast.capture))
         self.server.scene.set_up_direction("+y")
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
 

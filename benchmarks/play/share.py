@@ -3,6 +3,7 @@
 import base64
 import html
 import json
+import math
 import re
 import zlib
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ from ash.gaussians.gaussians import Gaussians
 from ash.harmonics import SH_C0
 from ash.protocol import PosesGaussians
 from benchmarks.play.actors import Cast
-from benchmarks.play.cameras import middle_of
+from benchmarks.play.cameras import first_camera, fov_of, middle_of, reach_of
 from benchmarks.play.motions import Act
 
 HERE = Path(__file__).parent
@@ -57,21 +58,18 @@ def clip_of(cast: Cast, act: Act, frames: Sequence[int]) -> SharedClip:
     Raises:
         InputError: several avatars, or one that has no Gaussians.
     """
-    if len(cast.titles) != 1:
-        raise InputError(f"expected one avatar, got {', '.join(cast.titles)}; give the folder of a cell")
-    actor = cast.actor(cast.titles[0])
+    actor = cast.only()
     if not isinstance(actor.avatar, PosesGaussians):
         raise InputError(f"{actor.title}: has no Gaussians; expected an avatar made of them")
-    middle, first = middle_of(cast.capture), next(iter(cast.capture.cameras.values()))
-    x, y, z = middle.tolist()
+    x, y, z = middle_of(cast.capture).tolist()
     return SharedClip(
         frames=tuple(actor.avatar.gaussians(Pose(act.motion, frame)) for frame in frames),
         fps=act.motion.fps,
         title=f"{actor.title}: {act.title}",
         dilation=actor.avatar.dilation,
         middle=(x, y, z),
-        distance=float(np.linalg.norm(first.position - middle)),
-        fov_deg=float(np.rad2deg(2 * np.arctan2(first.height / 2, first.K[1, 1]))),
+        distance=reach_of(cast.capture),
+        fov_deg=math.degrees(fov_of(first_camera(cast.capture))),
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ash.capture.dataset import Camera, Capture
 from benchmarks.cell import metrics
+from benchmarks.play.cameras import apart
 from benchmarks.play.film import capture_image
 from benchmarks.play.motions import Act
 from benchmarks.play.state import ViewState
@@ -60,9 +61,8 @@ class TruthShelf:
 
 def same_view(one: np.ndarray, other: np.ndarray) -> bool:
     """Whether two cameras `[4, 4]` stand and look alike, as far as a browser repeats what it was told."""
-    moved = np.linalg.norm(one[:3, :3].T @ one[:3, 3] - other[:3, :3].T @ other[:3, 3])
-    turned = np.linalg.norm(one[:3, :3] @ other[:3, :3].T - np.eye(3)) / np.sqrt(2)
-    return bool(moved < SAME_PLACE_M and turned < SAME_TURN)
+    moved, turned = apart(one, other)
+    return moved < SAME_PLACE_M and turned < SAME_TURN
 
 
 def truth_from(camera: Camera, straight: np.ndarray) -> TruthPicture:

@@ -9,12 +9,12 @@ import viser
 from scipy.spatial.transform import Rotation
 
 from ash.capture.dataset import Camera, Capture
-from benchmarks.play.cameras import middle_of, resized, starting_place
+from benchmarks.play.cameras import apart, fov_of, middle_of, resized, starting_place
 from benchmarks.play.state import FREE, Eye
 from benchmarks.play.viewer import Viewer
 
 SETTLE_SECONDS = 0.6  # after a jump, in which the browser may still report where it was
-SAME_M, SAME_DEG = 0.01, 0.6
+SAME_M, SAME_TURN = 0.01, 0.01  # metres and radians, as far as a browser's numbers say
 NARROW = 0.75  # width by height
 FRUSTUM_M, LINE_M = 0.12, 0.006  # a frustum's size, and how thick its lines are
 BLOCKS_M = 0.6  # of a frustum: nearer, it would hide the person
@@ -72,16 +72,15 @@ class Standpoint:
                 handle.visible = bool(far)
 
     def _frustum(self, name: str, camera: Camera) -> viser.CameraFrustumHandle:
-        quat = Rotation.from_matrix(camera.viewmat[:3, :3].T).as_quat()
         handle = self.client.scene.add_camera_frustum(
             f"/cameras/{name}",
-            fov=2 * float(np.arctan2(camera.height / 2, camera.K[1, 1])),
+            fov=fov_of(camera),
             aspect=camera.width / camera.height,
             scale=FRUSTUM_M,
             thickness=LINE_M,
             variant="filled",  # Lines alone are hard to hit.
             color=TRAINING if name in self.capture.splits["train"].cameras else HELD_OUT,
-            wxyz=quat[[3, 0, 1, 2]],
+            wxyz=Rotation.from_matrix(camera.viewmat[:3, :3].T).as_quat(scalar_first=True),
             position=camera.position,
         )
         handle.on_click(lambda _: self._clicked(name))
@@ -97,7 +96,7 @@ class Standpoint:
         depth = float(rotation[2] @ (middle_of(self.capture) - camera.position))
         self._jumped = time.perf_counter(), camera.viewmat
         with self.client.atomic():
-            self.client.camera.fov = 2 * float(np.arctan2(camera.height / 2, camera.K[1, 1]))
+            self.client.camera.fov = fov_of(camera)
             self.client.camera.up_direction = (0.0, 1.0, 0.0)
             self.client.camera.position = camera.position
             self.client.camera.look_at = camera.position + max(depth, 0.1) * rotation[2]
@@ -123,9 +122,8 @@ class Standpoint:
         when, viewmat = self._jumped
         if time.perf_counter() - when < SETTLE_SECONDS:
             return True
-        place = -viewmat[:3, :3].T @ viewmat[:3, 3]
-        turn = Rotation.from_matrix(viewmat[:3, :3] @ eye.viewmat[:3, :3].T).magnitude()
-        return bool(np.linalg.norm(place - eye.position) < SAME_M and np.rad2deg(turn) < SAME_DEG)
+        moved, turned = apart(viewmat, eye.viewmat)
+        return moved < SAME_M and turned < SAME_TURN
 
 
 def eye_of(camera: viser.CameraHandle) -> Eye | None:
@@ -134,8 +132,7 @@ def eye_of(camera: viser.CameraHandle) -> Eye | None:
         return None
     if not (np.isfinite(camera.position).all() and np.isfinite(camera.wxyz).all() and np.linalg.norm(camera.wxyz) > 0):
         return None
-    w, x, y, z = camera.wxyz
-    rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
+    rotation = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix().T
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ camera.position
     return Eye(

@@ -33,7 +33,7 @@ PAPER_MS = {
     256: {"stg1": 21.03, "stg2": 3.60, "stg3": 7.00, "stg4": 2.11, "frame": 33.74},
     512: {"stg1": 24.25, "stg2": 16.34, "stg3": 18.45, "stg4": 4.31, "frame": 63.35},
 }
-CAPTURE = "mannequin-ci-0"
+CAPTURE = Path("data/mannequin-ci-0")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,20 +231,15 @@ def _step(avatar: AshAvatar, batch: Batch, optimiser: Adam, *, naive: bool) -> N
     optimiser.step()
 
 
-def speed_capture(data: Path) -> Capture:
-    """The small mannequin of the suite `ci`, rendered if it is not there."""
-    from benchmarks.provenance import cores
-    from benchmarks.suites.captures import make_capture_in
-    from benchmarks.suites.suites import CaptureSpec
-
-    make_capture_in(CaptureSpec(scene="mannequin", size="ci"), data / CAPTURE, workers=cores())
-    return replace(load_capture(data / CAPTURE), store=data / "templates")
-
-
 def captured(folder: Path | None) -> Capture:
-    """The capture in a folder, or the one that is timed where none is named."""
+    """The capture in a folder; where none is named, the mannequin of the suite `ci`, rendered if it is not there."""
     if folder is None:
-        return speed_capture(Path("data"))
+        from benchmarks.provenance import cores
+        from benchmarks.suites.captures import make_capture_in
+        from benchmarks.suites.suites import CaptureSpec
+
+        folder = CAPTURE
+        make_capture_in(CaptureSpec(scene="mannequin", size="ci"), folder, workers=cores())
     return replace(load_capture(folder), store=folder.parent / "templates")
 
 
@@ -274,11 +269,6 @@ def main(json_path: Path | None, folder: Path | None = None) -> int:
         stages = ", ".join(f"{name} {ms:.2f}" for name, ms in found.items())
         print(f"  {texels} texels: {stages} ms, {1e3 / found['frame']:.2f} frames per second")
     if json_path is not None:
-        content = {"rows": [_as_json(row) for row in rows], "agreements": [vars(a) for a in agreements]}
+        content = {"rows": [as_json(row) for row in rows], "agreements": [vars(a) for a in agreements]}
         write_json(json_path, content | {"paper_ms": PAPER_MS})
     return 0
-
-
-def _as_json(row: SpeedRow) -> dict[str, object]:
-    fields = as_json(row)
-    return fields | {"ratio": None if math.isnan(row.ratio) else row.ratio}

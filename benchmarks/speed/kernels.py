@@ -3,20 +3,21 @@
 import statistics
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 import ash.gaussians.splatting
-from ash.files import InputError, write_json
+from ash.files import write_json
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import splat, splat_naive
 from ash.mesh.rasterizing import rasterize_mesh, rasterize_mesh_naive
 from ash.native.library import fma_peak, instruction_set, stage_ms
 from ash.training.losses import l1_ssim_loss, l1_ssim_loss_naive, ssim_target
 from benchmarks.cell.timing import peak_memory_mb
-from benchmarks.speed.rows import SpeedRow, TimedCandidate, _print_rows, as_json, rows_of, time_interleaved
+from benchmarks.speed.rows import SpeedRow, TimedCandidate, as_json, in_turns, print_rows, rows_of, time_interleaved
 from benchmarks.speed.scenes import SplatScene, body_mesh, splat_scene
 
 # Floating point operations of one splat at one pixel, counted in native/blend.inc: the exponent and its power of two,
@@ -70,32 +71,23 @@ def speed_kernels(
 
 def time_splat(scene: SplatScene, *, rounds: int, threads: tuple[int, ...]) -> Iterator[list[SpeedRow] | SplatDetail]:
     """Rows of forward and of forward with backward, naive and native by turns, then a detail per number of threads."""
-    cameras = {"viewmats": scene.viewmats, "Ks": scene.Ks, "width": scene.width, "height": scene.height}
     leaves = {name: getattr(scene.gaussians, name).clone().requires_grad_() for name in Gaussians.__slots__}
     gradient = torch.randn(1, scene.height, scene.width, 3, generator=torch.Generator().manual_seed(1))
     stages: dict[int, list[dict[str, float]]] = {count: [] for count in threads}
 
     def forward(draw: Callable[..., ash.gaussians.splatting.Splatted], **more: int) -> None:
         with torch.no_grad():
-            draw(scene.gaussians, **cameras, **more)
+            draw(scene.gaussians, **scene.cameras, **more)
 
     def both(draw: Callable[..., ash.gaussians.splatting.Splatted], **more: int) -> None:
         for leaf in leaves.values():
             leaf.grad = None
-        torch.autograd.backward(draw(Gaussians(**leaves), **cameras, **more).rgb, gradient)
+        torch.autograd.backward(draw(Gaussians(**leaves), **scene.cameras, **more).rgb, gradient)
         if more:
             stages[more["threads"]].append(stage_ms())
 
     for pass_, run in (("forward", forward), ("forward+backward", both)):
-        candidates = [
-            TimedCandidate(name="naive", threads=torch.get_num_threads(), call=lambda run=run: run(splat_naive))
-        ]  # type: ignore[misc]
-        candidates += [
-            TimedCandidate(
-                name="native", threads=count, repeats=10, call=lambda run=run, n=count: run(splat, threads=n)
-            )  # type: ignore[misc]
-            for count in threads
-        ]
+        candidates = in_turns(partial(run, splat_naive), partial(run, splat), threads)
         yield rows_of("splat", scene.name, pass_, time_interleaved(candidates, rounds=rounds))
     covered, pairs = count_pairs(scene)
     for count in threads:
@@ -126,15 +118,7 @@ def time_mixture(*, rounds: int, threads: int = 2) -> Mixture:
         layer(features).square().sum().backward()
 
     def draw() -> None:
-        drawn = splat(
-            Gaussians(**leaves),
-            viewmats=scene.viewmats,
-            Ks=scene.Ks,
-            width=scene.width,
-            height=scene.height,
-            threads=threads,
-        )
-        drawn.rgb.sum().backward()
+        splat(Gaussians(**leaves), **scene.cameras, threads=threads).rgb.sum().backward()
 
     def both() -> None:
         convolve()
@@ -190,31 +174,16 @@ def _time_loss(size: str, height: int, width: int, *, rounds: int, threads: tupl
         image.grad = None
         loss(image, cached, l1_weight=0.9, ssim_weight=0.1, **more).backward()
 
-    candidates = [TimedCandidate(name="naive", threads=torch.get_num_threads(), call=lambda: run(l1_ssim_loss_naive))]
-    candidates += [
-        TimedCandidate(name="native", threads=count, repeats=10, call=lambda n=count: run(l1_ssim_loss, threads=n))  # type: ignore[misc]
-        for count in threads
-    ]
+    candidates = in_turns(partial(run, l1_ssim_loss_naive), partial(run, l1_ssim_loss), threads)
     return rows_of("l1_ssim", size, "forward+backward", time_interleaved(candidates, rounds=2 * rounds))
 
 
 def _time_rasterizer(size: str, pixels: int, *, rounds: int, threads: tuple[int, ...]) -> list[SpeedRow]:
     vertices, faces = body_mesh(pixels)
-    sides = {"width": pixels, "height": pixels}
-    candidates = [
-        TimedCandidate(
-            name="naive", threads=torch.get_num_threads(), call=lambda: rasterize_mesh_naive(vertices, faces, **sides)
-        )
-    ]
-    candidates += [
-        TimedCandidate(
-            name="native",
-            threads=count,
-            repeats=10,
-            call=lambda n=count: rasterize_mesh(vertices, faces, **sides, threads=n),  # type: ignore[misc]
-        )
-        for count in threads
-    ]
+    naive, native = (
+        partial(draw, vertices, faces, width=pixels, height=pixels) for draw in (rasterize_mesh_naive, rasterize_mesh)
+    )
+    candidates = in_turns(naive, native, threads)
     return rows_of("rasterize_mesh", size, "forward", time_interleaved(candidates, rounds=max(1, rounds // 3)))
 
 
@@ -230,10 +199,8 @@ def _print_detail(detail: SplatDetail) -> None:
     )
 
 
-def main(what: str, json_path: Path | None) -> int:
-    """Print the table of `what`, and write it to `json_path`; returns the exit code."""
-    if what != "kernels":
-        raise InputError(f"speed: expected kernels, got {what}")
+def main(json_path: Path | None) -> int:
+    """Print the table, and write it to `json_path`; returns the exit code."""
     print(f"instruction set {instruction_set()}, FMA peak {1e-9 * fma_peak(1):.0f} GFLOP/s on one thread", end="")
     print(f" and {1e-9 * fma_peak(2):.0f} on two; torch {torch.__version__}, {torch.get_num_threads()} thread(s)")
     print(f"{'what':15} {'size':9} {'pass':17} th {'by':7} {'min ms':>10} {'median ms':>10} {'ratio':>8}")
@@ -252,7 +219,7 @@ def main(what: str, json_path: Path | None) -> int:
             )
         else:
             rows += result
-            _print_rows(result)
+            print_rows(result)
     peak_mb = peak_memory_mb()
     print(f"peak memory of this process, torch and the definitions included: {peak_mb:.0f} MB")
     if json_path is not None:

@@ -1,9 +1,13 @@
 """Rows of speed: what was timed, on what, by which candidate, and how much faster than its definition."""
 
+import math
 import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+
+import torch
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +33,16 @@ class TimedCandidate:
     threads: int
     call: Callable[[], object]
     repeats: int = 1
+
+
+def in_turns(
+    naive: Callable[[], object], native: Callable[..., object], threads: tuple[int, ...]
+) -> list[TimedCandidate]:
+    """The definition as it runs, then its kernel, ten times as often, on each number of `threads`."""
+    return [
+        TimedCandidate(name="naive", threads=torch.get_num_threads(), call=naive),
+        *(TimedCandidate(name="native", threads=n, call=partial(native, threads=n), repeats=10) for n in threads),
+    ]
 
 
 def time_interleaved(candidates: list[TimedCandidate], *, rounds: int) -> dict[tuple[str, int], list[float]]:
@@ -69,11 +83,13 @@ def row_of(
 
 
 def as_json(row: SpeedRow) -> dict[str, object]:
-    """The row under its public names."""
-    return {name.rstrip("_"): value for name, value in vars(row).items()}
+    """The row under its public names; null for a ratio to nothing."""
+    fields = {name.rstrip("_"): value for name, value in vars(row).items()}
+    return fields | {"ratio": None if math.isnan(row.ratio) else row.ratio}
 
 
-def _print_rows(rows: list[SpeedRow]) -> None:
+def print_rows(rows: list[SpeedRow]) -> None:
+    """A line for each."""
     for row in rows:
         print(
             f"{row.what:15} {row.size:9} {row.pass_:17} {row.threads:2} {row.candidate:7}"

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,6 +32,11 @@ class SplatScene:
     Ks: Tensor
     width: int
     height: int
+
+    @property
+    def cameras(self) -> dict[str, Any]:
+        """As the splatter takes them."""
+        return {"viewmats": self.viewmats, "Ks": self.Ks, "width": self.width, "height": self.height}
 
 
 # Gaussians, width, height, their standard deviation in metres, and how many image heights the body is tall. P covers

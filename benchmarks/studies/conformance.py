@@ -72,10 +72,10 @@ def judge(ran: dict[str, TrialRun], limits: Limits) -> tuple[RuleCheck, ...]:
         RuleCheck(rule="comes through", kept=not crashes, seen=crashes[0] if crashes else f"{len(ran)} trials"),
         _first_problem("keeps the protocol", [o.protocol or o.weights for o in outcomes], "every function is there"),
         _first_problem("draws as the protocol says", [o.images for o in outcomes], "float32, finite, premultiplied"),
-        _same("same seed, same bits", first, again),
+        _same("same seed, same bits", _pictures(first), _pictures(again)),
         _seeds(first, other),
-        _same("weights that are loaded draw the same", first, loaded),
-        _resumes(first),
+        _same("weights that are loaded draw the same", _pictures(first), _pictures(loaded)),
+        _same("training again in its folder ends the same", _pictures(first), first.again if first else None),
         _first_problem(
             "refuses bad poses", [first.bad_poses] if first else [], "NaN, wrong shape, frame beyond the end"
         ),
@@ -161,7 +161,7 @@ class _Bench:
 
 def _first_problem(rule: str, problems: list[str], fine: str) -> RuleCheck:
     if not problems:
-        return RuleCheck(rule=rule, kept=None, seen="no trial came so far")
+        return _untold(rule)
     found = next((problem for problem in problems if problem), "")
     return RuleCheck(rule=rule, kept=not found, seen=found or fine)
 
@@ -172,42 +172,34 @@ def _held_out(outcomes: list[Outcome], *, isolated: bool) -> RuleCheck:
     return replace(found, enforced=isolated)
 
 
-def _same(rule: str, one: Outcome | None, other: Outcome | None) -> RuleCheck:
-    if one is None or other is None or not one.pictures or not other.pictures:
-        return RuleCheck(rule=rule, kept=None, seen="no trial came so far")
-    equal = sum(a == b for a, b in zip(one.pictures, other.pictures, strict=True))
-    return RuleCheck(
-        rule=rule, kept=equal == len(one.pictures), seen=f"{equal} of {len(one.pictures)} images are equal"
-    )
+def _untold(rule: str) -> RuleCheck:
+    return RuleCheck(rule=rule, kept=None, seen="no trial came so far")
+
+
+def _pictures(outcome: Outcome | None) -> tuple[str, ...]:
+    return outcome.pictures if outcome else ()
+
+
+def _same(rule: str, ones: tuple[str, ...], others: tuple[str, ...] | None) -> RuleCheck:
+    if not ones or not others:
+        return _untold(rule)
+    equal = sum(a == b for a, b in zip(ones, others, strict=True))
+    return RuleCheck(rule=rule, kept=equal == len(ones), seen=f"{equal} of {len(ones)} images are equal")
 
 
 def _seeds(one: Outcome | None, other: Outcome | None) -> RuleCheck:
     """Error bars are the spread over seeds: a method that always draws the same would have none, and look certain."""
     rule = "the seed is what is random"
-    if one is None or other is None or not one.pictures or not other.pictures:
-        return RuleCheck(rule=rule, kept=None, seen="no trial came so far")
-    if one.seedless:
-        same = one.pictures == other.pictures
-        return RuleCheck(
-            rule=rule, kept=same, seen="seedless, as it says" if same else "says seedless, and seeds differ"
-        )
-    if one.pictures == other.pictures:
-        return RuleCheck(
-            rule=rule,
-            kept=False,
-            seen="two seeds draw the same bits; a method without randomness has `seedless = True`",
-        )
-    return RuleCheck(rule=rule, kept=True, seen="another seed draws other bits")
-
-
-def _resumes(first: Outcome | None) -> RuleCheck:
-    rule = "training again in its folder ends the same"
-    if first is None or first.again is None or not first.pictures:
-        return RuleCheck(rule=rule, kept=None, seen="no trial came so far")
-    equal = sum(a == b for a, b in zip(first.pictures, first.again, strict=True))
-    return RuleCheck(
-        rule=rule, kept=equal == len(first.pictures), seen=f"{equal} of {len(first.pictures)} images are equal"
-    )
+    if one is None or not one.pictures or not _pictures(other):
+        return _untold(rule)
+    same = one.pictures == _pictures(other)
+    seen = {
+        (True, True): "seedless, as it says",
+        (True, False): "says seedless, and seeds differ",
+        (False, True): "two seeds draw the same bits; a method without randomness has `seedless = True`",
+        (False, False): "another seed draws other bits",
+    }
+    return RuleCheck(rule=rule, kept=same == one.seedless, seen=seen[one.seedless, same])
 
 
 def _limit(rule: str, ran: dict[str, TrialRun], what: str, fine: str) -> RuleCheck:

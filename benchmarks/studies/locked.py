@@ -28,7 +28,7 @@ def main(argv: list[str]) -> int:
     os.chdir(folder)
     from benchmarks.studies.trial import main as do_trial
 
-    return do_trial([str(folder)])
+    return do_trial(folder)
 
 
 if __name__ == "__main__":

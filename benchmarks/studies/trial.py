@@ -63,9 +63,8 @@ class Outcome:
     peak_mb: float = 0.0
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(folder: Path) -> int:
     """Do the trial whose folder is given."""
-    folder = Path((argv or sys.argv[1:])[0])
     try:
         trial: Trial = from_json(Trial, read_json(folder / "trial.json"))
         outcome = perform(trial, folder)

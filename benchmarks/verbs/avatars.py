@@ -117,10 +117,7 @@ class ExportAvatarVerb:
 
         suffix = suffix_of(self.form)
         with open_cast(self.cell, trust=self.trust) as cast:
-            if len(cast.titles) != 1:
-                found = ", ".join(cast.titles)
-                raise InputError(f"{self.cell}: expected one avatar, got {found}; give the folder of a cell")
-            act = act_named(cast.capture, self.motion)
+            actor, act = cast.only(), act_named(cast.capture, self.motion)
             if self.form == SKELETON:
                 chosen = list(frames_in(act, self.frames))
                 played = replace(act.motion, dofs=act.motion.dofs[chosen], sequence=act.motion.sequence[chosen])
@@ -128,7 +125,6 @@ class ExportAvatarVerb:
                 print(self.out)
                 return DONE
             chosen = list(frames_in(act, self.frames or "0"))
-            actor = cast.actor(cast.titles[0])
             for index, frame in enumerate(chosen):
                 path = self.out if len(chosen) == 1 else self.out / f"{index:06d}{suffix}"
                 write_atomic(

@@ -49,7 +49,7 @@ class SpeedVerb:
             return measure_frames(self.json, self.capture)
         from benchmarks.speed.kernels import main as measure
 
-        return measure(self.what, self.json)
+        return measure(self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +125,9 @@ class TestVerb:
         }
         # A worker that dies ends the run and names its test: xdist would wait for ever for what it was given.
         spread = ["-n", str(cores()), "--dist", "loadfile", "--no-loadscope-reorder", "--max-worker-restart", "0"]
-        run = partial(subprocess.run, cwd=root, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=False)
+        # Hundreds of processes import the same modules, so their bytecode is kept whatever is set outside.
+        settings = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+        run = partial(subprocess.run, cwd=root, env={**settings, "OMP_NUM_THREADS": "1"}, check=False)
         with ThreadPoolExecutor() as beside:
             told = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
             running = {name: beside.submit(run, ["nice", *command], **told) for name, command in brief.items()}

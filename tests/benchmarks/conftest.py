@@ -1,37 +1,16 @@
 """Captures and methods that are fakes, and trained avatars for the tests that show them."""
 
-import os
 import shutil
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from helpers import fakes
 from helpers.captures import write_tube_capture
+from helpers.sharing import Shared
 
-from ash.files import only_one
 from benchmarks import cli
 from benchmarks.cell.cells import read_cell
-
-Shared = Callable[[str, Callable[[Path], object]], Path]
-
-
-@pytest.fixture(scope="session")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Shared:
-    """A folder by its name, filled once for all workers of a test run; nobody may change what is in it."""
-    base = tmp_path_factory.getbasetemp()
-    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-
-    def filled(name: str, make: Callable[[Path], object]) -> Path:
-        folder = base / name
-        with only_one(folder):
-            if not folder.with_suffix(".whole").exists():
-                make(folder)
-                folder.with_suffix(".whole").touch()
-        return folder
-
-    return filled
 
 
 @pytest.fixture(scope="session")
@@ -60,15 +39,17 @@ def installed_fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="session")
-def tube_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tube_run(shared: Shared) -> Path:
     """What `train` leaves: a bending tube as ash and as ddc, trained for a moment, colours seen from all sides."""
-    folder = tmp_path_factory.mktemp("tube")
-    write_tube_capture(folder / "capture")
-    short = ["--training.steps", "60", "--training.warmup_steps", "10"]
-    for method, more in (("ash", ["--model.sh_degree", "2"]), ("ddc", [])):
-        command = ["train", method, str(folder / "capture"), "--preset", "ci", "--out", str(folder / "run")]
-        assert cli.main([*command, *short, *more]) == cli.DONE
-    return folder / "run"
+
+    def make(folder: Path) -> None:
+        write_tube_capture(folder / "capture")
+        short = ["--training.steps", "60", "--training.warmup_steps", "10"]
+        for method, more in (("ash", ["--model.sh_degree", "2"]), ("ddc", [])):
+            command = ["train", method, str(folder / "capture"), "--preset", "ci", "--out", str(folder / "run")]
+            assert cli.main([*command, *short, *more]) == cli.DONE
+
+    return shared("tube", make) / "run"
 
 
 @pytest.fixture(scope="session")

@@ -238,20 +238,21 @@ def test_help_lists_every_verb_and_how_to_go_on(capsys) -> None:
     assert f"{arguments.own_name()} run my.toml" in told
 
 
-@pytest.mark.parametrize("verb", cli.VERBS)
-def test_a_verbs_help_needs_nothing_heavy(verb: str) -> None:
-    code = f"""
+def test_a_verbs_help_needs_nothing_heavy() -> None:
+    code = """
 import sys
-from benchmarks.cli import main
-try:
-    main([{verb!r}, "--help"])
-except SystemExit as end:
-    assert end.code == 0
-heavy = {{"torch", "mitsuba", "pandas", "altair", "scipy", "matplotlib"}} & set(sys.modules)
-assert not heavy, heavy
+from benchmarks.cli import VERBS, main
+for verb in VERBS:
+    try:
+        main([verb, "--help"])
+    except SystemExit as end:
+        assert end.code == 0, verb
+    heavy = {"torch", "mitsuba", "pandas", "altair", "scipy", "matplotlib"} & set(sys.modules)
+    assert not heavy, (verb, heavy)
 """
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    assert f"ash-bench {verb}" in done.stdout
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert [verb for verb in cli.VERBS if f"ash-bench {verb}" not in done.stdout] == []
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import tomllib
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import asdict
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 import jaxtyping
@@ -31,7 +31,6 @@ from ash.checkpoints import load_module, read_safetensors
 from ash.files import InputError, read_arrays, read_image, read_json, write_image, write_json
 from ash.searching import Choice, Tried
 from ash.searching import _read as read_choice
-from benchmarks.cell import methods
 from benchmarks.cell.cells import Cell, CellConfig, failed_result, read_cell, read_result, write_config, write_result
 from benchmarks.cell.curves import read_curve
 from benchmarks.cell.lpips import _load as read_tensors
@@ -152,12 +151,8 @@ def _result(folder: Path) -> Path:
 
 @pytest.fixture(autouse=True)
 def as_a_user_runs_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the checks of shapes, which no user has: they would refuse what a reader let through, and take time.
-
-    What is installed does not change, so it is looked up once.
-    """
+    """Without the checks of shapes, which no user has: they would refuse what a reader let through, and take time."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
-    monkeypatch.setattr(methods, "methods", cache(methods.methods))
 
 
 KINDS = (

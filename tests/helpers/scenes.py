@@ -1,14 +1,8 @@
-"""A tiny scene, and its capture rendered once for all tests."""
+"""A tiny scene; `small_capture` of `helpers.sharing` is its capture."""
 
-import atexit
-import shutil
-import tempfile
 from dataclasses import replace
-from functools import lru_cache
-from pathlib import Path
 
 from synth import presets
-from synth.capture import make_capture
 from synth.scene import Clip, Rig, Scene
 
 
@@ -24,11 +18,3 @@ def small_scene(**changes) -> Scene:
         novel_view_stride=2,
     )
     return replace(base, **changes)
-
-
-@lru_cache(maxsize=1)
-def small_capture() -> Path:
-    """The folder of the small scene's capture, removed when the tests end. Tests that change it work on a copy."""
-    folder = Path(tempfile.mkdtemp(prefix="ash-bench-tests-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return make_capture(small_scene(), folder / "small")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.scenes import small_capture, small_scene
+from helpers.scenes import small_scene
 
 import synth.code
 from ash.capture.dataset import Capture, image_path, pixels_path, surface_path
@@ -29,8 +29,8 @@ from synth.views import splits, wanted_views
 
 
 @pytest.fixture(scope="module")
-def folder() -> Path:
-    return small_capture()
+def folder(small_capture: Path) -> Path:
+    return small_capture
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +10,6 @@ import torch
 import trimesh
 from helpers.captures import write_tube_capture
 from helpers.figures import tube_mesh, tube_motion, tube_skeleton
-from helpers.scenes import small_capture
 
 from ash.capture.dataset import Capture, Pose, scan_path, surface_path
 from ash.capture.formats import load_capture, read_scan, read_surface_mesh_truth
@@ -258,9 +258,9 @@ def test_skinning_through_the_graph_blends_the_nodes_transforms(capture):
     assert rms_mm(template, capture, range(18)) < 0.8 * rms_mm(unlearned, capture, range(18))
 
 
-def test_a_method_learns_its_template_from_what_it_is_given_and_leaves_it_for_the_next(tmp_path):
+def test_a_method_learns_its_template_from_what_it_is_given_and_leaves_it_for_the_next(tmp_path, small_capture: Path):
     """A rendered capture, sealed as the harness seals it: no truth, scans of training frames, a store beside it."""
-    whole = load_capture(small_capture())
+    whole = load_capture(small_capture)
     config = TemplateConfig(kind="learned", nodes=60, supervision="scans")
     with seen_by_method(whole, tmp_path / "input", oracle=False, store=tmp_path / "store") as seen:
         with watched(whole, seen):

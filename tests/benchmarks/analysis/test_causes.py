@@ -1,8 +1,9 @@
 """Which truth channel explains an error."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from helpers.scenes import small_capture
 
 from ash.capture.formats import load_capture
 from benchmarks.analysis import causes
@@ -54,8 +55,8 @@ def test_depth_bends_at_edges_and_not_on_slopes() -> None:
     assert set(np.flatnonzero(causes._depth_steps(slope, hit).any(0))) == {4, 5}
 
 
-def test_regions_cover_truth_and_prediction_and_nothing_else() -> None:
-    capture = load_capture(small_capture())
+def test_regions_cover_truth_and_prediction_and_nothing_else(small_capture: Path) -> None:
+    capture = load_capture(small_capture)
     camera, frame = capture.splits["novel_pose"].views[0]
     truth = metrics.foreground(metrics.on_black(capture.image(camera, frame)))
     predicted = np.roll(truth, 6, axis=1)

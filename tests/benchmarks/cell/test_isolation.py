@@ -229,7 +229,9 @@ def test_a_capture_that_a_method_changed_is_seen_and_used_no_more(
 
 def test_results_belong_to_their_cell(capture: Path, tmp_path: Path) -> None:
     one, other = cell("fake_good", capture, tmp_path), cell("fake_bad", capture, tmp_path)
-    run([one, other])
+    for each in (one, other):
+        write_result(each.folder, failed_result(each.config, "crashed", "as an example"))
+    assert len(plan_cells([one, other]).done) == 2
     (other.folder / "result.json").write_bytes((one.folder / "result.json").read_bytes())
     with pytest.raises(InputError, match=r"expected the result of boxes · fake_bad"):
         plan_cells([one, other])

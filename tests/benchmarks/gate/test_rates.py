@@ -70,12 +70,13 @@ def test_unchanged_code_and_defects_are_judged_and_written_down(
     capture = fakes.write_capture(tmp_path / "capture")
     fakes.use(tmp_path / "plugins", monkeypatch)
     monkeypatch.setattr(rates, "make_capture", lambda *_, **__: capture)
+    monkeypatch.setattr(rates, "SEEDS", 2)
     monkeypatch.setattr(rates, "SOUND", "fake_good")
     monkeypatch.setattr(rates, "SOUND_FOR", {})
     monkeypatch.setattr(rates, "DEFECTS", (fake_bad,))
     monkeypatch.setattr(rates, "_target", lambda name: name)
     found = rates.measure(tmp_path / "out", tmp_path, reruns=2, workers=2)
-    assert [trial.name for trial in found.unchanged] == ["seeds 3 to 5", "seeds 6 to 8"]
+    assert [trial.name for trial in found.unchanged] == ["seeds 2 to 3", "seeds 4 to 5"]
     (defect,) = found.defects
     assert defect.alarm and any("psnr" in check.what for check in defect.flagged)
     text = (tmp_path / "out" / "rates.md").read_text()

@@ -7,7 +7,6 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from helpers.captures import SIZE
-from helpers.scenes import small_capture
 from PIL import Image, ImageSequence
 
 from ash.capture.dataset import Capture, Pose
@@ -89,8 +88,8 @@ def test_what_cannot_be_filmed_is_refused(tube_run: Path, tmp_path: Path, capsys
 
 
 @pytest.fixture(scope="module")
-def capture() -> Capture:
-    return load_capture(small_capture())
+def capture(small_capture: Path) -> Capture:
+    return load_capture(small_capture)
 
 
 @pytest.fixture(scope="module")

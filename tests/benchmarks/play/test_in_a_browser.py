@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from helpers.browser import PHONE, Visitor
-from helpers.scenes import small_capture
 from helpers.viewers import PATIENCE, state_of
 from helpers.waiting import wait_for
 from PIL import Image
@@ -37,11 +36,11 @@ def player(tube_run: Path) -> Iterator[PlayServer]:
 
 
 @pytest.fixture(scope="module")
-def person(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PlayServer]:
+def person(tmp_path_factory: pytest.TempPathFactory, small_capture: Path) -> Iterator[PlayServer]:
     """A player of somebody whose truth can be rendered: a mannequin, learned from for a moment."""
     out = tmp_path_factory.mktemp("person")
     short = ["--preset", "ci", "--training.steps", "20", "--training.warmup_steps", "10"]
-    assert cli.main(["train", "ash", str(small_capture()), *short, "--out", str(out)]) == cli.DONE
+    assert cli.main(["train", "ash", str(small_capture), *short, "--out", str(out)]) == cli.DONE
     with playing(out) as player:
         yield player
 

@@ -1,14 +1,17 @@
 import io
 import os
+import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
 import pytest
+from helpers import fakes
 from helpers.waiting import wait_for
 
 from ash.files import InputError
@@ -42,6 +45,23 @@ def run(cells: list[Cell], *, limits: Limits = LIMITS, workers: int = 2) -> Cell
     return plan
 
 
+@pytest.fixture(scope="module")
+def done_once(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a run of one cell leaves."""
+    folder = tmp_path_factory.mktemp("done")
+    with pytest.MonkeyPatch.context() as patch:
+        fakes.use(folder / "plugins", patch)
+        assert len(run([cell("good", capture, folder / "out")]).todo) == 1
+    return folder / "out"
+
+
+@pytest.fixture
+def done(done_once: Path, capture: Path, tmp_path: Path) -> Cell:
+    """A copy of that cell."""
+    shutil.copytree(done_once, tmp_path, dirs_exist_ok=True)
+    return cell("good", capture, tmp_path)
+
+
 def test_cells_run_side_by_side_and_failures_are_results(capture: Path, tmp_path: Path) -> None:
     expected = {"good": "done", "nan": "diverged", "raising": "crashed", "dying": "crashed"}
     cells = [cell(method, capture, tmp_path) for method in expected]
@@ -67,45 +87,35 @@ def test_a_cell_beyond_its_time_or_memory_is_ended_and_recorded(capture: Path, t
     assert read_result(large.folder).status == "out of memory"
 
 
-def test_a_second_run_repeats_nothing(capture: Path, tmp_path: Path) -> None:
-    cells = [cell("good", capture, tmp_path)]
-    assert len(run(cells).todo) == 1
-    stamp = (cells[0].folder / "result.json").stat().st_mtime_ns
-    plan = run(cells)
+def test_a_second_run_repeats_nothing(done: Cell) -> None:
+    stamp = (done.folder / "result.json").stat().st_mtime_ns
+    plan = run([done])
     assert (len(plan.todo), len(plan.done)) == (0, 1)
-    assert (cells[0].folder / "result.json").stat().st_mtime_ns == stamp
+    assert (done.folder / "result.json").stat().st_mtime_ns == stamp
 
 
-def test_a_changed_input_runs_again_and_says_why(capture: Path, tmp_path: Path) -> None:
-    from dataclasses import replace
-
-    old = cell("good", capture, tmp_path)
-    run([old])
-    config = replace(old.config, code="other")
-    fresh = replace(old, config=config, folder=tmp_path / "cells" / config.key)
+def test_a_changed_input_runs_again_and_says_why(done: Cell) -> None:
+    config = replace(done.config, code="other")
+    fresh = replace(done, config=config, folder=done.folder.parent / config.key)
     plan = plan_cells([fresh])
     assert [c.config.key for c in plan.todo] == [config.key]
     assert "the code changed" in plan.reasons[0]
 
 
-def test_a_damaged_result_is_an_error_and_stays_as_it_is(capture: Path, tmp_path: Path) -> None:
-    broken = cell("good", capture, tmp_path)
-    run([broken])
-    path = broken.folder / "result.json"
+def test_a_damaged_result_is_an_error_and_stays_as_it_is(done: Cell) -> None:
+    path = done.folder / "result.json"
     whole = path.read_bytes()
     for content in (b"", whole[: len(whole) // 2], b"[]", b'{"status": "done"}', whole.replace(b'"done"', b'"fine"')):
         path.write_bytes(content)
         with pytest.raises(InputError, match=r"result\.json.*remove"):
-            plan_cells([broken])
+            plan_cells([done])
         assert path.read_bytes() == content
     path.write_bytes(whole.replace(b'"protocol": "%s"' % PROTOCOL.encode(), b'"protocol": "0"'))
     with pytest.raises(InputError, match=f"protocol {PROTOCOL}, got 0"):
-        plan_cells([broken])
+        plan_cells([done])
 
 
 def test_wrong_input_ends_the_run_with_its_line(capture: Path, tmp_path: Path) -> None:
-    import shutil
-
     damaged = Path(shutil.copytree(capture, tmp_path / "damaged"))
     image = damaged / "frames" / "cam3" / "000000.png"
     image.write_bytes(image.read_bytes()[:100])

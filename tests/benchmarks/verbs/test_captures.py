@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.motion_files import amass_file, bvh_file
-from helpers.scenes import small_capture
 
 from ash.capture.formats import load_capture, read_cameras, write_cameras
 from benchmarks.cli import main
@@ -14,16 +13,18 @@ from synth.camera.rig import rig_from_file
 from synth.motion.clips import FLOOR
 
 
-def _rig(folder: Path) -> Path:
-    cameras = list(read_cameras(small_capture() / "cameras.json").values())[:3]
-    write_cameras(folder / "rig.json", cameras)
-    return folder / "rig.json"
+@pytest.fixture
+def rig(tmp_path: Path, small_capture: Path) -> Path:
+    """A file of three cameras."""
+    cameras = list(read_cameras(small_capture / "cameras.json").values())[:3]
+    write_cameras(tmp_path / "rig.json", cameras)
+    return tmp_path / "rig.json"
 
 
-def test_a_users_motion_seen_by_a_users_cameras(tmp_path: Path, capsys: pytest.CaptureFixture):
+def test_a_users_motion_seen_by_a_users_cameras(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
     """Two shards render it; what comes out moves as the files say and is seen by the cameras given."""
     motion = amass_file(tmp_path / "walk.npz", mocap_framerate=np.array(12.0))
-    test, rig = bvh_file(tmp_path / "turn.bvh"), _rig(tmp_path)
+    test = bvh_file(tmp_path / "turn.bvh")
     test.write_text(test.read_text().replace("0.04", "0.0833333"))
     out = tmp_path / "capture"
     command = ["synth", "mannequin", "--size", "ci", "--out", str(out), "--workers", "1"]
@@ -50,15 +51,14 @@ def test_a_users_motion_seen_by_a_users_cameras(tmp_path: Path, capsys: pytest.C
     assert "1/2" not in capsys.readouterr().err
 
 
-def test_a_rig_may_be_the_bare_list_of_its_cameras(tmp_path: Path) -> None:
-    rig = _rig(tmp_path)
+def test_a_rig_may_be_the_bare_list_of_its_cameras(rig: Path, tmp_path: Path) -> None:
     bare = tmp_path / "bare.json"
     bare.write_text(json.dumps(json.loads(rig.read_text())["cameras"]))
     assert rig_from_file(bare) == rig_from_file(rig)
 
 
-def _bad_rigs(folder: Path) -> dict[str, str]:
-    rows = json.loads(_rig(folder).read_text())["cameras"]
+def _bad_rigs(rig: Path) -> dict[str, str]:
+    rows = json.loads(rig.read_text())["cameras"]
 
     def changed(**fields) -> str:
         return json.dumps({"cameras": [rows[0], {**rows[1], **fields}]})
@@ -90,9 +90,9 @@ def _bad_rigs(folder: Path) -> dict[str, str]:
     "fx, fy > 0", "one size", "16384", "in front of it", "folds", "shape", "held out", "at least one camera",
     "list of cameras", "not valid JSON", "JSON",
 ])  # fmt: skip
-def test_bad_rigs_end_in_one_clear_line(message: str, tmp_path: Path, capsys: pytest.CaptureFixture):
+def test_bad_rigs_end_in_one_clear_line(message: str, rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
     path = tmp_path / "bad.json"
-    path.write_text(_bad_rigs(tmp_path)[message])
+    path.write_text(_bad_rigs(rig)[message])
     _require_refusal(["--rig", str(path)], message, tmp_path, capsys)
 
 
@@ -158,8 +158,8 @@ def test_bad_options_are_refused(arguments: list[str], message: str, tmp_path: P
     _require_refusal(arguments, message, tmp_path, capsys)
 
 
-def test_export_and_undistort_have_doors(tmp_path: Path, capsys: pytest.CaptureFixture):
-    small = str(small_capture())
+def test_export_and_undistort_have_doors(tmp_path: Path, capsys: pytest.CaptureFixture, small_capture: Path):
+    small = str(small_capture)
     assert main(["export", small, "--format", "glb", "--out", str(tmp_path / "glb")]) == 0
     assert (tmp_path / "glb" / "human.glb").is_file()
     assert main(["export", small, "--format", "fbx", "--out", str(tmp_path / "fbx")]) == 2
@@ -167,5 +167,5 @@ def test_export_and_undistort_have_doors(tmp_path: Path, capsys: pytest.CaptureF
     assert main(["undistort", small, "--out", str(tmp_path / "straight")]) == 0
     assert main(["verify", str(tmp_path / "straight")]) == 0
     files = load_capture(tmp_path / "straight").manifest.files
-    assert files == load_capture(small_capture()).manifest.files  # Pinholes stay as they are, byte for byte.
+    assert files == load_capture(small_capture).manifest.files  # Pinholes stay as they are, byte for byte.
     assert "empty folder" in capsys.readouterr().err

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.scenes import small_capture, small_scene
+from helpers.scenes import small_scene
 from scipy.spatial import cKDTree
 
 from ash.capture.dataset import scan_path
@@ -22,16 +22,16 @@ from synth.shooting import studio_of
 
 
 @pytest.fixture(scope="module")
-def studio() -> Studio:
+def studio(small_capture: Path) -> Studio:
     """The person of the small capture's first frame."""
-    capture = load_capture(small_capture())
+    capture = load_capture(small_capture)
     dressed = studio_of(small_scene(), capture.folder, probe())
     dressed.dress(read_surface_mesh_truth(capture, 0)[0])
     return dressed
 
 
-def test_training_frames_are_scanned_and_the_manifest_says_how_well() -> None:
-    folder = small_capture()
+def test_training_frames_are_scanned_and_the_manifest_says_how_well(small_capture: Path) -> None:
+    folder = small_capture
     capture, manifest = load_capture(folder), read_manifest(folder)
     scanned = {name for name in manifest.files if name.startswith("scans/")}
     assert scanned == {str(scan_path(Path(), frame)) for frame in capture.splits["train"].frames}
@@ -40,8 +40,8 @@ def test_training_frames_are_scanned_and_the_manifest_says_how_well() -> None:
     assert len(sizes) > 1 and max(sizes) < 0.95 * len(read_surface_mesh_truth(capture, 0)[0])
 
 
-def test_a_scan_is_a_function_of_the_seed_and_the_frame(studio: Studio) -> None:
-    capture = load_capture(small_capture())
+def test_a_scan_is_a_function_of_the_seed_and_the_frame(studio: Studio, small_capture: Path) -> None:
+    capture = load_capture(small_capture)
     cameras = [capture.cameras[name] for name in capture.splits["train"].cameras]
     scene = small_scene()
     vertices, faces = scan(studio, cameras, scene.scanner, seed=stream(scene, "scan", 0))
@@ -52,8 +52,10 @@ def test_a_scan_is_a_function_of_the_seed_and_the_frame(studio: Studio) -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
-def test_a_scan_is_off_along_the_normal_by_exactly_the_stated_rms(studio: Studio, share: float) -> None:
-    capture = load_capture(small_capture())
+def test_a_scan_is_off_along_the_normal_by_exactly_the_stated_rms(
+    studio: Studio, share: float, small_capture: Path
+) -> None:
+    capture = load_capture(small_capture)
     cameras = [capture.cameras[name] for name in capture.splits["train"].cameras]
     scanner = Scanner(rms_mm=0.4, bump_share=share, bump_mm=40.0)
     vertices, faces = scan(studio, cameras, scanner, seed=3)
@@ -69,8 +71,8 @@ def test_a_scan_is_off_along_the_normal_by_exactly_the_stated_rms(studio: Studio
     assert {0.0: -0.05 < alike < 0.05, 0.5: 0.3 < alike < 0.6, 1.0: alike > 0.7}[share]
 
 
-def test_the_error_grows_where_no_two_cameras_look_squarely(studio: Studio) -> None:
-    capture = load_capture(small_capture())
+def test_the_error_grows_where_no_two_cameras_look_squarely(studio: Studio, small_capture: Path) -> None:
+    capture = load_capture(small_capture)
     cameras = [capture.cameras[name] for name in capture.splits["train"].cameras]
     surface = studio.vertices.astype(np.float64)
     normals = vertex_normals(surface, studio.surface.faces)
@@ -83,8 +85,8 @@ def test_the_error_grows_where_no_two_cameras_look_squarely(studio: Studio) -> N
     assert np.sqrt(np.mean(aside**2)) > 2 * np.sqrt(np.mean(square**2))
 
 
-def test_two_cameras_must_see_what_is_scanned(studio: Studio) -> None:
-    capture = load_capture(small_capture())
+def test_two_cameras_must_see_what_is_scanned(studio: Studio, small_capture: Path) -> None:
+    capture = load_capture(small_capture)
     camera = capture.cameras[capture.splits["train"].cameras[0]]
     surface = studio.vertices.astype(np.float64)
     normals = vertex_normals(surface, studio.surface.faces)
@@ -99,12 +101,12 @@ def test_two_cameras_must_see_what_is_scanned(studio: Studio) -> None:
     assert seen.sum() > 500 and not (seen & hidden).any() and not (seen & (facing < FACING)).any()
 
 
-def test_a_lost_scan_comes_back_and_a_studio_without_a_scanner_has_none(tmp_path: Path) -> None:
+def test_a_lost_scan_comes_back_and_a_studio_without_a_scanner_has_none(tmp_path: Path, small_capture: Path) -> None:
     other = tmp_path / "other"
-    shutil.copytree(small_capture(), other)
+    shutil.copytree(small_capture, other)
     scan_path(other, 1).unlink()
     make_capture(small_scene(), other)
-    assert sha256_of(other / "manifest.json") == sha256_of(small_capture() / "manifest.json")
+    assert sha256_of(other / "manifest.json") == sha256_of(small_capture / "manifest.json")
     bare = make_capture(replace(small_scene(), scanner=Scanner(rms_mm=0.0)), tmp_path / "bare")
     assert not (bare / "scans").exists() and verify_capture(bare) == []
     with pytest.raises(InputError, match="expected a scan of training frame 0, found none"):

@@ -1,5 +1,6 @@
+from pathlib import Path
+
 import numpy as np
-from helpers.scenes import small_capture
 
 from ash.capture.dataset import surface_path
 from ash.files import read_arrays
@@ -24,8 +25,8 @@ def test_stretch_is_relative_to_rest():
     np.testing.assert_allclose(stretch(BODY, np.stack([rest, 1.2 * rest]), "skirt"), [1.0, 1.2])
 
 
-def test_a_capture_tells_what_its_clothes_do_in_every_frame():
-    folder = small_capture()
+def test_a_capture_tells_what_its_clothes_do_in_every_frame(small_capture: Path):
+    folder = small_capture
     told = read_arrays(
         folder / "truth" / "clothes.npz", expected=("penetrating", "penetration_mm", "stretch")
     )  # fmt: skip

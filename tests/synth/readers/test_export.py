@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.scenes import small_capture
 from PIL import Image
 
 from ash.capture.dataset import Capture
@@ -17,8 +16,8 @@ from synth.readers.export import export
 
 
 @pytest.fixture(scope="module")
-def capture() -> Capture:
-    return load_capture(small_capture())
+def capture(small_capture: Path) -> Capture:
+    return load_capture(small_capture)
 
 
 def test_nerfstudio_cameras_look_along_minus_z(capture: Capture, tmp_path: Path):

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.scenes import small_capture
 from PIL import Image
 
 from ash.capture.dataset import Capture, TemplateMesh
@@ -17,8 +16,8 @@ from synth.readers.official import graph_faces, graph_nodes, taken_vertices
 
 
 @pytest.fixture(scope="module")
-def capture() -> Capture:
-    return load_capture(small_capture())
+def capture(small_capture: Path) -> Capture:
+    return load_capture(small_capture)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.scenes import small_capture
 
 from ash.capture.dataset import Capture, pixels_path, plate_path
 from ash.capture.formats import load_capture, read_cameras, write_cameras
@@ -18,8 +17,8 @@ from synth.scene import RIGS, Rig
 
 
 @pytest.fixture(scope="module")
-def capture() -> Capture:
-    return load_capture(small_capture())
+def capture(small_capture: Path) -> Capture:
+    return load_capture(small_capture)
 
 
 @pytest.fixture(scope="module")
