@@ -34,7 +34,7 @@ def draw(view: Viewport, background: list[float], arrays: list[Tensor]) -> tuple
     return rgb, alpha, depth, means2d
 
 
-_FAULTS = {  # `Fault` in native/kernels.h
+FAULTS = {  # `Fault` in native/kernels.h
     1: "means: expected finite numbers, got NaN or infinity",
     2: "quats: expected finite numbers, got NaN or infinity",
     3: "quats: expected quaternions that are not zero, got a zero quaternion",
@@ -57,7 +57,7 @@ class _Project(Function):
         ctx.sizes = (count, cameras, coefficients, *view)
         fault = load().ash_project(*map(address, arrays), *ctx.sizes, *map(address, (means2d, packed, depths)))
         if fault:
-            raise InputError(f"{_FAULTS[fault % 16]} at Gaussian {fault // 16}")
+            raise InputError(f"{FAULTS[fault % 16]} at Gaussian {fault // 16}")
         ctx.save_for_backward(*arrays, packed)
         ctx.mark_non_differentiable(depths)
         return means2d, packed, depths
