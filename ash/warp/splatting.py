@@ -65,7 +65,8 @@ class _ProjectByWarp(Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         arrays = list(ctx.saved_tensors)
-        given = [array(g.contiguous(), dtype) for g, dtype in zip(grads[:3], (wp.vec2, wp.vec4, wp.vec4), strict=True)]
+        whole = [grad.contiguous() for grad in grads[:3]]  # Kept by name: an array does not keep what it points at.
+        given = [array(grad, dtype) for grad, dtype in zip(whole, (wp.vec2, wp.vec4, wp.vec4), strict=True)]
         made = [torch.empty_like(tensor) for tensor in arrays[:5]]
         outputs = [array(tensor, dtype) for tensor, dtype in zip(made, GAUSSIANS[:5], strict=True)]
         arguments = [*_gaussians(arrays), *_plain(ctx.view), *given, *outputs]
@@ -130,7 +131,8 @@ class _BlendByWarp(Function):
         view, pairs = ctx.view, ctx.pairs
         means2d, shapes, looks, left, lasts = ctx.saved_tensors
         device = means2d.device
-        given = [array(g.contiguous(), t) for g, t in zip(grad_images, (wp.vec3, wp.float32, wp.float32), strict=True)]
+        whole = [grad.contiguous() for grad in grad_images]  # Kept by name: an array does not keep what it points at.
+        given = [array(grad, dtype) for grad, dtype in zip(whole, (wp.vec3, wp.float32, wp.float32), strict=True)]
         entries = torch.zeros(len(pairs.members), blending.ENTRY, device=device)
         kept = [array(left, wp.float32), array(lasts, wp.int32), *given, array(pairs.slots, wp.int64)]
         places = array(entries, blending.vec10)

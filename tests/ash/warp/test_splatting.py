@@ -34,7 +34,7 @@ from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted, splat, splat_by_warp, splat_naive
 from ash.model import views_of
 from ash.native.splatting import Viewport
-from ash.warp import blending, projecting, projecting_back, splatting
+from ash.warp import blending, projecting, projecting_back, rasterizing, splatting
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
 # Of float32: a splat larger than the image sums thousands of pixels in another order than the native kernels do.
@@ -79,6 +79,17 @@ def test_each_image_alone_has_its_gradient(output: str) -> None:
         (image * torch.linspace(0.1, 1, image.numel(), dtype=dtype).reshape(image.shape)).sum().backward()
         leaves = tensors_of(scene.gaussians)
         gradients.append({name: torch.zeros_like(t) if t.grad is None else t.grad for name, t in leaves.items()})
+    assert_same(*gradients, TOLERANCE)
+
+
+def test_a_gradient_that_is_one_number_everywhere_is_taken_as_it_is() -> None:
+    """A sum hands back a single number for all pixels, which is made an array before a kernel reads it."""
+    gradients = []
+    for drawer, dtype in ((splat_warp, torch.float32), (splat_naive, torch.float64)):
+        scene = cast(random_scene(count=60), dtype)
+        drawn = draw(drawer, scene)
+        (drawn.rgb.sum() + 0.5 * drawn.depth.sum() - 0.3 * drawn.alpha.sum() + drawn.means2d.sum()).backward()
+        gradients.append({name: tensor.grad for name, tensor in tensors_of(scene.gaussians).items()})
     assert_same(*gradients, TOLERANCE)
 
 
@@ -166,7 +177,9 @@ def test_gaussians_on_cuda_are_drawn_by_warp() -> None:
     assert not torch.equal(drawn.alpha, draw(splat, scene).alpha)  # The native kernels round otherwise.
 
 
-@pytest.mark.parametrize("module", [projecting, projecting_back, blending], ids=lambda module: module.__name__)
+@pytest.mark.parametrize(
+    "module", [projecting, projecting_back, blending, rasterizing], ids=lambda module: module.__name__
+)
 def test_the_kernels_compile_for_a_gpu(module: ModuleType, tmp_path: Path) -> None:
     """NVRTC comes with Warp and needs neither a driver nor a GPU; PTX for 7.5 runs on every later one."""
     (made,) = wp.compile_aot_module(module, arch=75, use_ptx=True, module_dir=tmp_path)
