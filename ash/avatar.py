@@ -1,6 +1,7 @@
 """ASH as a method of the suite: builds the model from a capture, warms it up, trains it, renders with it."""
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from ash.capture.dataset import Camera, Capture, Pose, fewer_views
 from ash.checkpoints import contiguous_state, load_module, read_safetensors
 from ash.config import AshConfig, ModelConfig, TrainingConfig
 from ash.decoders import Decoders
+from ash.devices import CPU, device_named, moved
 from ash.files import InputError, write_atomic
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.initialising import blank_gaussians, initial_gaussians, released_gaussians, texel_pitch
@@ -70,6 +72,10 @@ class AshAvatar:
         if isinstance(decoders, LocalBlendshapes):
             window, frames = config.model.window, capture.splits["train"].frames
             decoders.observe([normalised_motion(Pose(capture.motion, frame), window=window) for frame in frames])
+        self.device = device_named(config.device)
+        self.module.to(self.device)
+        self.template, self.lattice = self.module.template, self.module.lattice
+        self.analytic = self.analytic.to(self.device)
         self._conditions = Kept(self._make_conditions)  # A template that images do not move is frozen.
         self._motion = capture.motion
         self._outcome: TrainingOutcome | None = None
@@ -101,7 +107,7 @@ class AshAvatar:
 
     def fit(self, capture: Capture, *, folder: Path) -> None:
         """Warm up and train; see `ash.training.loop.fit`."""
-        images = load_training_images(_seen(capture, self.config.training))
+        images = load_training_images(_seen(capture, self.config.training), self.device)
         if self.choice is not None:
             write_choice(self.choice, folder / "log.jsonl")
         self._outcome = fit(
@@ -163,7 +169,7 @@ class AshAvatar:
     def _decode(self, conditions: Conditions) -> Tensor:
         """Stage 3 as it learns, in the precision of the configuration."""
         half = self.config.training.precision == "bfloat16"
-        with torch.autocast("cpu", torch.bfloat16, enabled=half):
+        with torch.autocast(self.device.type, torch.bfloat16) if half else nullcontext():
             return self.module.decode(conditions).float()
 
     def _conditions_of(self, frame: int) -> Conditions:
@@ -213,7 +219,7 @@ class AshAvatar:
         assert self.module.decoders is not None
         training = self.config.training
         optimiser = Adam([{"params": list(self.module.decoders.parameters()), "lr": training.learning_rate}])
-        weights = torch.ones(self.analytic.shape[1])
+        weights = self.analytic.new_ones(self.analytic.shape[1])
         weights[10] = opacity
         for step in range(training.warmup_steps):
             frame = frames[step % len(frames)]
@@ -230,7 +236,7 @@ class AshAvatar:
 
     def template_vertices(self, pose: Pose) -> np.ndarray:
         """The posed template, `[v, 3]` metres."""
-        return self.template.pose(pose).vertices.numpy()
+        return self.template.pose(pose).vertices.cpu().numpy()
 
     def outcome(self) -> TrainingOutcome | None:
         """How training ended; None before it did."""
@@ -247,8 +253,8 @@ class AshAvatar:
 
     @torch.no_grad()
     def gaussians(self, pose: Pose, *, clock: StageClock | None = None, decoders: Decode | None = None) -> Gaussians:
-        """The posed Gaussians: world, metres; by other `decoders` than the model's own where they are given."""
-        return self.module.gaussians(pose, clock, decoders=decoders)
+        """The posed Gaussians: world, metres, on the CPU; by other `decoders` than the model's own where given."""
+        return moved(self.module.gaussians(pose, clock, decoders=decoders), CPU)
 
     @property
     def dilation(self) -> float:

@@ -1,6 +1,7 @@
 """What defines a run of ASH: frozen dataclasses, checked when they are made. Presets are functions in `ash.presets`."""
 
 import math
+import re
 from dataclasses import dataclass
 
 from ash.files import InputError
@@ -10,6 +11,12 @@ def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
     """Refuse a value that is not among those that exist."""
     if value not in allowed:
         raise InputError(f"{name}: expected one of {', '.join(allowed)}, got {value!r}")
+
+
+def check_device(name: str) -> None:
+    """Refuse what names no device."""
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", name):
+        raise InputError(f"device: expected cpu, cuda or cuda:N, got {name!r}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -191,9 +198,11 @@ class AshConfig:
     template: TemplateConfig = TemplateConfig()
     search: bool = False  # choose the size of the decoders on a training sequence left out; not in the paper
     seed: int = 0
+    device: str = "cpu"  # or "cuda", "cuda:1": where it learns and draws; templates are learned on the CPU
 
     def __post_init__(self) -> None:
         """Refuse training that the model cannot take."""
+        check_device(self.device)
         if self.training.warmup == "static" and not self.model.base:
             raise InputError("warmup='static' trains the base alone and needs base=True")
         if self.training.warmup in ("analytic", "fitted") and not self.model.motion:

@@ -62,7 +62,7 @@ def _degree_of(count: int) -> int:
 def _sampling(degree: int) -> tuple[Tensor, Tensor]:
     """Directions on a Fibonacci sphere, and the matrix from values there to the coefficients of one degree."""
     count = 2 * (2 * degree + 1)
-    index = torch.arange(count, dtype=torch.float64) + 0.5
+    index = torch.arange(count, dtype=torch.float64, device="cpu") + 0.5
     z = 1 - 2 * index / count
     angle = index * torch.pi * (1 + 5**0.5)
     radius = (1 - z * z).sqrt()

@@ -1,7 +1,7 @@
 """The ASH avatar, in the paper's order: template, textures, decoders, skinning, splatting. START READING HERE."""
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ash.capture.dataset import Camera, Pose
 from ash.config import ModelConfig
+from ash.devices import MovingModule
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted, splat
 from ash.gaussians.texels import LIGHT_COEFFICIENTS, place, pose
@@ -23,7 +24,7 @@ from ash.textures import Conditions, TexelLattice, TextureDrawer, build_lattice
 Decode = Callable[[Conditions], Tensor]  # to raw parameters [n, o]
 
 
-class AshModel(nn.Module):
+class AshModel(MovingModule):
     """The learned part of ASH, and how the stages are joined. `base` and `light` are not in the paper."""
 
     def __init__(
@@ -62,24 +63,25 @@ class AshModel(nn.Module):
 
     def conditions(self, pose: Pose, clock: StageClock | None = None, threads: int = 1) -> Conditions:
         """Stg.1 and Stg.2: pose the template, and draw what the decoders see."""
-        with _stage(clock, "stg1"):
+        device = self.base.device
+        with stage(clock, "stg1", device):
             learns = self.refinement is not None and torch.is_grad_enabled()
             posed = self.template.pose_anew(pose) if learns else self.template.pose(pose)
-        with _stage(clock, "stg2"):
+        with stage(clock, "stg2", device):
             canonical, normals, transforms = place(self.lattice, posed, self.config.anchor, threads=threads)
             textures = self._textures(pose)
             return Conditions(
                 textures=textures,
                 trust=1.0 if self.textures is None else self.textures.trust(textures),
-                motion=normalised_motion(pose, window=self.config.window),
-                root_translation=torch.from_numpy(pose.dofs[:3]).float(),
+                motion=normalised_motion(pose, window=self.config.window).to(device),
+                root_translation=torch.from_numpy(pose.dofs[:3]).float().to(device),
                 canonical=canonical,
                 normals=normals,
                 transforms=transforms,
             )
 
     def _textures(self, pose: Pose) -> Float[Tensor, "c r r"]:
-        return torch.zeros(0, 1, 1) if self.textures is None else self.textures(self.template, pose)
+        return self.base.new_zeros(0, 1, 1) if self.textures is None else self.textures(self.template, pose)
 
     def decode(self, conditions: Conditions, *, decoders: Decode | None = None) -> Float[Tensor, "n o"]:
         """Stg.3: raw Gaussian parameters per texel; by other `decoders` than the model's own where they are given.
@@ -123,23 +125,23 @@ class AshModel(nn.Module):
     ) -> Splatted:
         """Motion and camera to image: the whole of ASH, over black, on as many threads as torch is given."""
         gaussians = self.gaussians(pose, clock, decoders=decoders)
-        with _stage(clock, "stg4"):
+        with stage(clock, "stg4", self.base.device):
             return self.draw(gaussians, [camera], None, torch.get_num_threads())
 
     def gaussians(self, pose: Pose, clock: StageClock | None = None, *, decoders: Decode | None = None) -> Gaussians:
         """Motion to posed Gaussians: everything that does not depend on the camera."""
         threads = torch.get_num_threads()
         conditions = self.conditions(pose, clock, threads)  # Stg.1, Stg.2
-        with _stage(clock, "stg3"):
+        with stage(clock, "stg3", self.base.device):
             raw = self.decode(conditions, decoders=decoders)
-        with _stage(clock, "stg4"):
+        with stage(clock, "stg4", self.base.device):
             return self.pose(raw, conditions, threads)
 
 
 def image_of(drawn: Splatted) -> np.ndarray:
     """The first view as a method returns it: premultiplied RGBA, float32 `[h, w, 4]`."""
     height, width = drawn.alpha.shape[1:]
-    image = torch.empty(height, width, 4)
+    image = torch.empty(height, width, 4, device="cpu")
     image[..., :3], image[..., 3] = drawn.rgb[0], drawn.alpha[0]
     return image.clamp_(0, 1).numpy()
 
@@ -154,5 +156,10 @@ def views_of(cameras: list[Camera]) -> dict[str, Any]:
     }
 
 
-def _stage(clock: StageClock | None, name: str) -> AbstractContextManager[None]:
-    return clock.stage(name) if clock is not None else nullcontext()
+@contextmanager
+def stage(clock: StageClock | None, name: str, device: torch.device) -> Iterator[None]:
+    """Time the body, to the end of what it queued on a GPU; without a clock nothing is timed or waited for."""
+    with clock.stage(name) if clock is not None else nullcontext():
+        yield
+        if clock is not None and device.type == "cuda":
+            torch.cuda.synchronize(device)

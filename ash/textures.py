@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ash.capture.dataset import Motion, Pose, TemplateMesh
+from ash.devices import MovingModule
 from ash.files import InputError
 from ash.mesh.rasterizing import rasterize_mesh
 from ash.rotations import (
@@ -100,8 +101,8 @@ def motion_aware_textures(
     Positions (metres) are relative to the root of the newest frame, so the textures do not change when the whole
     motion is moved; with `yaw_normalise` they do not change either when it is turned about the vertical axis.
     """
-    dofs = torch.from_numpy(pose.dofs).float()
-    root = dofs[:3] + torch.from_numpy(template.skeleton.heads[0]).float()
+    dofs = torch.from_numpy(pose.dofs).float().to(template.device)
+    root = dofs[:3] + torch.from_numpy(template.skeleton.heads[0]).float().to(template.device)
     posed = [template.pose(Pose(pose.motion, int(past))) for past in pose.window(window)]
     vectors = torch.stack([v for p in posed for v in (p.normals, p.vertices - root)], 1)
     # Interpolated first and turned then: a texture has fewer texels than the mesh has vertices.
@@ -134,7 +135,7 @@ def unsettled(textures: Float[Tensor, "c r r"], sigma: float, *, seed: int, step
     """Standardised textures with other noise in every step that learns: who sees it relies less on exact poses."""
     if sigma == 0 or not torch.is_grad_enabled():
         return textures
-    return textures + sigma * smooth_noise(textures.shape, (seed, 3, step))
+    return textures + sigma * smooth_noise(textures.shape, (seed, 3, step)).to(textures.device)
 
 
 def smooth_noise(shape: torch.Size, seed: tuple[int, ...]) -> Float[Tensor, "c h w"]:
@@ -144,7 +145,7 @@ def smooth_noise(shape: torch.Size, seed: tuple[int, ...]) -> Float[Tensor, "c h
     return nn.functional.interpolate(grid, size=shape[1:], mode="bilinear", align_corners=True)[0]
 
 
-class TextureDrawer(nn.Module):
+class TextureDrawer(MovingModule):
     """Stg.2 as a network sees it: the motion-aware textures of a frame, standardised if asked.
 
     What is standardised is a deviation from the mean training texture, in units of its channel's spread, at most three

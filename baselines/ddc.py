@@ -20,14 +20,16 @@ from torch import Tensor, nn
 import ash.native.shading
 from ash.capture.dataset import Camera, Capture, Pose, TemplateMesh
 from ash.checkpoints import contiguous_state, load_module, read_safetensors
-from ash.config import AshConfig, AtlasConfig, TemplateConfig, TrainingConfig, one_of
+from ash.config import AshConfig, AtlasConfig, TemplateConfig, TrainingConfig, check_device, one_of
 from ash.decoders import GLOBAL_FEATURES, GlobalFeatures, UNet
+from ash.devices import CPU, MovingModule, device_named, moved
 from ash.files import InputError, write_atomic
 from ash.gaussians.initialising import initial_texture
 from ash.gaussians.texels import LIGHT_COEFFICIENTS
 from ash.harmonics import sh_basis
 from ash.kept import Kept
 from ash.mesh.drawing import draw_mesh_views, textured, topology_of
+from ash.model import stage
 from ash.presets import Recipe, named
 from ash.protocol import Display, DressedMesh, StageClock, TrainingOutcome
 from ash.rotations import RigidTransforms
@@ -59,11 +61,13 @@ class DdcConfig:
     refine: str  # images move the vertices: "static", alike in all frames; "motion", as a frame moves, too; "none"
     vertices_every: int = 4  # steps, of which one has a gradient in the vertices: its pictures take thrice as long
     seed: int
+    device: str = "cpu"  # or "cuda", "cuda:1": where it learns and draws
 
     def __post_init__(self) -> None:
         """Refuse a texture that what is decoded cannot be shuffled up to."""
         if self.texture < 1 or self.texture % self.model.decoded_texels:
             raise InputError(f"texture: expected a multiple of {self.model.decoded_texels}, got {self.texture}")
+        check_device(self.device)
         one_of("refine", self.refine, ("none", "static", "motion"))
         if self.vertices_every < 1:
             raise InputError(f"vertices_every: expected at least 1, got {self.vertices_every}")
@@ -97,7 +101,7 @@ class MeshConditions:
     window: list[RigidTransforms]  # for the vertices' networks
 
 
-class DdcModel(nn.Module):
+class DdcModel(MovingModule):
     """A static texture plus a residual that is predicted from the motion-aware textures; moved vertices."""
 
     def __init__(
@@ -135,7 +139,7 @@ class DdcModel(nn.Module):
         return MeshConditions(
             textures=textures,
             trust=self.textures.trust(textures),
-            root_translation=torch.from_numpy(pose.dofs[:3]).float(),
+            root_translation=torch.from_numpy(pose.dofs[:3]).float().to(self.texture.device),
             window=self.refinement.window(pose) if isinstance(self.refinement, MotionRefinement) else [],
         )
 
@@ -205,7 +209,9 @@ class DdcAvatar:
             fade=config.model.fade,
         )
         textures.observe(self.template, capture.motion, capture.splits["train"].frames)
-        self.module = DdcModel(config, capture.template, self.template, textures, initial)
+        self.device = device_named(config.device)
+        self.module = DdcModel(config, capture.template, self.template, textures, initial).to(self.device)
+        self.template = self.module.template
         self._motion = capture.motion
         self._outcome: TrainingOutcome | None = None
         # The template is frozen: each training frame is posed once, as far as there is room.
@@ -229,7 +235,7 @@ class DdcAvatar:
 
     def fit(self, capture: Capture, *, folder: Path) -> None:
         """Train texture and network on the training images; see `ash.training.loop.fit`."""
-        images = load_training_images(capture)
+        images = load_training_images(capture, self.device)
         if self.choice is not None:
             write_choice(self.choice, folder / "log.jsonl")
         self._outcome = fit(self, images, self.config.training, seed=self.config.seed, folder=folder)
@@ -245,10 +251,8 @@ class DdcAvatar:
             static.append(module.refinement.shared.rough)
         elif module.refinement is not None:
             static.append(module.refinement.rough)
-        return [
-            {"params": nets, "lr": training.learning_rate},
-            {"params": static, "lr": training.base_learning_rate},
-        ]
+        groups = (nets, training.learning_rate), (static, training.base_learning_rate)
+        return [{"params": group, "lr": rate} for group, rate in groups]
 
     def draw_training_views(self, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
         """The texture of the frame, drawn into each camera; the static texture alone while the warm-up lasts."""
@@ -273,7 +277,7 @@ class DdcAvatar:
             self.module.static_texture.copy_(self.module.texture)
 
     def _drawn(self, texture: Tensor, posed: PosedTemplate, cameras: list[Camera], background: Tensor) -> Tensor:
-        flat = background if background.ndim == 1 else torch.zeros(3)
+        flat = background if background.ndim == 1 else background.new_zeros(3)
         drawn = self.module.draw(texture, posed, cameras, flat)
         return drawn[..., :3] if background.ndim == 1 else over(drawn[..., :3], drawn[..., 3], background)
 
@@ -296,8 +300,8 @@ class DdcAvatar:
     def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
         """Premultiplied RGBA, float32 `[h, w, 4]`."""
         posed, texture = self.dress(pose, clock)
-        with clock.stage("stg4"):
-            return self.module.draw(texture, posed, [camera], torch.zeros(3))[0].clamp(0, 1).numpy()
+        with stage(clock, "stg4", self.device):
+            return self.module.draw(texture, posed, [camera], texture.new_zeros(3))[0].clamp(0, 1).cpu().numpy()
 
     @torch.no_grad()
     def dress(self, pose: Pose, clock: StageClock) -> tuple[PosedTemplate, Float[Tensor, "3 t t"]]:
@@ -306,17 +310,17 @@ class DdcAvatar:
         Training may leave negative colours between texels; no display knows those, and held-out views are better
         without them.
         """
-        with clock.stage("stg1"):
+        with stage(clock, "stg1", self.device):
             posed = self.template.pose(pose)
-        with clock.stage("stg2"):
+        with stage(clock, "stg2", self.device):
             conditions = self.module.conditions(pose)
-        with clock.stage("stg3"):
+        with stage(clock, "stg3", self.device):
             return self.module.refined(posed, conditions), self.module.dynamic_texture(conditions).clamp(min=0)
 
     @torch.no_grad()
     def dressed_mesh(self, pose: Pose) -> DressedMesh:
         """The posed mesh with the texture of the frame, lit as at the texels' normals."""
-        posed, texture = self.dress(pose, StageClock())
+        posed, texture = moved(self.dress(pose, StageClock()), CPU)
         lit = texture * self._gain(posed)
         mesh = self.template.mesh
         return DressedMesh(
@@ -330,31 +334,28 @@ class DdcAvatar:
 
     def _gain(self, posed: PosedTemplate) -> Float[Tensor, "3 t t"]:
         """What the light multiplies every texel by; beside the charts, as at the nearest texel of one."""
-        light, size = self.module.light, self.config.texture
+        light, size = moved(self.module.light, CPU), self.config.texture
         if light is None:
             return torch.ones(3, size, size)
         lattice = build_lattice(self.template.mesh, size)
         normals = torch.nn.functional.normalize(lattice.interpolate(posed.normals), dim=-1)
-        covered = np.zeros(size * size, dtype=bool)
-        covered[lattice.texels.numpy()] = True
-        beside = ~covered.reshape(size, size)
+        beside = np.ones((size, size), dtype=bool)
+        beside.reshape(-1)[lattice.texels.numpy()] = False
         nearest = ndimage.distance_transform_edt(beside, return_distances=False, return_indices=True).astype(np.int64)
         gain = lattice.to_texture((sh_basis(normals, 2) @ light).exp())
         return gain[:, torch.from_numpy(nearest[0]), torch.from_numpy(nearest[1])]
 
     def open_display(self) -> Display:
         """OpenGL's picture of the avatar, as it would be shown."""
-        module = self.module
-        return MeshDisplay(
-            self.dress, faces=module.template.faces, uvs=module.uvs, uv_faces=module.uv_faces, light=module.light
-        )
+        m = self.module
+        return MeshDisplay(self.dress, faces=m.template.faces, uvs=m.uvs, uv_faces=m.uv_faces, light=m.light)
 
     def template_vertices(self, pose: Pose) -> np.ndarray:
         """The posed template, `[v, 3]` metres."""
         posed = self.template.pose(pose)
         if self.module.refinement is None:
-            return posed.vertices.numpy()
-        return self.module.refined(posed, self.module.conditions(pose)).vertices.detach().numpy()
+            return posed.vertices.cpu().numpy()
+        return self.module.refined(posed, self.module.conditions(pose)).vertices.detach().cpu().numpy()
 
     def outcome(self) -> TrainingOutcome | None:
         """How training ended; None before it did."""

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ash.capture.dataset import Camera, Pose
+from ash.devices import CPU, moved
 from ash.files import InputError
 from ash.harmonics import sh_basis
 from ash.mesh.drawing import SUPERSAMPLING
@@ -89,16 +90,16 @@ class MeshDisplay:
         Raises:
             InputError: there is no off-screen OpenGL here.
         """
-        self.dress, self.light = dress, light
+        self.dress, self.light = dress, moved(light, CPU)
         self.pyrender = pyrender_or_refuse()
         try:
             self.renderer = _one_sample_renderer(self.pyrender)
         except Exception as error:
             raise InputError(f"no off-screen OpenGL here ({type(error).__name__}: {error})") from error
         # OpenGL knows one UV per vertex: vertices at seams are listed once per UV.
-        pairs = torch.stack([faces.reshape(-1), uv_faces.reshape(-1)], 1)
+        pairs = torch.stack([faces.reshape(-1), uv_faces.reshape(-1)], 1).cpu()
         corners, index = torch.unique(pairs, dim=0, return_inverse=True)
-        self.vertex, self.uvs = corners[:, 0], uvs[corners[:, 1]].numpy()
+        self.vertex, self.uvs = corners[:, 0], uvs.cpu()[corners[:, 1]].numpy()
         self.faces = index.reshape(-1, 3).numpy()
 
     def close(self) -> None:
@@ -110,7 +111,7 @@ class MeshDisplay:
         """Premultiplied RGBA, float32 `[h, w, 4]`, as the avatar's own `render`."""
         posed, texture = self.dress(pose, clock)
         with clock.stage("stg4"):
-            return self._draw(posed, texture, camera)
+            return self._draw(*moved((posed, texture), CPU), camera)
 
     def _draw(self, posed: PosedTemplate, texture: Tensor, camera: Camera) -> Float[np.ndarray, "h w 4"]:
         # Texels are stored in eight bits between 0 and 1; what exceeds 1 is scaled down, and up again with the light.

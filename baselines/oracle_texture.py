@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from ash.capture.dataset import Camera, Capture, Pose
 from ash.config import TemplateConfig
+from ash.model import stage
 from ash.presets import Recipe, named
 from ash.protocol import StageClock
 from ash.template.template import PosedTemplate
@@ -43,7 +44,7 @@ class OracleTexture(DdcAvatar):
     @torch.no_grad()
     def dress(self, pose: Pose, clock: StageClock) -> tuple[PosedTemplate, Float[Tensor, "3 t t"]]:
         """The posed surface and the texture."""
-        with clock.stage("stg1"):
+        with stage(clock, "stg1", self.device):
             return self.template.pose(pose), self.module.texture.clamp(min=0)
 
 

@@ -19,7 +19,7 @@ PACKAGES = (
     "scikit-image",
     "flip-evaluator",
     "pandas",
-    "gsplat",
+    "warp-lang",
 )
 
 

@@ -61,15 +61,15 @@ def released_gaussians(
     """
     raw = torch.zeros_like(analytic)
     raw[:, 11:14] = analytic[:, 11:14]
-    points = conditions.transforms.apply(conditions.canonical).numpy()
-    near = torch.from_numpy(cKDTree(points).query(points, k=4)[0][:, 1:]).float()
+    points = conditions.transforms.apply(conditions.canonical).cpu().numpy()
+    near = torch.from_numpy(cKDTree(points).query(points, k=4)[0][:, 1:]).to(raw)
     raw[:, 3:6] = near.square().mean(1).sqrt().clamp(min=1e-4).log()[:, None]
     normals = conditions.normals
     if config.quat_frame == "canonical":
         normals = rotate(quat_conjugate(conditions.transforms.quats), normals)
     x, y, z = normals.unbind(1)
     turn = torch.stack([1 + x, torch.zeros_like(x), -z, y], 1)
-    half_turn = torch.tensor([0.0, 0.0, 0.0, 1.0])
+    half_turn = raw.new_tensor([0.0, 0.0, 0.0, 1.0])
     raw[:, 6:10] = torch.nn.functional.normalize(torch.where(turn.norm(dim=1, keepdim=True) < 1e-3, half_turn, turn))
     raw[:, 10] = _logit(0.1)
     return raw

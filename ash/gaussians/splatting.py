@@ -1,9 +1,10 @@
 """Stg. 4: Gaussians to images. `splat_naive` is the definition (ASH Eq. 1-3), `splat` the same function, fast.
 
-Kerbl et al.'s constants, here and in the native kernels: a splat's opacity at a pixel lies in [1/255, 0.99], smaller
-ones are skipped; a pixel is finished before the splat that would take its transmittance below 1e-4; 0.3 px^2 is added
-to both axes of every projected covariance (an argument: at 256x256 pixels 0.05 gains over a decibel). A splat reaches
-as far as its opacity exceeds 1/255: no fixed number of standard deviations. Equal depths are drawn as they come.
+Kerbl et al.'s constants, here and in the native and Warp kernels: a splat's opacity at a pixel lies in [1/255, 0.99],
+smaller ones are skipped; a pixel is finished before the splat that would take its transmittance below 1e-4; 0.3 px^2
+is added to both axes of every projected covariance (an argument: at 256x256 pixels 0.05 gains over a decibel). A splat
+reaches as far as its opacity exceeds 1/255: no fixed number of standard deviations. Equal depths are drawn as they
+come.
 """
 
 import math
@@ -290,11 +291,11 @@ def splat(
     near: float = 0.01,
     threads: int = 1,
 ) -> Splatted:
-    """Draw Gaussians in one or several cameras: `splat_naive` by native kernels on the CPU, by gsplat on CUDA.
+    """Draw Gaussians in one or several cameras: `splat_naive` by native kernels on the CPU, by Warp's on CUDA.
 
-    ASH Eq. 1-3. Differentiable in every Gaussian parameter and in `viewmats`; not in `Ks` and `background`. Float32
-    only. The same numbers come out for any number of threads. gsplat's own constants differ: it lets an opacity reach
-    0.999, stops at 1e-4 inclusive, and draws no splat beyond 3.33 standard deviations.
+    ASH Eq. 1-3. Differentiable in every Gaussian parameter; in `viewmats` on the CPU only; not in `Ks` and
+    `background`. Float32 only. The same numbers come out for any number of threads, and on a GPU every time. Both have
+    the constants of the definition. The Gaussians' device decides; cameras and background may lie on the CPU.
 
     Args:
         gaussians: in the world's frame.
@@ -318,63 +319,37 @@ def splat(
             raise InputError(f"{name}: splat has no gradient for it; splat_naive does")
     if background is not None and not bool(torch.isfinite(background).all()):
         raise InputError("background: expected finite numbers, got NaN or infinity")
-    if gaussians.means.is_cuda:
-        return _splat_gsplat(
-            gaussians,
-            viewmats=viewmats,
-            Ks=Ks,
-            width=width,
-            height=height,
-            background=background,
-            dilation=dilation,
-            compensate=compensate,
-            near=near,
-        )
     if threads < 1:
         raise InputError(f"threads: expected at least 1, got {threads}")
+    view = Viewport(width, height, int(compensate), dilation, near, threads)
+    if gaussians.means.is_cuda:
+        return splat_by_warp(gaussians, viewmats, Ks, view, background)
     tensors = {name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
     arrays = [float32_on_cpu(name, tensor) for name, tensor in (tensors | {"viewmats": viewmats, "Ks": Ks}).items()]
-    view = Viewport(width, height, int(compensate), dilation, near, threads)
     behind = [0.0, 0.0, 0.0] if background is None else background.tolist()
     rgb, alpha, depth, means2d = draw(view, behind, arrays)
     return Splatted(rgb=rgb, alpha=alpha, depth=depth, means2d=means2d)
 
 
-def _splat_gsplat(
+def splat_by_warp(
     gaussians: Gaussians,
-    *,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    background: Tensor | None,
-    dilation: float,
-    compensate: bool,
-    near: float,
+    viewmats: Float[Tensor, "c 4 4"],
+    Ks: Float[Tensor, "c 3 3"],
+    view: Viewport,
+    background: Float[Tensor, " 3"] | None,
 ) -> Splatted:
-    """The same call for gsplat, which is imported only here."""
-    check_gaussians(gaussians)
-    try:
-        from gsplat import rasterization
-    except ImportError as error:
-        raise InputError("means: on CUDA, where splatting needs the package gsplat (pip install gsplat)") from error
-    backgrounds = None if background is None else background.expand(len(viewmats), 3)
-    image, alpha, info = rasterization(
-        means=gaussians.means,
-        quats=gaussians.quats,
-        scales=gaussians.scales,
-        opacities=gaussians.opacities,
-        colors=gaussians.sh,
-        viewmats=viewmats,
-        Ks=Ks,
-        width=width,
-        height=height,
-        near_plane=near,
-        eps2d=dilation,
-        sh_degree=math.isqrt(gaussians.sh.shape[1]) - 1,
-        packed=False,
-        backgrounds=backgrounds,
-        render_mode="RGB+D",
-        rasterize_mode="antialiased" if compensate else "classic",
-    )
-    return Splatted(rgb=image[..., :3], alpha=alpha[..., 0], depth=image[..., 3], means2d=info["means2d"])
+    """What `splat` does on CUDA, on any device of Warp's: tests run it on the CPU."""
+    from ash.warp import splatting  # Warp takes a second to import.
+
+    if viewmats.requires_grad:
+        raise InputError("viewmats: splat has no gradient for it on CUDA; on the CPU it has")
+    device = gaussians.means.device
+    cameras = {"viewmats": viewmats.to(device), "Ks": Ks.to(device)}
+    tensors = {name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")} | cameras
+    for name, tensor in tensors.items():
+        if tensor.dtype != torch.float32 or tensor.device != device:
+            raise InputError(f"{name}: expected float32 on {device}, got {tensor.dtype} on {tensor.device}")
+    rgb, alpha, depth, means2d = splatting.draw(view, [tensor.contiguous() for tensor in tensors.values()])
+    if background is not None:
+        rgb = rgb + (1 - alpha)[..., None] * background.to(device)
+    return Splatted(rgb=rgb, alpha=alpha, depth=depth, means2d=means2d)

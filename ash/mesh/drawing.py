@@ -204,7 +204,8 @@ def _outlines(samples: Float[Tensor, "s d"], view: _MeshView, topology: Topology
     """
     corners, covered = view.corners, view.covered
     height, width = view.triangle.shape
-    row_of = torch.full((height * width,), len(covered)).index_put_((covered,), torch.arange(len(covered)))
+    row_of = torch.full_like(view.triangle.reshape(-1), len(covered))
+    row_of[covered] = torch.arange(len(covered), device=covered.device)
     screen = corners[:, :2] / corners[:, 2:]
     face, edge = _outline_edges(screen.detach(), topology).nonzero(as_tuple=True)
     ends = torch.stack([topology.faces[face, edge], topology.faces[face, (edge + 1) % 3]], 1)
@@ -247,8 +248,8 @@ def _crossings(
     first = (low - 0.5).ceil().long().clamp(min=0)
     last = ((high - 0.5).ceil().long() - 1).clamp(max=shape[still] - 1)
     count = (last - first + 1).clamp(min=0)
-    edge = torch.repeat_interleave(torch.arange(len(ends)), count)
-    line = first[edge] + torch.arange(len(edge)) - (count.cumsum(0) - count)[edge]
+    edge = torch.repeat_interleave(torch.arange(len(ends), device=ends.device), count)
+    line = first[edge] + torch.arange(len(edge), device=edge.device) - (count.cumsum(0) - count)[edge]
     p, q, r = screen[ends[edge, 0]], screen[ends[edge, 1]], screen.detach()[third[edge]]
     fraction = (line + 0.5 - p[:, still]) / (q[:, still] - p[:, still])
     at = p[:, across] + fraction * (q[:, across] - p[:, across])
@@ -275,7 +276,7 @@ def _visible(found: _Crossings, triangle: Int[Tensor, " s"], depth: Float[Tensor
     kept = kept[found.depth[kept].argsort(stable=True)]
     pair = found.inner[kept] * len(triangle) + found.outer[kept]
     order = pair.argsort(stable=True)
-    first = torch.ones(len(pair), dtype=torch.bool)
+    first = torch.ones(len(pair), dtype=torch.bool, device=pair.device)
     first[1:] = pair[order][1:] != pair[order][:-1]
     return kept[order[first]]
 
@@ -284,7 +285,7 @@ def _outline_edges(screen: Float[Tensor, "v 2"], topology: Topology) -> Bool[Ten
     """Edges beyond which the surface ends or turns away from the camera; of the two faces at an edge, one has it."""
     a, b, c = screen[topology.faces].unbind(1)
     turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0] > 0
-    other = topology.across > torch.arange(len(turn))[:, None]
+    other = topology.across > torch.arange(len(turn), device=turn.device)[:, None]
     return (topology.across < 0) | (other & (turn[topology.across] != turn[:, None]))
 
 

@@ -39,7 +39,7 @@ def rasterize_mesh(
     near: float = 0.01,
     threads: int = 1,
 ) -> Rasterized:
-    """The triangle nearest to the camera at every pixel's centre, whichever way it faces.
+    """The triangle nearest to the camera at every pixel's centre, whichever way it faces: by native kernels or Warp's.
 
     A pixel on an edge belongs to the triangle to whose left or top that edge is, so that a closed surface covers each
     pixel exactly once. Points with a depth below `near` are not seen, points beyond are, of one and the same triangle
@@ -47,7 +47,7 @@ def rasterize_mesh(
     numbers come out for any number of threads.
 
     Args:
-        vertices: homogeneous pixels, float32 or float64 on the CPU (see the top of this file).
+        vertices: homogeneous pixels, float32 or float64 (see the top of this file); on CUDA, Warp rasterises.
         faces: rows of `vertices`.
         width: pixels.
         height: pixels.
@@ -60,9 +60,11 @@ def rasterize_mesh(
     _check_mesh(vertices, faces, width=width, height=height, near=near)
     if threads < 1:
         raise InputError(f"threads: expected at least 1, got {threads}")
-    triangle = torch.empty(height, width, dtype=torch.int32)
-    barycentric, depth = torch.empty(height, width, 3), torch.empty(height, width)
     corners, rows = vertices.detach().double().contiguous(), faces.to(torch.int32).contiguous()
+    if vertices.is_cuda:
+        return rasterize_by_warp(corners, rows, width=width, height=height, near=near)
+    triangle = torch.empty(height, width, dtype=torch.int32, device="cpu")
+    barycentric, depth = (torch.empty(height, width, *rest, device="cpu") for rest in ((3,), ()))
     check_memory(
         load().ash_rasterize(
             address(corners),
@@ -75,6 +77,16 @@ def rasterize_mesh(
             *map(address, (triangle, barycentric, depth)),
         )
     )
+    return Rasterized(triangle=triangle, barycentric=barycentric, depth=depth)
+
+
+def rasterize_by_warp(
+    corners: Float[Tensor, "v 3"], rows: Int[Tensor, "f 3"], *, width: int, height: int, near: float
+) -> Rasterized:
+    """What `rasterize_mesh` does on CUDA, on any device of Warp's: tests run it on the CPU."""
+    from ash.warp.rasterizing import rasterize  # Warp takes a second to import.
+
+    triangle, barycentric, depth = rasterize(corners, rows, width=width, height=height, near=near)
     return Rasterized(triangle=triangle, barycentric=barycentric, depth=depth)
 
 

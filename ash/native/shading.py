@@ -56,7 +56,7 @@ class _Shade(Function):
             sums,
             address(grad_weights),
         )
-        grad_light = None if light is None else torch.tensor(list(sums), dtype=torch.float32).reshape(9, 3)
+        grad_light = None if light is None else light.new_tensor(list(sums)).reshape(9, 3)
         return grad_texture, grad_light, grad_weights, None, None
 
 
@@ -90,7 +90,7 @@ class _CornerWeights(Function):
         ctx.width = width
         tensors = corners.contiguous(), faces.contiguous(), triangles, samples
         ctx.save_for_backward(*tensors)
-        weights = torch.empty(len(samples), 3)
+        weights = torch.empty(len(samples), 3, device="cpu")
         load().ash_corner_weights(*map(address, tensors), len(samples), width, address(weights))
         return weights
 
@@ -116,7 +116,7 @@ class _Resolve(Function):
     def forward(
         ctx: Any, colours: Tensor, covered: Tensor, background: Tensor, width: int, height: int, factor: int
     ) -> Tensor:
-        image = torch.empty(height, width, 4)
+        image = torch.empty(height, width, 4, device="cpu")
         colours, background = colours.contiguous(), background.contiguous()
         inputs = address(colours), address(covered), len(covered)
         load().ash_resolve(*inputs, width, height, factor, address(background), address(image))
@@ -128,7 +128,7 @@ class _Resolve(Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         (covered,) = ctx.saved_tensors
-        colours = torch.empty(len(covered), 3)
+        colours = torch.empty(len(covered), 3, device="cpu")
         grad = grad.contiguous()
         inputs = address(grad), address(covered), len(covered)
         load().ash_resolve_backward(*inputs, *ctx.numbers, address(colours))
@@ -154,6 +154,6 @@ class _AddShuffled(Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         channels, height, width, factor = ctx.numbers
         grad = grad.contiguous()
-        pixels = torch.empty(height, width, channels * factor**2)
+        pixels = torch.empty(height, width, channels * factor**2, device="cpu")
         load().ash_shuffle(address(grad), None, *ctx.numbers, 1, address(pixels))
         return grad, pixels.permute(2, 0, 1), None

@@ -18,7 +18,7 @@ def skin_vertices(joints: Tensor, skin: Tensor, weights: Tensor) -> tuple[Tensor
     """Quaternions `[v, 4]` and translations `[v, 3]` from joints' dual quaternions `[j, 8]`, int64 `skin` `[v, k]`."""
     inputs = joints.contiguous(), skin.contiguous(), weights.contiguous()
     count, influences = skin.shape
-    skinned = torch.empty(count, 4), torch.empty(count, 3)
+    skinned = torch.empty(count, 4, device="cpu"), torch.empty(count, 3, device="cpu")
     load().ash_skin_vertices(*map(address, inputs), count, influences, torch.get_num_threads(), *map(address, skinned))
     return skinned
 
@@ -26,6 +26,6 @@ def skin_vertices(joints: Tensor, skin: Tensor, weights: Tensor) -> tuple[Tensor
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     """Unit normals `[v, 3]`; int64 `faces` `[f, 3]`."""
     inputs = vertices.contiguous(), faces.contiguous()
-    normals = torch.empty(len(vertices), 3)
+    normals = torch.empty(len(vertices), 3, device="cpu")
     load().ash_vertex_normals(*map(address, inputs), len(vertices), len(faces), address(normals))
     return normals

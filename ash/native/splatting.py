@@ -34,7 +34,7 @@ def draw(view: Viewport, background: list[float], arrays: list[Tensor]) -> tuple
     return rgb, alpha, depth, means2d
 
 
-_FAULTS = {  # `Fault` in native/kernels.h
+FAULTS = {  # `Fault` in native/kernels.h
     1: "means: expected finite numbers, got NaN or infinity",
     2: "quats: expected finite numbers, got NaN or infinity",
     3: "quats: expected quaternions that are not zero, got a zero quaternion",
@@ -51,13 +51,13 @@ class _Project(Function):
     def forward(ctx: Any, view: Viewport, *arrays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         means, sh, viewmats = arrays[0], arrays[4], arrays[5]
         count, cameras, coefficients = len(means), len(viewmats), sh.shape[1]
-        means2d = torch.empty(cameras, count, 2)
-        packed = torch.empty(cameras, count, 8)
-        depths = torch.empty(cameras, count, dtype=torch.float64)
+        means2d = torch.empty(cameras, count, 2, device="cpu")
+        packed = torch.empty(cameras, count, 8, device="cpu")
+        depths = torch.empty(cameras, count, dtype=torch.float64, device="cpu")
         ctx.sizes = (count, cameras, coefficients, *view)
         fault = load().ash_project(*map(address, arrays), *ctx.sizes, *map(address, (means2d, packed, depths)))
         if fault:
-            raise InputError(f"{_FAULTS[fault % 16]} at Gaussian {fault // 16}")
+            raise InputError(f"{FAULTS[fault % 16]} at Gaussian {fault // 16}")
         ctx.save_for_backward(*arrays, packed)
         ctx.mark_non_differentiable(depths)
         return means2d, packed, depths
@@ -69,7 +69,7 @@ class _Project(Function):
         grads = [torch.empty_like(array) for array in arrays[:5]]
         cameras = len(arrays[5])
         inputs = (packed, grad_means2d.contiguous(), grad_packed.contiguous())
-        flat = torch.empty(cameras, 12, dtype=torch.float64) if ctx.needs_input_grad[6] else None
+        flat = torch.empty(cameras, 12, dtype=torch.float64, device="cpu") if ctx.needs_input_grad[6] else None
         check_memory(
             load().ash_project_backward(
                 *map(address, arrays), *ctx.sizes, *map(address, inputs), *map(address, grads), address(flat)
@@ -99,7 +99,7 @@ class _Blend(Function):
         ctx: Any, view: Viewport, background: list[float], means2d: Tensor, packed: Tensor, depths: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         cameras, count = depths.shape
-        images = [torch.empty(cameras, view.height, view.width, *rest) for rest in ((3,), (), ())]
+        images = [torch.empty(cameras, view.height, view.width, *rest, device="cpu") for rest in ((3,), (), ())]
         handle = load().ash_blend(
             *map(address, (means2d, packed, depths)),
             count,

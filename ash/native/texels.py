@@ -29,7 +29,8 @@ def place_texels(
     `vertices` `[v, VERTEX]` and `barycentric` `[n, 3]` are float32, `corners` `[n, 3]` int32, all contiguous.
     """
     count = len(corners)
-    placed = torch.empty(count, 4), torch.empty(count, 3), torch.empty(count, 3), torch.empty(count, 3)
+    quats, *points = (torch.empty(count, width, device="cpu") for width in (4, 3, 3, 3))
+    placed = quats, points[0], points[1], points[2]
     load().ash_place_texels(*map(address, (vertices, corners, barycentric)), count, threads, *map(address, placed))
     return placed
 
@@ -50,7 +51,7 @@ class _Pose(Function):
     def forward(ctx: Any, options: PoseOptions, raw: Tensor, light: Tensor | None, *surface: Tensor) -> Any:
         count, coefficients = len(raw), (raw.shape[1] - 11) // 3
         shapes = (3,), (4,), (3,), (), (coefficients, 3)
-        posed = tuple(torch.empty(count, *shape) for shape in shapes)
+        posed = tuple(torch.empty(count, *shape, device="cpu") for shape in shapes)
         canonical, normals, turns, translations = surface
         inputs = (raw, canonical, normals, turns, translations, light)
         load().ash_pose(*map(address, inputs), count, coefficients, *options, *map(address, posed))
@@ -76,5 +77,5 @@ class _Pose(Function):
                 sums,
             )
         )
-        grad_light = None if light is None else torch.tensor(list(sums), dtype=torch.float32).reshape(9, 3)
+        grad_light = None if light is None else light.new_tensor(list(sums)).reshape(9, 3)
         return None, grad_raw, grad_light, None, None, None, None

@@ -84,7 +84,7 @@ class _UNet(Function):
         laid = [_laid_out(tensor) for tensor in weights]
         features = None if features is None else features.contiguous()
         whole = (shape.height, shape.width, shape.outputs)
-        out = torch.empty(whole if picks is None else (len(picks.places), picks.width))
+        out = torch.empty(whole if picks is None else (len(picks.places), picks.width), device="cpu")
         handle = load().ash_unet(
             (c_int * len(shape))(*shape),
             texture.data_ptr(),
@@ -105,7 +105,7 @@ class _UNet(Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         weights = list(ctx.saved_tensors)
         grads = [torch.empty_like(tensor) for tensor in weights]
-        features = torch.empty(ctx.shape.features) if ctx.shape.features else None
+        features = torch.empty(ctx.shape.features, device="cpu") if ctx.shape.features else None
         outer = (grad if ctx.picks is not None else grad.permute(1, 2, 0)).contiguous()
         check_memory(
             load().ash_unet_backward(

@@ -1,5 +1,6 @@
 """The embedded graph of Stg.1, and how it deforms the template (ASH appendix, Eq. 10; Sumner et al. 2007)."""
 
+import copy
 import warnings
 from dataclasses import dataclass
 from typing import Any
@@ -101,6 +102,12 @@ class NeighbourMean:
 
     def __init__(self, operator: scipy.sparse.csr_matrix) -> None:
         self.operator, self.transposed = _to_torch(operator), _to_torch(operator.T.tocsr())
+
+    def to(self, device: torch.device) -> "NeighbourMean":
+        """The same on a device."""
+        other = copy.copy(self)
+        other.operator, other.transposed = self.operator.to(device), self.transposed.to(device)
+        return other
 
     def __call__(self, x: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
         """Rows of the neighbours' means."""

@@ -12,6 +12,7 @@ from torch import Tensor
 
 import ash.native.skinning
 from ash.capture.dataset import Capture, Motion, Pose, Skeleton, TemplateMesh, require_pose
+from ash.devices import moved
 from ash.files import InputError
 from ash.rotations import RigidTransforms
 from ash.template.graph import EmbeddedGraph
@@ -43,6 +44,12 @@ class RestDeformation:
     def __init__(self, mesh: TemplateMesh) -> None:
         self.rest = torch.from_numpy(mesh.vertices).float()
 
+    def to(self, device: torch.device) -> "RestDeformation":
+        """The same on a device."""
+        other = copy.copy(self)
+        other.rest = self.rest.to(device)
+        return other
+
     def canonical(self, pose: Pose, transforms: RigidTransforms) -> Float[Tensor, "v 3"]:
         """The rest vertices."""
         return self.rest
@@ -54,6 +61,12 @@ class KnownDeformation:
     def __init__(self, motion: Motion, posed: Float[np.ndarray, "t v 3"]) -> None:
         self.motion = motion
         self.posed = torch.from_numpy(posed).float()
+
+    def to(self, device: torch.device) -> "KnownDeformation":
+        """The same on a device."""
+        other = copy.copy(self)
+        other.posed = self.posed.to(device)
+        return other
 
     def canonical(self, pose: Pose, transforms: RigidTransforms) -> Float[Tensor, "v 3"]:
         """Inverse skinning of the known posed vertices.
@@ -98,10 +111,16 @@ class PerturbedDeformation:
         lag = abs(planted.lag)
         self.memory = 1 + (int(np.ceil(np.log(self.FORGOTTEN) / np.log(lag))) if lag > self.FORGOTTEN else 0)
 
+    def to(self, device: torch.device) -> "PerturbedDeformation":
+        """The same on a device."""
+        other = copy.copy(self)
+        other.inner = moved(self.inner, device)
+        return other
+
     def canonical(self, pose: Pose, transforms: RigidTransforms) -> Float[Tensor, "v 3"]:
         """The inner deformation's vertices, off by the planted error."""
         error = self.error(pose.frame, int(pose.motion.sequence[pose.frame]))
-        return self.inner.canonical(pose, transforms) + torch.from_numpy(error).float()
+        return self.inner.canonical(pose, transforms) + torch.from_numpy(error).float().to(transforms.quats.device)
 
     def error(self, frame: int, sequence: int = 0) -> Float[np.ndarray, "v 3"]:
         """The error of a frame, metres, canonical. The two parts are orthogonal, so that their squares add up."""
@@ -170,6 +189,18 @@ class Template:
         """Keep nothing of what was posed: the deformation has changed."""
         self._kept.clear()
 
+    @property
+    def device(self) -> torch.device:
+        """Where it is posed."""
+        return self.faces.device
+
+    def to(self, device: torch.device) -> "Template":
+        """The same on a device."""
+        other = self.deformed_by(moved(self.deformation, device))
+        other.faces, other.skin = moved((self.faces, self.skin), device)
+        other.links = moved(self.links, device)
+        return other
+
     def deformed_by(self, deformation: Deformation) -> "Template":
         """The same mesh and skinning with another deformation."""
         other = copy.copy(self)
@@ -178,10 +209,10 @@ class Template:
 
     def pose_anew(self, pose: Pose) -> PosedTemplate:
         """The template in one frame, differentiable in what its deformation learns."""
-        dofs = torch.from_numpy(pose.dofs)
+        dofs = torch.from_numpy(pose.dofs)  # Joints are too few for a GPU.
         joints = forward_kinematics(self.skeleton, dofs)
         joints = RigidTransforms(quats=joints.quats.float(), translations=joints.translations.float())
-        transforms = dual_quaternion_skinning(joints, self.skin)
+        transforms = dual_quaternion_skinning(moved(joints, self.device), self.skin)
         if self.links is not None:
             transforms = dual_quaternion_skinning(transforms, self.links)
         canonical = self.deformation.canonical(pose, transforms)

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from ash.capture.dataset import Pose, Skeleton, TemplateMesh
 from ash.config import TemplateConfig
+from ash.devices import MovingModule
 from ash.rotations import RigidTransforms
 from ash.template.graph import build_graph
 from ash.template.motion import normalised_motion
@@ -17,7 +18,7 @@ from ash.template.skinning import near_joints
 NEIGHBOUR_JOINT = 0.5  # How far a node feels a joint's neighbours in the skeleton, against the joint itself.
 
 
-class LinearDeformation(nn.Module):
+class LinearDeformation(MovingModule):
     """Eq. 10 with a linear map per node: T_j from the pose of the joints near node j, A_j = 0, D_i the same always.
 
     A node sees the degrees of freedom of the motion window weighed by `reach`: the skinning weight of a joint at the
@@ -39,7 +40,7 @@ class LinearDeformation(nn.Module):
 
     def window(self, pose: Pose) -> Float[Tensor, " f"]:
         """The normalised motion window, in a row: it does not say where the root is or heads."""
-        return normalised_motion(pose, window=self.config.window).flatten()
+        return normalised_motion(pose, window=self.config.window).flatten().to(self.rest.device)
 
     def shift(self, pose: Pose) -> Float[Tensor, "v 3"]:
         """Canonical vertices less those at rest, metres; differentiable in what is learned."""

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from ash.capture.dataset import Pose, Skeleton, TemplateMesh
 from ash.config import TemplateConfig
+from ash.devices import MovingModule, moved
 from ash.rotations import RigidTransforms, quat_multiply, root_yaw, rotate, rotvec_to_unitquat
 from ash.template.graph import EmbeddedGraph, NeighbourMean, build_graph, embedded_deformation
 from ash.template.skinning import SkinWeights, dual_quaternion_skinning, forward_kinematics, sparse_skin_weights
@@ -77,7 +78,7 @@ class GraphNet(nn.Module):
         return self.head(x)
 
 
-class GraphDeformation(nn.Module):
+class GraphDeformation(MovingModule):
     """Motion window -> embedded graph (angles, translations) and displacements -> canonical vertices (Eq. 10).
 
     Both networks also see the rest positions: shared weights must know where a node is. `static` is what all frames
@@ -117,21 +118,17 @@ class GraphDeformation(nn.Module):
         """Per-vertex skinning of the window's frames, newest first, seen from the newest frame's root and heading."""
         now = torch.from_numpy(pose.dofs)
         origin = now[:3] + torch.from_numpy(self.skeleton.heads[0])
-        zero = torch.zeros((), dtype=torch.float64)
+        zero = now.new_zeros(())
         unturn = rotvec_to_unitquat(torch.stack([zero, -root_yaw(now), zero]))
         window = []
         for past in pose.window(self.config.window):
             joints = forward_kinematics(self.skeleton, torch.from_numpy(pose.motion.dofs[past]))
             turn = unturn.expand(len(joints.quats), 4)
-            window.append(
-                dual_quaternion_skinning(
-                    RigidTransforms(
-                        quats=quat_multiply(turn, joints.quats).float(),
-                        translations=rotate(turn, joints.translations - origin).float(),
-                    ),
-                    self.skin,
-                )
+            seen = RigidTransforms(
+                quats=quat_multiply(turn, joints.quats).float(),
+                translations=rotate(turn, joints.translations - origin).float(),
             )
+            window.append(dual_quaternion_skinning(moved(seen, self.rest.device), self.skin))
         return window
 
     @torch.no_grad()

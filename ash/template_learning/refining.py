@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from ash.capture.dataset import Pose, Skeleton, TemplateMesh
 from ash.config import TemplateConfig
+from ash.devices import MovingModule, moved
 from ash.rotations import RigidTransforms
 from ash.template.graph import vertex_neighbours
 from ash.template.template import Deformation, Template
@@ -19,7 +20,7 @@ UNIT_M = 0.004  # Of what is learned: Adam's step of 0.02 is then a twelfth of a
 SWEEPS = 4  # Of smoothing over neighbours: a vertex is pulled by the pixels around it, not by a handful of its own.
 
 
-class Refinement(nn.Module):
+class Refinement(MovingModule):
     """A displacement of every canonical vertex, the same in all frames, that an avatar learns with the rest of it."""
 
     def __init__(self, mesh: TemplateMesh) -> None:
@@ -57,6 +58,10 @@ class RefinedDeformation:
 
     def __init__(self, inner: Deformation, refinement: MotionRefinement) -> None:
         self.inner, self.refinement = inner, refinement
+
+    def to(self, device: torch.device) -> "RefinedDeformation":
+        """The same on a device; the networks themselves are moved, because the avatar trains them."""
+        return RefinedDeformation(moved(self.inner, device), self.refinement.to(device))
 
     def canonical(self, pose: Pose, transforms: RigidTransforms) -> Float[Tensor, "v 3"]:
         """Differentiable in the refinement; the inner deformation is frozen."""

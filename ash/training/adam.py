@@ -57,7 +57,7 @@ class Adam:
             if known is None or not known.are_of(parameters, moments):
                 known = self._addresses[first] = _Addresses(parameters, moments)
             return _move_native(known, lr, self.eps)
-        finite = all(bool(torch.isfinite(parameter.grad).all()) for parameter in parameters)  # type: ignore[arg-type]
+        finite = _all_finite([parameter.grad for parameter in parameters if parameter.grad is not None])
         _move_by_torch(parameters, moments, lr, self.eps)
         return finite
 
@@ -72,6 +72,11 @@ class Adam:
         """Moments before the first step, in memory as the parameter lies: the kernel walks memory."""
         step = torch.zeros((), dtype=torch.float32, device=parameter.device)
         return {"step": step, "exp_avg": torch.zeros_like(parameter), "exp_avg_sq": torch.zeros_like(parameter)}
+
+
+def _all_finite(gradients: list[Tensor]) -> bool:
+    """Whether no number is NaN or infinite: one look for all, because a GPU's answer is waited for."""
+    return bool(torch.stack([torch.isfinite(gradient).all() for gradient in gradients]).all())
 
 
 def _move_by_torch(parameters: list[Tensor], moments: list[Moments], lr: float, eps: float) -> None:

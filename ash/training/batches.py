@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ash.capture.dataset import Camera, Capture
 from ash.config import TrainingConfig
+from ash.devices import CPU
 from ash.files import InputError
 from ash.kept import Kept
 from ash.native.library import address, float32_on_cpu, load
@@ -29,6 +30,7 @@ class TrainingImages:
     cameras: dict[str, Camera]
     frames: tuple[int, ...]
     reserved: tuple[tuple[str, int], ...] = ()  # views that no batch holds
+    device: torch.device = CPU  # where batches are made; the images stay in the processor's memory
     plates: dict[str, UInt8[np.ndarray, "h w 3"]] = field(default_factory=dict)  # the empty studio, where it is known
 
 
@@ -43,8 +45,8 @@ class Batch:
     background: Float[Tensor, " 3"] | Float[Tensor, "c h w 3"]  # a colour, or one for every pixel
 
 
-def load_training_images(capture: Capture) -> TrainingImages:
-    """Look at every training image once, and keep those for which there is room.
+def load_training_images(capture: Capture, device: torch.device = CPU) -> TrainingImages:
+    """Look at every training image once, and keep those for which there is room; batches go to the device.
 
     Raises:
         InputError: an image is damaged, or shows nobody.
@@ -65,6 +67,7 @@ def load_training_images(capture: Capture) -> TrainingImages:
         frames=tuple(train.frames),
         reserved=reserved_views(tuple(train.cameras), tuple(train.frames)),
         plates={name: plate for name in train.cameras if (plate := capture.plate(name)) is not None},
+        device=device,
     )
 
 
@@ -112,7 +115,7 @@ def in_studio(batch: Batch, images: TrainingImages) -> Batch:
         whole = images.cameras[camera.name]
         left, top = np.round(whole.K[:2, 2] - camera.K[:2, 2]).astype(int)
         plate = images.plates[camera.name][top : top + camera.height, left : left + camera.width]
-        seen = torch.from_numpy(np.ascontiguousarray(plate)).float() / 255
+        seen = torch.from_numpy(np.ascontiguousarray(plate)).to(images.device).float() / 255
         behind[view] = torch.where(mask[..., None] > 0, seen, batch.background)
     share = 1 - batch.foreground[..., None]
     return replace(batch, targets=batch.targets + share * (behind - batch.background), background=behind)
@@ -129,6 +132,7 @@ def cut_batch(images: TrainingImages, frame: int, names: list[str], background: 
     full = images.cameras[names[0]]
     width = min(full.width, max(x1 - x0 for x0, _, x1, _ in boxes) + 2 * CROP_MARGIN)
     height = min(full.height, max(y1 - y0 for _, y0, _, y1 in boxes) + 2 * CROP_MARGIN)
+    background = background.to(images.device)
     cameras, targets, masks = [], [], []
     for name, (x0, y0, x1, y1) in zip(names, boxes, strict=True):
         left = min(max(0, (x0 + x1 - width) // 2), full.width - width)
@@ -148,16 +152,24 @@ def cut_batch(images: TrainingImages, frame: int, names: list[str], background: 
 
 
 def composite_naive(rgba: UInt8[np.ndarray, "h w 4"], background: Float[Tensor, " 3"]) -> tuple[Tensor, Tensor]:
-    """Straight RGBA over a background, `[h, w, 3]`, and its alpha, `[h, w]`, both in 0..1: the definition."""
-    image = torch.from_numpy(rgba).float() / 255
+    """Straight RGBA over a background, `[h, w, 3]`, and its alpha, `[h, w]`, both in 0..1: the definition.
+
+    It is composited where the background lies; the bytes are moved there.
+    """
+    image = torch.from_numpy(rgba).to(background.device).float() / 255
     return image[..., :3] * image[..., 3:] + (1 - image[..., 3:]) * background, image[..., 3]
 
 
 def composite(rgba: UInt8[np.ndarray, "h w 4"], background: Float[Tensor, " 3"]) -> tuple[Tensor, Tensor]:
-    """`composite_naive` in one native pass over the window, whose pixels must lie side by side in their rows."""
+    """`composite_naive` in one native pass over the window, whose pixels must lie side by side in their rows.
+
+    On other devices than the CPU the definition itself runs.
+    """
+    if background.device.type != "cpu":
+        return composite_naive(rgba, background)
     height, width = rgba.shape[:2]
     assert rgba.strides[1:] == (4, 1)
-    rgb, alpha = torch.empty(height, width, 3), torch.empty(height, width)
+    rgb, alpha = torch.empty(height, width, 3, device="cpu"), torch.empty(height, width, device="cpu")
     outputs = address(float32_on_cpu("background", background)), address(rgb), address(alpha)
     load().ash_composite(rgba.ctypes.data, rgba.strides[0], width, height, *outputs)
     return rgb, alpha

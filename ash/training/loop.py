@@ -229,7 +229,7 @@ class _Run:
         """Foreground PSNR of the training views that no step sees, in dB."""
         errors = []
         for name, frame in self.images.reserved:
-            view = cut_batch(self.images, frame, [name], torch.zeros(3))
+            view = cut_batch(self.images, frame, [name], torch.zeros(3, device="cpu"))
             try:
                 drawn = self.learner.draw_training_views(frame, view.cameras, view.background, self.step)
             except FloatingPointError:

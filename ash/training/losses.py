@@ -100,15 +100,15 @@ def l1_ssim_loss(
 ) -> Float[Tensor, ""]:
     """`l1_ssim_loss_naive` in one fused native pass with the analytic gradient; float32 on the CPU.
 
-    On CUDA the definition itself runs. Differentiable in `image`; the gradient of |x| at 0 is 0. The same numbers come
-    out for any number of threads.
+    Elsewhere the definition itself runs. Differentiable in `image`; the gradient of |x| at 0 is 0. The same numbers
+    come out for any number of threads.
 
     Raises:
-        InputError: shapes differ, or the image is neither float32 nor on CUDA. NaN in the image gives a NaN loss.
+        InputError: shapes differ, or the image is on the CPU and not float32. NaN in the image gives a NaN loss.
     """
     if image.shape != target.image.shape:
         raise InputError(f"image: expected the target's shape {tuple(target.image.shape)}, got {tuple(image.shape)}")
-    if image.is_cuda:
+    if image.device.type != "cpu":
         return l1_ssim_loss_naive(image, target, l1_weight=l1_weight, ssim_weight=ssim_weight)
     if threads < 1:
         raise InputError(f"threads: expected at least 1, got {threads}")
@@ -139,7 +139,7 @@ class _L1Ssim(Function):
         )
         ctx.grad = grad
         l1, ssim = (total / target.weight_sum for total in sums)
-        return torch.tensor(l1_weight * l1 + ssim_weight * (1 - ssim), dtype=image.dtype)
+        return torch.tensor(l1_weight * l1 + ssim_weight * (1 - ssim), dtype=image.dtype, device="cpu")
 
     @staticmethod
     @once_differentiable

@@ -131,7 +131,7 @@ def evaluate_cell(cell: Cell) -> CellResult:
 
 @contextmanager
 def load_avatar(cell: Cell, capture: Capture, *, trust: bool = False) -> Iterator[tuple[Avatar, Capture]]:
-    """A cell's trained avatar in this process, and the capture as it sees it; both hold as long as the body runs.
+    """A cell's trained avatar in this process, on the CPU, and the capture as it sees it, as long as the body runs.
 
     Code that is loaded here can do what the user can: a method of others is refused unless it is trusted.
 
@@ -147,7 +147,7 @@ def load_avatar(cell: Cell, capture: Capture, *, trust: bool = False) -> Iterato
     factory = method.load()
     with _seen(cell, capture) as seen:
         with watched(capture, seen):
-            avatar = _make(cell.config, seen, factory)
+            avatar = _make(_on_the_processor(cell.config) if method.is_ours else cell.config, seen, factory)
             avatar.load(cell.folder / CHECKPOINT)
         yield avatar, seen
 
@@ -232,6 +232,11 @@ def _has_left(cell: Cell) -> bool:
     """Whether an earlier attempt left something that training takes up."""
     work = cell.folder / WORK
     return work.is_dir() and any(work.iterdir())
+
+
+def _on_the_processor(config: CellConfig) -> CellConfig:
+    """The same avatar wherever it was trained: who looks at one needs no GPU."""
+    return replace(config, changes={key: value for key, value in config.changes.items() if key != "device"})
 
 
 def _make(config: CellConfig, capture: Capture, factory: Callable[..., Avatar]) -> Avatar:

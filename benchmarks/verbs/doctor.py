@@ -80,15 +80,16 @@ def _gpu() -> Finding:
             found="none",
             consequence="everything runs on the processor; absolute ms are not comparable with the paper's",
         )
-    import torch
+    from ash.devices import obstacle
 
-    if not torch.cuda.is_available():
+    if why := obstacle():
         return Finding(
             what="GPU",
-            found=f"{name}, but torch {torch.__version__} cannot use it",
-            consequence="install a CUDA build of torch to use it",
+            found=f"{name}, but {why}",
+            consequence="everything runs on the processor (--device cuda is refused)",
         )
-    return Finding(what="GPU", found=name, consequence="the paper's preset and absolute frame times are possible")
+    consequence = "--device cuda learns and draws there; how fast was not measured: no GPU was at hand"
+    return Finding(what="GPU", found=name, consequence=consequence)
 
 
 def _lpips() -> Finding:

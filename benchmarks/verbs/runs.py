@@ -21,6 +21,7 @@ from benchmarks.verbs.arguments import (
     changes_of,
     typed,
 )
+from benchmarks.verbs.devices import CPU, DeviceName, chosen_device, on_device
 
 if TYPE_CHECKING:
     from benchmarks.suites.runs import Run as RunOnDisk
@@ -49,6 +50,7 @@ class RunVerb:
     capture: UseAppendAction[tuple[Path, ...]] = ()  # in place of the scenes: a finished capture; may be repeated
     size: str | None = None  # of scenes: ci, quick, table or paper
     preset: str | None = None  # budget of the methods
+    device: DeviceName = CPU  # where methods learn and draw that can choose: cpu, cuda, cuda:1, or auto
     seeds: CountIfAny = None  # train every method with so many seeds
     subjects: CountIfAny = None  # on captures of so many people, from subject 0 on
     out: Folder | None = None  # where results go; default: runs/SUITE
@@ -66,7 +68,7 @@ class RunVerb:
         from benchmarks.suites.captures import require_published
         from benchmarks.suites.runs import RunOptions
 
-        suite = self._chosen()
+        suite = on_device(self._chosen(), chosen_device(self.device))
         require_published(suite)
         _use_lpips(self.lpips_weights)
         options = RunOptions(
@@ -202,6 +204,7 @@ class TrainVerb:
     capture: Positional[Path]  # the capture's folder
     preset: str = "cpu"  # budget of the method: ci, cpu, ...
     seed: Natural = 0  # of the training
+    device: DeviceName = CPU  # where it learns and draws: cpu, cuda, cuda:1, or auto
     out: Folder = Path("runs/train")  # where cells go
     row: str = ""  # what it is called in tables; default: the method's name and what is changed
 
@@ -222,7 +225,9 @@ class TrainVerb:
         from benchmarks.suites.runs import cell_for
         from benchmarks.suites.suites import CaptureSpec, CellSpec, varied_name
 
-        changes = changes_of(self)
+        changes, device = changes_of(self), chosen_device(self.device)
+        if device != CPU:
+            changes = tuple(sorted({**dict(changes), "device": device}.items()))
         if changes:
             configured(self.method, self.preset, changes)
         capture = load_capture(self.capture)

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from ash.gaussians.gaussians import Gaussians
-from ash.gaussians.splatting import Splatted, splat, splat_naive
+from ash.gaussians.splatting import Splatted, splat, splat_by_warp, splat_naive
+from ash.native.splatting import Viewport
 
 IMAGES = ("rgb", "alpha", "depth")
 # Errors are a few units in the last place of float32 (6e-8), summed: 1e-6 is typical. A halved gradient is off by 0.5.
@@ -103,11 +104,33 @@ def change(scene: Scene, **tensors: Tensor) -> Scene:
     return replace(scene, gaussians=Gaussians(**(tensors_of(scene.gaussians) | tensors)))
 
 
-def compare(scene: Scene, tolerance: float = TOLERANCE, **wider: float) -> dict[str, Tensor]:
+def compare(
+    scene: Scene, tolerance: float = TOLERANCE, *, drawer: Callable[..., Splatted] = splat, **wider: float
+) -> dict[str, Tensor]:
     """`splat` against its definition in double precision, in value and gradient; `wider`: tolerances of their own."""
-    results = values_and_gradients(splat, scene, torch.float32)
-    assert_same(results, values_and_gradients(splat_naive, scene, torch.float64), tolerance, wider)
+    results = values_and_gradients(drawer, scene, torch.float32)
+    truth = values_and_gradients(splat_naive, scene, torch.float64)
+    if drawer is not splat:
+        del results["grad_viewmats"], truth["grad_viewmats"]  # Only the native kernels have it.
+    assert_same(results, truth, tolerance, wider)
     return results
+
+
+def splat_warp(
+    gaussians: Gaussians,
+    *,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    background: Tensor | None,
+    dilation: float,
+    compensate: bool,
+    near: float,
+) -> Splatted:
+    """What `splat` does on CUDA, on the device of the Gaussians; cameras have no gradient."""
+    view = Viewport(width, height, int(compensate), dilation, near, 1)
+    return splat_by_warp(gaussians, viewmats.detach(), Ks, view, background)
 
 
 def turned_cameras(count: int, *, distance: float = 3.0) -> Tensor:

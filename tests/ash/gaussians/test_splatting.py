@@ -2,8 +2,6 @@
 
 import math
 import os
-import sys
-import types
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -279,68 +277,3 @@ def test_what_splat_cannot_do_is_refused() -> None:
         draw(splat, replace(scene, background=torch.zeros(3, requires_grad=True)))
     with pytest.raises(InputError, match="threads"):
         draw(splat, scene, threads=0)
-
-
-# --- gsplat -----------------------------------------------------------------------------------------------------------
-
-
-def test_gsplat_is_called_by_its_own_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a GPU: the arguments that gsplat 1.5's `rasterization` takes, and what is made of its answer."""
-    from ash.gaussians.splatting import _splat_gsplat
-
-    def rasterization(
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        colors: Tensor,
-        viewmats: Tensor,
-        Ks: Tensor,
-        width: int,
-        height: int,
-        near_plane: float = 0.01,
-        eps2d: float = 0.3,
-        sh_degree: int | None = None,
-        packed: bool = True,
-        backgrounds: Tensor | None = None,
-        render_mode: str = "RGB",
-        rasterize_mode: str = "classic",
-    ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        assert (sh_degree, packed, render_mode, rasterize_mode) == (2, False, "RGB+D", "antialiased")
-        assert backgrounds is not None and backgrounds.shape == (2, 3) and (near_plane, eps2d) == (0.5, 0.1)
-        image = torch.arange(4.0).expand(2, height, width, 4)
-        return image, torch.full((2, height, width, 1), 9.0), {"means2d": torch.zeros(2, len(means), 2)}
-
-    monkeypatch.setitem(sys.modules, "gsplat", types.SimpleNamespace(rasterization=rasterization))
-    scene = replace(random_scene(coefficients=9, cameras=2), compensate=True, near=0.5, dilation=0.1)
-    drawn = draw(_splat_gsplat, scene)
-    assert drawn.rgb[1, 3, 4].tolist() == [0, 1, 2] and (drawn.depth == 3).all() and (drawn.alpha == 9).all()
-
-
-def test_without_gsplat_the_message_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    from ash.gaussians.splatting import _splat_gsplat
-
-    monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(InputError, match="pip install gsplat"):
-        draw(_splat_gsplat, random_scene(count=3))
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a CUDA device, and there is none")
-def test_gsplat_is_the_definition() -> None:
-    pytest.importorskip("gsplat")
-    # Opacities below the caps of both, so that their different constants do not matter.
-    scene = random_scene(count=150, coefficients=9, cameras=2)
-    scene = change(scene, opacities=0.5 * scene.gaussians.opacities)
-    truth = values_and_gradients(splat_naive, scene, torch.float64)
-
-    def on_gpu(**arguments: Any) -> Splatted:
-        moved = {name: value.cuda() if isinstance(value, Tensor) else value for name, value in arguments.items()}
-        gaussians = Gaussians(**{name: t.cuda() for name, t in tensors_of(arguments["gaussians"]).items()})
-        drawn = splat(**(moved | {"gaussians": gaussians}))
-        return Splatted(
-            rgb=drawn.rgb.cpu(), alpha=drawn.alpha.cpu(), depth=drawn.depth.cpu(), means2d=drawn.means2d.cpu()
-        )
-
-    results = values_and_gradients(on_gpu, scene, torch.float32)
-    del results["grad_means2d"], truth["grad_means2d"]  # the copy on the CPU has none
-    assert_same(results, truth, 1e-3, {"means2d": 1.0})

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,23 @@ import trimesh
 from torch import Tensor
 
 from ash.files import InputError
-from ash.mesh.rasterizing import Rasterized, project_vertices, rasterize_mesh, rasterize_mesh_naive
+from ash.mesh.rasterizing import (
+    Rasterized,
+    project_vertices,
+    rasterize_by_warp,
+    rasterize_mesh,
+    rasterize_mesh_naive,
+)
 
 WIDTH, HEIGHT = 96, 80
+
+
+def by_warp(vertices: Tensor, faces: Tensor, *, width: int, height: int, near: float = 0.01) -> Rasterized:
+    """What `rasterize_mesh` does on CUDA, on the CPU."""
+    return rasterize_by_warp(vertices.double(), faces.int(), width=width, height=height, near=near)
+
+
+both = pytest.mark.parametrize("rasterize", [rasterize_mesh, by_warp], ids=["native", "warp"])
 
 
 def assert_equal(a: Rasterized, b: Rasterized) -> None:
@@ -47,8 +62,18 @@ def test_rasterizer_is_its_definition(kind: str, seed: int) -> None:
         assert_equal(drawn, truth)
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kind", ["in_front", "behind", "on_centres"])
+def test_warp_rasterizes_as_the_definition(kind: str, seed: int) -> None:
+    vertices, faces = triangle_soup(kind, seed)
+    drawn, again = (by_warp(vertices, faces, width=61, height=47) for _ in range(2))
+    assert_equal(drawn, rasterize_mesh_naive(vertices, faces, width=61, height=47))
+    assert torch.equal(drawn.triangle, again.triangle) and torch.equal(drawn.depth, again.depth)
+
+
+@both
 @pytest.mark.parametrize("offset", [0.0, 0.5, 0.123])
-def test_a_grid_covers_every_pixel_exactly_once(offset: float) -> None:
+def test_a_grid_covers_every_pixel_exactly_once(offset: float, rasterize: Callable[..., Rasterized]) -> None:
     """Whole-pixel, half-pixel and arbitrary corners, either diagonal, both ways round: one triangle at a time."""
     steps = torch.arange(0.0, 41.0, 8)
     grid = torch.stack([*torch.meshgrid(steps, steps, indexing="xy"), torch.ones(6, 6)], -1).reshape(-1, 3)
@@ -61,7 +86,7 @@ def test_a_grid_covers_every_pixel_exactly_once(offset: float) -> None:
             faces += pair
     times = torch.zeros(48, 48, dtype=torch.int64)
     for face in faces:
-        times += rasterize_mesh(vertices, torch.tensor([face]), width=48, height=48).triangle == 0
+        times += rasterize(vertices, torch.tensor([face]), width=48, height=48).triangle == 0
     # With corners on pixel centres left and top edges keep their pixels, right and bottom edges do not.
     inside = torch.zeros(48, 48, dtype=torch.int64)
     inside[:40, :40] = 1
@@ -83,28 +108,30 @@ def test_barycentrics_are_perspective_correct() -> None:
     assert (drawn.depth[drawn.triangle < 0] == 0).all() and (drawn.barycentric[drawn.triangle < 0] == 0).all()
 
 
-def test_floor_through_the_camera_is_seen_up_to_the_horizon() -> None:
+@both
+def test_floor_through_the_camera_is_seen_up_to_the_horizon(rasterize: Callable[..., Rasterized]) -> None:
     """A floor that reaches far behind the camera fills exactly the lower half of the image."""
     floor = torch.tensor([[-1e4, 1.0, -1e4], [1e4, 1, -1e4], [1e4, 1, 1e4], [-1e4, 1, 1e4]])
     K = torch.tensor([[20.0, 0, 24], [0, 20, 20], [0, 0, 1]])
     vertices = project_vertices(floor, torch.eye(4), K)
-    drawn = rasterize_mesh(vertices, torch.tensor([[0, 1, 2], [0, 2, 3]]), width=48, height=40)
+    drawn = rasterize(vertices, torch.tensor([[0, 1, 2], [0, 2, 3]]), width=48, height=40)
     assert (drawn.triangle[:20] == -1).all() and (drawn.triangle[20:] >= 0).all()
     rows = torch.arange(20, 40) + 0.5
     assert torch.allclose(drawn.depth[20:, 7], 20 / (rows - 20), rtol=1e-5)
-    near = rasterize_mesh(vertices, torch.tensor([[0, 1, 2], [0, 2, 3]]), width=48, height=40, near=2.0)
+    near = rasterize(vertices, torch.tensor([[0, 1, 2], [0, 2, 3]]), width=48, height=40, near=2.0)
     assert torch.equal(near.triangle >= 0, (drawn.triangle >= 0) & (drawn.depth >= 2.0))
 
 
-def test_ties_nearer_and_degenerate_triangles() -> None:
+@both
+def test_ties_nearer_and_degenerate_triangles(rasterize: Callable[..., Rasterized]) -> None:
     square = torch.tensor([[0.0, 0, 1], [20, 0, 1], [0, 20, 1]])
     far = square * 2
     vertices = torch.cat([far, square, square])
-    drawn = rasterize_mesh(vertices, torch.tensor([[0, 1, 2], [3, 4, 5], [6, 7, 8]]), width=20, height=20)
+    drawn = rasterize(vertices, torch.tensor([[0, 1, 2], [3, 4, 5], [6, 7, 8]]), width=20, height=20)
     assert drawn.triangle[2, 2] == 1 and drawn.depth[2, 2] == 1
-    flat = rasterize_mesh(square, torch.tensor([[0, 1, 1], [2, 2, 2]]), width=20, height=20)
+    flat = rasterize(square, torch.tensor([[0, 1, 1], [2, 2, 2]]), width=20, height=20)
     assert (flat.triangle == -1).all()
-    none = rasterize_mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int64), width=3, height=2)
+    none = rasterize(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int64), width=3, height=2)
     assert none.triangle.shape == (2, 3) and (none.triangle == -1).all()
 
 

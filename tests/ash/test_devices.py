@@ -1,0 +1,105 @@
+"""One code path for every device, proved without a GPU: see `helpers.devices`.
+
+The other way round, a step on the CPU runs while `meta` is the device of every tensor that does not say its own.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.captures import write_tube_capture
+from helpers.devices import META, as_if_averaged, step_of, tiny, without_numbers
+
+from ash.avatar import AshAvatar
+from ash.capture.dataset import Capture, Pose
+from ash.config import AshConfig
+from ash.devices import CPU, device_named, moved, obstacle
+from ash.files import InputError
+from ash.presets import PRESETS, named
+from ash.template.graph import NeighbourMean
+from ash.template.template import Template
+from ash.template_learning.deforming import LinearDeformation
+from ash.template_learning.graph_nets import GraphDeformation
+from ash.textures import TexelLattice, build_lattice
+
+
+@pytest.fixture(scope="module")
+def tube(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return write_tube_capture(tmp_path_factory.mktemp("tube"))
+
+
+@pytest.fixture
+def default_is_meta() -> Iterator[None]:
+    yield
+    torch.set_default_device(None)
+
+
+def refining() -> AshConfig:
+    """Vertices that learn with the avatar."""
+    config = named("ci")
+    return replace(config, model=replace(config.model, refine=True))
+
+
+VARIANTS = {
+    "refining": (refining(), {}),
+    **{name: (named(name), {}) for name in PRESETS},
+    "exact": (named("ci"), {"kind": "exact"}),
+    "planted_error": (named("ci"), {"kind": "exact", "error_mm": 4.0}),
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_training_step_stays_on_its_device(variant: str, tube: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    without_numbers(monkeypatch)
+    config, template = VARIANTS[variant]
+    avatar = AshAvatar(tiny(config, **template), tube)
+    learned = step_of(avatar, tube, META)
+    assert learned and all(parameter.device == META for parameter in learned)
+    assert {tensor.device for tensor in (*avatar.module.buffers(), *avatar.module.parameters())} == {META}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_nothing_of_a_step_is_made_on_the_default_device(variant: str, tube: Capture, default_is_meta: None) -> None:
+    config, template = VARIANTS[variant]
+    avatar = AshAvatar(tiny(config, **template), tube)
+    torch.set_default_device(META)
+    learned = step_of(avatar, tube, CPU)
+    assert learned and all(bool(torch.isfinite(parameter).all()) for parameter in learned)
+
+
+@pytest.mark.parametrize("kind", [LinearDeformation, GraphDeformation])
+def test_a_learned_template_is_posed_on_its_device(kind: type, tube: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = tiny(named("ci")).template
+    template = Template(tube.template, tube.skeleton, kind(config, tube.template, tube.skeleton))
+    monkeypatch.setattr(NeighbourMean, "__call__", as_if_averaged)  # `meta` has no sparse product.
+    posed = template.to(META).pose(Pose(tube.motion, 2))
+    assert {posed.vertices.device, posed.normals.device, posed.transforms.quats.device} == {META}
+
+
+def test_moving_nothing_copies_nothing(tube: Capture) -> None:
+    lattice = build_lattice(tube.template, 16)
+    assert moved(lattice, CPU) is lattice
+    there = moved((lattice, [lattice.texels], None, "text"), META)
+    assert isinstance(there[0], TexelLattice) and there[0].corners.device == there[1][0].device == META
+    assert there[0].resolution == 16 and there[2:] == (None, "text")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_a_device_that_is_not_there_is_refused_with_the_reason(tube: Capture) -> None:
+    assert device_named("cpu") == CPU
+    with pytest.raises(InputError, match=re.escape(f"device cuda:1: {obstacle('cuda:1')}")):
+        device_named("cuda:1")
+    with pytest.raises(InputError, match=r"^device cuda: torch"):
+        AshAvatar(replace(tiny(named("ci")), device="cuda"), tube)
+    with pytest.raises(InputError, match="expected cpu, cuda or cuda:N, got 'gpu'"):
+        replace(named("ci"), device="gpu")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
+@pytest.mark.parametrize("preset", ["ci", "frugal", "paper", "official"])
+def test_a_gpu_learns_what_the_cpu_learns(preset: str, tube: Capture) -> None:
+    there, here = (AshAvatar(replace(tiny(named(preset)), device=name), tube) for name in ("cuda", "cpu"))
+    for learned, expected in zip(step_of(there, tube, torch.device("cuda")), step_of(here, tube, CPU), strict=True):
+        torch.testing.assert_close(learned.grad.cpu(), expected.grad, rtol=1e-2, atol=1e-2 * expected.grad.abs().max())

@@ -1,0 +1,76 @@
+"""One code path for every device: the mesh and the other baselines, as `tests/ash/test_devices.py` has ASH."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from helpers.captures import write_tube_capture
+from helpers.devices import META, step_of, tiny, without_numbers
+
+from ash.capture.dataset import Capture
+from ash.devices import CPU
+from ash.presets import Recipe
+from baselines.ddc import ddc
+from baselines.mlp import mlp, mlp_base
+from baselines.oracle_texture import oracle_texture
+from baselines.static import static
+from baselines.switches import ash_frugal, wo_disp, wo_mot, wo_offset
+
+RECIPES: dict[str, Recipe[Any]] = {
+    "ddc": ddc,
+    "ddc_moves": ddc.but({"refine": "motion"}),
+    "ddc_still": ddc.but({"refine": "none"}),
+    "oracle_texture": oracle_texture,
+    "static": static,
+    "wo_mot": wo_mot,
+    "wo_disp": wo_disp,
+    "wo_offset": wo_offset,
+    "ash_frugal": ash_frugal,
+    "mlp": mlp,
+    "mlp_base": mlp_base,
+}
+
+
+@pytest.fixture(scope="module")
+def tube(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return write_tube_capture(tmp_path_factory.mktemp("tube"))
+
+
+@pytest.fixture
+def default_is_meta() -> Iterator[None]:
+    yield
+    torch.set_default_device(None)
+
+
+def avatar_of(name: str, capture: Capture) -> Any:
+    recipe = RECIPES[name]
+    return recipe.build(tiny(recipe.config("ci")), capture)
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_training_step_stays_on_its_device(name: str, tube: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    without_numbers(monkeypatch)
+    if name.startswith("mlp"):  # `meta` has no autocast; its half precision is of no account here.
+        monkeypatch.setattr(torch, "autocast", lambda *_, **__: torch.enable_grad())
+    learned = step_of(avatar_of(name, tube), tube, META)
+    assert learned and all(parameter.device == META for parameter in learned)
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_nothing_of_a_step_is_made_on_the_default_device(name: str, tube: Capture, default_is_meta: None) -> None:
+    avatar = avatar_of(name, tube)
+    torch.set_default_device(META)
+    learned = step_of(avatar, tube, CPU)
+    assert learned and all(bool(torch.isfinite(parameter).all()) for parameter in learned)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_gpu_learns_what_the_cpu_learns(name: str, tube: Capture) -> None:
+    recipe = RECIPES[name]
+    config = tiny(recipe.config("ci"))
+    there, here = (recipe.build(replace(config, device=device), tube) for device in ("cuda", "cpu"))
+    for learned, expected in zip(step_of(there, tube, torch.device("cuda")), step_of(here, tube, CPU), strict=True):
+        torch.testing.assert_close(learned.grad.cpu(), expected.grad, rtol=1e-2, atol=1e-2 * expected.grad.abs().max())

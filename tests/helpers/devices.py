@@ -1,0 +1,109 @@
+"""A training step where tensors have a shape and no numbers: whatever was made on another device raises there.
+
+What needs numbers is replaced on the device `meta`, and only that: the splatter and the rasteriser give shapes,
+outlines are not followed, a frame's novelty is not measured, and nobody looks whether a gradient is finite. So is the
+product with a sparse matrix, which `meta` has not.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from helpers.captures import tiny_preset
+from torch import Tensor
+
+import ash.avatar
+import ash.mesh.drawing
+import ash.model
+import ash.template.graph
+import ash.textures
+import ash.training.adam
+import baselines.ddc
+from ash.capture.dataset import Camera, Capture
+from ash.gaussians.gaussians import Gaussians
+from ash.gaussians.splatting import Splatted
+from ash.mesh.drawing import SUPERSAMPLING, Topology, _MeshView, _weights_of
+from ash.mesh.rasterizing import project_vertices
+from ash.template.graph import NeighbourMean
+from ash.training.adam import Adam
+from ash.training.batches import draw_batch, load_training_images
+from ash.training.loop import view_loss
+
+META = torch.device("meta")
+
+
+def tiny(config: Any, **template: Any) -> Any:
+    """The configuration of a preset as it is, but for its size; on the skinned template, or another."""
+    small = tiny_preset(steps=4, warmup_steps=0)
+    size = {"texels": 16, "width": 4, "levels": 2, "window": 2, "shuffle": min(2, config.model.shuffle)}
+    return replace(
+        config,
+        model=replace(config.model, **size),
+        training=replace(config.training, steps=4, warmup_steps=0),
+        template=replace(small.template, **({"kind": "skinned"} | template)),
+        search=False,
+        **({"texture": 32} if hasattr(config, "texture") else {}),
+    )
+
+
+def step_of(avatar: Any, capture: Capture, device: torch.device) -> list[Tensor]:
+    """One training step, as the loop makes it; returns the parameters that moved."""
+    training = avatar.config.training
+    batch = draw_batch(load_training_images(capture, device), training, 0, 0)
+    optimiser = Adam(avatar.parameter_groups(), eps=1e-15)
+    shown = (batch.frame, batch.cameras, batch.background)
+    view_loss(avatar.draw_training_views(*shown, 0), batch, training).backward()
+    static = avatar.draw_static_views(*shown)
+    if static is not None:
+        view_loss(static, batch, training).backward()
+    assert optimiser.step()
+    return [parameter for parameter in optimiser.parameters if parameter.grad is not None]
+
+
+def without_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Avatars are made for `meta`, and what needs numbers is replaced."""
+    for module in (ash.avatar, baselines.ddc):
+        monkeypatch.setattr(module, "device_named", lambda name: META)
+    monkeypatch.setattr(ash.template.graph.NeighbourMean, "__call__", as_if_averaged)
+    monkeypatch.setattr(ash.model, "splat", _shapes_of_images)
+    monkeypatch.setattr(ash.mesh.drawing, "_view_of", _some_samples)
+    monkeypatch.setattr(ash.mesh.drawing, "_outlines", _no_outlines)
+    monkeypatch.setattr(ash.textures.TextureDrawer, "trust", lambda drawer, textures: 0.5)
+    monkeypatch.setattr(ash.training.adam, "_all_finite", lambda gradients: True)
+
+
+def _shapes_of_images(gaussians: Gaussians, *, viewmats: Tensor, width: int, height: int, **_: Any) -> Splatted:
+    """What `splat` returns, and a graph that leads back to every parameter."""
+    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    total = torch.stack([tensor.sum() for tensor in tensors]).sum()
+    size = (len(viewmats), height, width)
+    centres = gaussians.means[:, :2].expand(len(viewmats), -1, -1)
+    return Splatted(rgb=total.expand(*size, 3), alpha=total.expand(size), depth=total.expand(size), means2d=centres)
+
+
+def _some_samples(vertices: Tensor, topology: Topology, camera: Camera) -> _MeshView:
+    """What `_view_of` returns where seven samples see the first triangle."""
+    width, height = camera.width * SUPERSAMPLING, camera.height * SUPERSAMPLING
+    viewmat, K = (torch.from_numpy(matrix).to(vertices) for matrix in (camera.viewmat, camera.K))
+    corners = project_vertices(vertices, viewmat, K)
+    covered = torch.arange(7, device=vertices.device)
+    return _MeshView(
+        camera=camera,
+        corners=corners,
+        triangle=covered.new_zeros(height, width),
+        depth=vertices.new_zeros(height, width),
+        covered=covered,
+        seen=torch.zeros_like(covered),
+        weights=_weights_of(corners, topology.faces, torch.zeros_like(covered), covered, width),
+    )
+
+
+def as_if_averaged(mean: NeighbourMean, x: Tensor) -> Tensor:
+    """What `NeighbourMean` returns, where the operator lies on the device of what it is applied to."""
+    assert mean.operator.device == mean.transposed.device == x.device
+    return x.clone()
+
+
+def _no_outlines(samples: Tensor, view: _MeshView, topology: Topology) -> Tensor:
+    return samples.new_zeros(view.camera.height, view.camera.width, samples.shape[1])
