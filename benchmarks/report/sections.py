@@ -154,6 +154,7 @@ def provenance(results: Sequence[CellResult], command: str) -> Section:
     """Where the numbers come from; cells made at several places are listed with all of them."""
     known = [result.provenance for result in results if result.provenance is not None]
     facts = [("protocol", PROTOCOL), ("commit", _all_of(p.commit for p in known))]
+    facts.append(("code", _all_of(r.config.code for r in results)))
     for name in ("processor", "cores", "memory_gb", "system", "gpu", "python"):
         facts.append((name.replace("_gb", " [GB]"), _all_of(p.machine.get(name, "unknown") for p in known)))
     for name in sorted({name for p in known for name in p.versions}):
@@ -164,7 +165,8 @@ def provenance(results: Sequence[CellResult], command: str) -> Section:
     facts += [("command", command)] if command else []
     note = (
         f"Protocol {PROTOCOL}: predictions are quantised to 8 bits on black before anything is compared. "
-        f"results.csv beside "
+        "Code: hash of the sources that decide a cell. "
+        "results.csv beside "
         "this report has every number; each cell's result.json the scores of every image. Differences are taken before "
         "numbers are rounded."
     )

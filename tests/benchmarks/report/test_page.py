@@ -95,6 +95,7 @@ def test_the_page_is_whole_and_needs_nothing_else(run: Run) -> None:
         "1 of 1 failed",
         "diverged",
         f"Protocol {PROTOCOL}",
+        ">code<",
         "noise ceiling 39.9",
         "This is a smoke test",
         "2 cameras, 4 frames",
