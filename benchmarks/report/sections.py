@@ -16,7 +16,7 @@ from benchmarks.report.glossary import GLOSSARY
 from benchmarks.report.tables import entry_of
 from benchmarks.report.vega import Figure, Series
 
-WHISKERS = "Whiskers: 95 % interval over seeds."
+WHISKERS = "Whiskers: 95 % interval over seeds, or over captures where there are several."
 
 
 def needs(scores: Scores) -> list[Section]:
@@ -110,7 +110,7 @@ def _spent_figure(table: pd.DataFrame, name: str, title: str, spent: str, x_titl
         }
     )
     panels = charts.lines(samples, looks, y="foreground PSNR [dB]", size=(390, 240), log=True)
-    caption = "Foreground PSNR, mean over seeds and its 95 % interval."
+    caption = f"Foreground PSNR. {WHISKERS}"
     return Figure(name=name, title=title, caption=caption, panels=panels, series=looks)
 
 
@@ -134,7 +134,8 @@ def beside_the_paper(scores: Scores, suite: str) -> list[Section]:
     note = (
         "The paper: captured data at 1285x940 and weeks on a GPU, PSNR of the release's convention. Ours: "
         "foreground PSNR "
-        f"on {suite}. Levels cannot be compared, orders can; interval of Kendall's tau: seeds drawn anew."
+        f"on {suite}. Levels cannot be compared, orders can; interval of Kendall's tau: captures, or seeds of a "
+        "single one, drawn anew."
     )
     return [Section(title="Beside the paper", blocks=(*blocks, Text(text=note, note=True)))] if blocks else []
 
@@ -292,7 +293,12 @@ def _reliability(scores: Scores, scene: str) -> Table:
         )
         for row in stability.reliability(scores, scene)
     )
-    titles = ("failed cells", "95 % interval of the rate", "diverged", "spread over seeds, clean, held-out views")
+    titles = (
+        "failed cells",
+        "95 % interval of the rate",
+        "diverged",
+        "spread over the seeds of a capture, clean, held-out views",
+    )
     return Table(title="Reliability", columns=tuple(Head(title=title) for title in titles), rows=rows)
 
 
