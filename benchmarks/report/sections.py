@@ -4,29 +4,18 @@ from collections.abc import Iterable, Sequence
 
 import pandas as pd
 
-from benchmarks.analysis import anytime, footage, margin, necessity, paper, stability
+from benchmarks.analysis import anytime, footage, margin, paper, stability
 from benchmarks.analysis.names import SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Scores, foreground
-from benchmarks.analysis.statistics import Difference
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS, PROTOCOL
 from benchmarks.report import charts, vega
-from benchmarks.report.content import Block, Bullets, Chart, Entry, Head, Mark, Row, Section, Table, Text, texts
+from benchmarks.report.content import Block, Bullets, Chart, Entry, Head, Row, Section, Table, Text, texts
 from benchmarks.report.glossary import GLOSSARY
 from benchmarks.report.tables import entry_of
 from benchmarks.report.vega import Figure, Series
 
 WHISKERS = "Whiskers: 95 % interval over seeds, or over captures where there are several."
-
-
-def needs(scores: Scores) -> list[Section]:
-    """What each scene needs, where parts were taken away."""
-    tables = [_need_table(matrix) for split in RANKED_SPLITS if (matrix := necessity.matrix(scores, split))]
-    note = (
-        "Foreground PSNR in dB that ASH loses when the part is taken away, with the 95 % interval over seeds. Needed: "
-        "surely more than 0.2 dB. Not needed: surely less. Harmful: the scene is better off without."
-    )
-    return [Section(title="What each scene needs", blocks=(*tables, Text(text=note, note=True)))] if tables else []
 
 
 def margins(scores: Scores) -> list[Section]:
@@ -190,21 +179,6 @@ def _all_of(values: Iterable[str]) -> str:
 
 def _chart(figure: Figure) -> Chart:
     return Chart(figure=figure)
-
-
-def _need_table(matrix: necessity.Matrix) -> Table:
-    marks: dict[str, Mark] = {"needed": "best", "harmful": "second"}
-
-    def entry(loss: Difference | None) -> Entry:
-        if loss is None:
-            return Entry(text="n/a")
-        verdict = necessity.verdict(loss)
-        interval = "" if verdict == "unknown" else f" [{loss.low:+.2f}, {loss.high:+.2f}] {verdict}"
-        return Entry(text=f"{loss.mean:+.2f}{interval}", sort=loss.mean, mark=marks.get(verdict, ""))
-
-    rows = tuple(Row(name=row.scene, entries=tuple(map(entry, row.losses))) for row in matrix.rows)
-    columns = tuple(Head(title=part, unit="dB lost") for part in matrix.parts)
-    return Table(title=SPLIT_NAMES[matrix.split].title, corner="scene", columns=columns, rows=rows)
 
 
 def _place(curve: margin.MarginCurve) -> str:
