@@ -9,7 +9,7 @@ import pandas as pd
 from benchmarks.report.charts import inline, layered, tooltips
 
 # Cells keep their light colours on dark pages, and so does what stands in them.
-WRITING = "#17202c"
+WRITING, FRAME = "#17202c", "#c2415c"  # The frame is seen on light cells and on dark paper.
 RANGE = ("#e8995a", "#f1f3f6", "#6f9ceb")
 CELL = (70, 40)  # pixels
 
@@ -46,7 +46,7 @@ def heatmap(
     above: dict[str, Any] = {"dy": -6, "fontSize": 13, "color": WRITING}
     layers = [
         seen.mark_rect(cornerRadius=2).encode(**at, fill=colour, tooltip=tips),
-        framed.mark_rect(filled=False, stroke=WRITING, strokeWidth=2.5, cornerRadius=2).encode(**at),
+        framed.mark_rect(filled=False, stroke=FRAME, strokeWidth=2.5, cornerRadius=2).encode(**at),
         seen.transform_filter(f"{sure} >= 0").mark_text(fontWeight="bold", **above).encode(**at, text="text:N"),
         seen.transform_filter(f"{sure} < 0").mark_text(**above).encode(**at, text="text:N"),
         seen.mark_text(dy=9, fontSize=10, color=WRITING).encode(**at, text="interval:N"),
