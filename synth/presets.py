@@ -12,7 +12,7 @@ from synth.motion.clips import clip_from_file
 from synth.motion.importing import WHOLE
 from synth.scene import Clip, Light, Outfit, Rig, Scene, Take
 
-SIZES = ("ci", "quick", "long", "table", "paper")
+SIZES = ("ci", "rung", "quick", "long", "table", "paper")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -32,6 +32,9 @@ def _size(name: str) -> Size:
     if name == "ci":
         rig = Rig(cameras=6, held_out=2, width=128, height=128)
         return Size(rig=rig, repeats=1, frames=4, test_frames=3, stride=3, samples=16, texture=512)
+    if name == "rung":  # Enough cameras for held-out views to be between them, enough pixels for what a rung adds.
+        rig = Rig(cameras=20, held_out=4, width=192, height=192)
+        return Size(rig=rig, repeats=1, frames=10, test_frames=12, stride=5, samples=50, texture=1024)
     if name == "quick":
         return Size(rig=Rig(), repeats=1, frames=10, test_frames=12, stride=5, samples=50, texture=2048)
     if name == "long":  # `quick` with eight times the training motion.
@@ -129,7 +132,7 @@ SCENES: dict[str, Callable[..., Scene]] = {
 
 
 def scene(name: str, *, size: str, seed: int = 0, subject: int = 0) -> Scene:
-    """The named scene of a subject at a size (`ci`, `quick`, `table`, `paper`).
+    """The named scene of a subject at a size (one of `SIZES`).
 
     Raises:
         InputError: an unknown name or size; the message lists the known ones.

@@ -8,7 +8,7 @@ import pandas as pd
 
 from benchmarks.analysis.names import SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import RANKED_SPLITS
-from benchmarks.analysis.statistics import mean_interval
+from benchmarks.analysis.statistics import independent, mean_interval
 from benchmarks.cell.cells import CellResult
 
 COLUMNS = ("scene", "split", "method", "seconds", "capture", "seed", "psnr")
@@ -47,8 +47,7 @@ def curves(results: Sequence[CellResult]) -> pd.DataFrame:
             for mark in marks:
                 scores = own.groupby(["capture", "seed"]).apply(_at, mark, include_groups=False)
                 if scores.notna().all():
-                    means = scores.groupby("capture").mean()
-                    interval = mean_interval(list(means if len(means) > 1 else scores))
+                    interval = mean_interval(independent(scores.groupby("capture").agg(list).to_dict()))
                     rows.append((scene, split, method, mark, interval.mean, interval.low, interval.high))
     table = pd.DataFrame(rows, columns=["scene", "split", "method", "seconds", "psnr", "low", "high"])
     return table.astype({"low": float, "high": float})

@@ -1,14 +1,18 @@
 """Which differences between methods are established, and how large a difference the run could have found."""
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from benchmarks.analysis.names import look_of
 from benchmarks.analysis.pareto import Contender
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Scores, foreground
-from benchmarks.analysis.statistics import Difference, hierarchical_bootstrap, holm, paired, welch
+from benchmarks.analysis.statistics import Difference, compared, detectable, hierarchical_bootstrap, holm
 from benchmarks.cell.methods import is_oracle
+
+COUNTS = (1, 2, 4, 8, 16)  # of captures, for which reports say what they would show
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -33,18 +37,10 @@ class Contrast:
 
 
 def difference(scores: Scores, scene: str, ours: str, theirs: str, split: str) -> Difference | None:
-    """Foreground PSNR of one method minus another's in dB; None where either was not run, or failed.
-
-    Over the captures in pairs, where the scene has several; else over the seeds. A single value knows no interval: then
-    it is NaN, and so is p.
-    """
-    a, b = (scores.values(scene, method, foreground(split)) for method in (ours, theirs))
-    if not a or not b or not scores.whole(scene, ours, theirs):
+    """Foreground PSNR of one method minus another's in dB; None where either was not run, or failed."""
+    if not scores.whole(scene, ours, theirs):
         return None
-    if len(a) > 1 and len(b) > 1:
-        return paired(a, b) if scores.captures(scene) > 1 and len(a) == len(b) else welch(a, b)
-    unknown = {name: float("nan") for name in ("low", "high", "p", "effect", "detectable")}
-    return Difference(mean=float(np.mean(a) - np.mean(b)), **unknown)
+    return compared(*(scores.samples(scene, method, foreground(split)) for method in (ours, theirs)))
 
 
 def contrasts(scores: Scores, scene: str, *, reference: str = "ash") -> tuple[Contrast, ...]:
@@ -65,23 +61,56 @@ def contrasts(scores: Scores, scene: str, *, reference: str = "ash") -> tuple[Co
     )
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Sight:
+    """The smallest true difference, dB, that so many captures in pairs show: of the middle row, and of the worst."""
+
+    captures: int
+    middle: float
+    worst: float
+
+
+def sights(found: Sequence[Contrast], split: str) -> tuple[Sight, ...]:
+    """What 1, 2, 4, 8 and 16 captures would show; of contrasts over a single capture nothing is known."""
+    spreads = [contrast.test.spread for contrast in found if contrast.split == split and contrast.test.pairs]
+    if not spreads:
+        return ()
+    return tuple(
+        Sight(
+            captures=captures,
+            middle=detectable(float(np.median(spreads)), captures),
+            worst=detectable(max(spreads), captures),
+        )
+        for captures in COUNTS
+    )
+
+
 def candidates(scores: Scores, scene: str, split: str) -> tuple[Contender, ...]:
-    """The methods that compete on a scene, with foreground PSNR per seed and milliseconds per frame."""
+    """The methods that compete on a scene, with foreground PSNR and milliseconds per frame.
+
+    They are judged on the captures that all of them were run on.
+    """
     found = []
     for method in scores.methods(scene):
-        frame, values = scores.get(scene, method, FRAME_MS), scores.values(scene, method, foreground(split))
-        if frame and values and not is_oracle(method) and scores.whole(scene, method):
-            found.append(Contender(name=method, qualities=tuple(values), cost=frame.mean))
-    return tuple(found)
+        frame, samples = scores.get(scene, method, FRAME_MS), scores.samples(scene, method, foreground(split))
+        if frame and samples and not is_oracle(method) and scores.whole(scene, method):
+            found.append(Contender(name=method, samples=samples, cost=frame.mean))
+    shared = set.intersection(*(set(contender.samples) for contender in found)) if found else set()
+    kept = [replace(c, samples={name: own for name, own in c.samples.items() if name in shared}) for c in found]
+    return tuple(kept) if shared else ()
 
 
 def _bootstrap(scores: Scores, scene: str, ours: str, theirs: str, split: str) -> tuple[float, float]:
+    """Interval of the difference by drawing captures (of a single one, seeds) and images anew; NaN without images."""
+    unknown = (math.nan, math.nan)
+    if scores.images.empty:
+        return unknown
     a, b = (scores.per_image(scene, method, split) for method in (ours, theirs))
-    if a.empty or not a.columns.equals(b.columns) or a.isna().any(axis=None) or b.isna().any(axis=None):
-        return float("nan"), float("nan")
     pairs = scores.captures(scene) > 1
     if pairs:
         a, b = (rows.groupby(level="capture").mean() for rows in (a, b))
-        if not a.index.equals(b.index):
-            return float("nan"), float("nan")
+        shared = a.index.intersection(b.index)
+        a, b = a.loc[shared], b.loc[shared]
+    if a.empty or not a.columns.equals(b.columns) or a.isna().any(axis=None) or b.isna().any(axis=None):
+        return unknown
     return hierarchical_bootstrap(a.to_numpy(), b.to_numpy(), rng=np.random.default_rng(0), pairs=pairs)

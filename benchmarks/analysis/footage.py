@@ -7,7 +7,7 @@ import pandas as pd
 
 from benchmarks.analysis.names import look_of
 from benchmarks.analysis.scores import RANKED_SPLITS
-from benchmarks.analysis.statistics import mean_interval
+from benchmarks.analysis.statistics import independent, mean_interval
 from benchmarks.cell.cells import CellResult
 from benchmarks.suites.stress import FOOTAGE_FRAMES
 
@@ -23,9 +23,12 @@ def curves(results: Sequence[CellResult]) -> pd.DataFrame:
     for scene, method, severity in places:
         own = [r for r in used if (r.config.scene, r.config.method, r.config.severity) == (scene, method, severity)]
         for split in RANKED_SPLITS:
-            scores = [score for r in own if (score := r.value(split, "foreground", "psnr")) is not None]
-            if scores:
-                interval = mean_interval(scores)
+            samples: dict[str, list[float]] = {}
+            for result in own:
+                if (score := result.value(split, "foreground", "psnr")) is not None:
+                    samples.setdefault(result.config.capture, []).append(score)
+            if samples:
+                interval = mean_interval(independent(samples))
                 frames = FOOTAGE_FRAMES - int(severity)
                 rows.append((scene, split, method, frames, interval.mean, interval.low, interval.high))
     table = pd.DataFrame(rows, columns=["scene", "split", "method", "frames", "psnr", "low", "high"])

@@ -1,56 +1,186 @@
-"""What each scene needs: the loss when one part of ASH is taken away, scene by scene, with its certainty."""
+"""What each scene needs: the loss when one part of ASH is taken away, scene by scene, against what should be needed.
+
+The parts are the rows that a run has. Significance is corrected over all cells of a matrix (Benjamini and Hochberg
+1995), so that one in twenty of what is called needed, at most, is so by chance.
+"""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
+
+from scipy import stats
 
 from benchmarks.analysis.contrasts import difference
 from benchmarks.analysis.names import look_of
 from benchmarks.analysis.scores import Scores
 from benchmarks.analysis.statistics import Difference
+from benchmarks.cell.methods import is_oracle
+from synth.presets import RUNGS
 
 Verdict = Literal["needed", "not needed", "harmful", "unclear", "unknown"]
 
-PARTS = ("wo_mot", "wo_disp", "mlp")  # ASH without one part, or with a plainer one in its place
+WHOLE = "ash"  # the row that has every part
+REFERENCES = ("static", "nearest")  # They are less than ASH without one part.
+# Of spherical harmonics ASH has degree 0 in our presets: what a degree is worth is told against degree 3.
+PAIRS = {"sh_3": ("sh_3", WHOLE), "sh_1": ("sh_3", "sh_1"), "sh_2": ("sh_3", "sh_2")}
+TITLES = {"sh_3": "SH 0, not 3", "sh_1": "SH 1, not 3", "sh_2": "SH 2, not 3"}
+# The expected diagonal: which rows lack what the one phenomenon of a scene asks for. Who lacks all motion lacks its
+# window as well; decoders are off without motion, which `skinned` should not need.
+EXPECTED = {
+    "splats": (),
+    "still": (),
+    "skinned": (),
+    "wrinkles": ("wo_mot", "wo_disp", "wo_offset"),
+    "swing": ("wo_mot", "window_1", "unlearned"),
+    "lit": ("wo_phi", "wo_light", "wo_phi_and_light"),
+    "glossy": ("sh_3",),
+    "turning": ("wo_heading",),
+    "loose": ("unlearned",),
+}
+ON_TRIAL = tuple(dict.fromkeys(row for rows in EXPECTED.values() for row in rows))  # Of others nothing is expected.
+ZERO_DOSE = "skinned"  # A rung of strength 0 has its images, bit for bit.
+DOSES = {"_half": 0.5, "": 1.0, "_twice": 2.0}  # how a scene's name ends, times the rung's strength
 MARGIN_DB = 0.2  # A loss below this is no need.
+LEVEL = 0.05
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Needs:
-    """A row of the matrix: the dB that one scene loses without each part (None: not run there)."""
+class Part:
+    """A column: what is lost from the row that has the part to the row that has not."""
+
+    row: str  # that the run has it by
+    within: str
+    without: str
+
+    @property
+    def title(self) -> str:
+        """What is missing, for readers."""
+        return TITLES.get(self.row, look_of(self.row).title)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Need:
+    """A cell: foreground PSNR lost without the part in dB (None: not run there), with p corrected over all cells."""
 
     scene: str
-    losses: tuple[Difference | None, ...]
+    part: Part
+    loss: Difference | None
+    p_adjusted: float = math.nan
+
+    @property
+    def expected(self) -> bool:
+        """Whether the scene's phenomenon asks for the part."""
+        return self.part.row in EXPECTED.get(self.scene, ())
+
+    @property
+    def verdict(self) -> Verdict:
+        """What the numbers allow to say, with `MARGIN_DB` as the least loss that counts."""
+        if self.loss is None or math.isnan(self.loss.low):
+            return "unknown"
+        if self.p_adjusted < LEVEL and abs(self.loss.mean) > MARGIN_DB:
+            return "needed" if self.loss.mean > 0 else "harmful"
+        return "not needed" if self.loss.high < MARGIN_DB else "unclear"
+
+    @property
+    def surprise(self) -> str:
+        """How the cell contradicts the expected diagonal; empty where it does not."""
+        if self.loss is None or self.scene not in EXPECTED or self.part.row not in ON_TRIAL:
+            return ""
+        size = f"{self.loss.mean:+z.2f} dB [{self.loss.low:+z.2f}, {self.loss.high:+z.2f}]"
+        what = f"{self.scene}, {self.part.title}: {size}"
+        if self.expected and self.verdict in ("not needed", "harmful"):
+            return f"{what}, {self.verdict} where it should be needed."
+        if not self.expected and self.verdict in ("needed", "harmful"):
+            return f"{what}, {self.verdict} though nothing in the scene asks for it."
+        return ""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Matrix:
-    """Scenes by parts for one split."""
+    """Scenes by parts for one split, scene after scene."""
 
     split: str
-    parts: tuple[str, ...]
-    rows: tuple[Needs, ...]
+    scenes: tuple[str, ...]
+    parts: tuple[Part, ...]
+    needs: tuple[Need, ...]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Dose:
+    """What one expected part is worth on one rung, by its strength: times that of the ladder, and the loss."""
+
+    scene: str
+    part: Part
+    losses: tuple[tuple[float, Difference], ...]
+
+    @property
+    def rises(self) -> bool:
+        """Whether the loss grows with every dose."""
+        means = [loss.mean for _, loss in self.losses]
+        return all(a < b for a, b in pairwise(means))
 
 
 def matrix(scores: Scores, split: str) -> Matrix | None:
     """The necessity matrix of a run, or None where it has fewer than two scenes with ASH and an ablation of it."""
-    parts = [part for part in PARTS if any(part in scores.methods(scene) for scene in scores.scenes)]
-    scenes = [scene for scene in scores.scenes if "ash" in scores.methods(scene)]
+    scenes = tuple(scene for scene in scores.scenes if WHOLE in scores.methods(scene) and not _is_dose(scene))
+    parts = parts_of(scores, scenes)
     if len(scenes) < 2 or not parts:
         return None
-    rows = [
-        Needs(scene=scene, losses=tuple(difference(scores, scene, "ash", part, split) for part in parts))
+    needs = [
+        Need(scene=scene, part=part, loss=difference(scores, scene, part.within, part.without, split))
         for scene in scenes
+        for part in parts
     ]
-    return Matrix(split=split, parts=tuple(look_of(part).title for part in parts), rows=tuple(rows))
+    return Matrix(split=split, scenes=scenes, parts=parts, needs=corrected(needs))
 
 
-def verdict(loss: Difference) -> Verdict:
-    """What the interval allows to say, with `MARGIN_DB` as the least loss that counts."""
-    if math.isnan(loss.low):
-        return "unknown"
-    if loss.low > MARGIN_DB:
-        return "needed"
-    if loss.high < -MARGIN_DB:
-        return "harmful"
-    return "not needed" if loss.high < MARGIN_DB else "unclear"
+def parts_of(scores: Scores, scenes: Sequence[str]) -> tuple[Part, ...]:
+    """The columns: every row of the scenes that competes with ASH, those of the expected diagonal first."""
+    rows = dict.fromkeys(row for scene in scenes for row in scores.methods(scene))
+    parts = []
+    for row in sorted(rows, key=_column):
+        within, without = PAIRS.get(row, (WHOLE, row))
+        if row != WHOLE and row not in REFERENCES and not is_oracle(row) and within in rows:
+            parts.append(Part(row=row, within=within, without=without))
+    return tuple(parts)
+
+
+def _column(row: str) -> int:
+    """Where a row stands: in the order of the expected diagonal, degrees beside each other, all others behind."""
+    beside = next(iter(PAIRS)) if row in PAIRS else row
+    return ON_TRIAL.index(beside) if beside in ON_TRIAL else len(ON_TRIAL)
+
+
+def corrected(needs: Sequence[Need]) -> tuple[Need, ...]:
+    """The cells with their p corrected for how many of them there are."""
+    known = [need.loss.p for need in needs if need.loss is not None and not math.isnan(need.loss.p)]
+    adjusted = iter(stats.false_discovery_control(known) if known else ())
+    return tuple(
+        need if need.loss is None or math.isnan(need.loss.p) else replace(need, p_adjusted=float(next(adjusted)))
+        for need in needs
+    )
+
+
+def doses(scores: Scores, split: str) -> tuple[Dose, ...]:
+    """A course per rung and expected part, for rungs of which a run has two strengths or more."""
+    found = []
+    for rung in RUNGS:
+        places = {0.0: ZERO_DOSE} | {dose: f"{rung}{ending}" for ending, dose in DOSES.items()}
+        parts = {part.row: part for part in parts_of(scores, list(places.values()))}
+        for row in EXPECTED[rung]:
+            losses = _losses(scores, parts[row], places, split) if row in parts else ()
+            if len(losses) > 1 and any(dose == 1 for dose, _ in losses):
+                found.append(Dose(scene=rung, part=parts[row], losses=losses))
+    return tuple(found)
+
+
+def _losses(scores: Scores, part: Part, places: dict[float, str], split: str) -> tuple[tuple[float, Difference], ...]:
+    there = {dose: difference(scores, places[dose], part.within, part.without, split) for dose in sorted(places)}
+    return tuple((dose, loss) for dose, loss in there.items() if loss is not None)
+
+
+def _is_dose(scene: str) -> bool:
+    """Whether a scene is a rung at another strength than its own."""
+    return any(scene == f"{rung}{ending}" for rung in RUNGS for ending, dose in DOSES.items() if dose != 1)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.analysis.scores import RANKED_SPLITS, Scores, foreground
-from benchmarks.analysis.statistics import kendall
+from benchmarks.analysis.statistics import kendall, redrawn
 
 RESAMPLES = 2000
 
@@ -91,7 +91,7 @@ PAPER_TABLES = (
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Agreement:
-    """Kendall's tau of two orders of the same methods, with the interval that our spread over seeds leaves it."""
+    """Kendall's tau of two orders of the same methods, with the interval that our spread leaves it."""
 
     split: str
     tau: float
@@ -118,14 +118,18 @@ def tables_beside(scores: Scores) -> tuple[tuple[PaperTable, tuple[Agreement, ..
 
 
 def _agreement(scores: Scores, scene: str, rows: list[PaperRow], split: str) -> Agreement | None:
-    """Tau between the paper's PSNR and ours; the interval by drawing seeds anew (percentiles of the bootstrap)."""
+    """Tau between the paper's PSNR and ours; the interval by drawing captures anew, or of a single one, seeds."""
     paper = [row.view[0] if split == "novel_view" else row.pose[0] for row in rows]
-    seeds = [scores.values(scene, str(row.method), foreground(split)) for row in rows]
-    if not all(seeds):
+    methods = [str(row.method) for row in rows]
+    values = [scores.values(scene, method, foreground(split)) for method in methods]
+    if not all(values):
         return None
-    tau, low, high = kendall(paper, [float(np.mean(values)) for values in seeds]), None, None
-    if all(len(values) > 1 for values in seeds):
-        rng = np.random.default_rng(0)
-        drawn = [kendall(paper, [float(rng.choice(v, len(v)).mean()) for v in seeds]) for _ in range(RESAMPLES)]
+    tau, low, high = kendall(paper, [float(np.mean(own)) for own in values]), None, None
+    if all(len(own) > 1 for own in values):
+        samples, rng = (
+            [scores.samples(scene, method, foreground(split)) for method in methods],
+            np.random.default_rng(0),
+        )
+        drawn = [kendall(paper, redrawn(samples, rng=rng)) for _ in range(RESAMPLES)]
         low, high = (float(q) for q in np.quantile(drawn, [0.025, 0.975]))
     return Agreement(split=split, tau=tau, low=low, high=high, methods=len(rows))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.analysis.statistics import welch
+from benchmarks.analysis.statistics import Samples, compared, redrawn
 
 SUFFICIENT_DB = 0.5  # A loss that readers of images do not see, and three seeds can establish.
 REFERENCE_MS, REFERENCE_DB = 1000.0, 10.0  # The hypervolume's fixed corner: a frame per second of noise.
@@ -17,16 +17,16 @@ REFERENCE_MS, REFERENCE_DB = 1000.0, 10.0  # The hypervolume's fixed corner: a f
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Contender:
-    """A method with its quality for each seed and its cost."""
+    """A method with its quality for each seed, by capture, and its cost."""
 
     name: str
-    qualities: tuple[float, ...]
+    samples: Samples
     cost: float
 
     @property
     def quality(self) -> float:
-        """Mean over seeds."""
-        return float(np.mean(self.qualities))
+        """Mean over captures of their seeds' means."""
+        return float(np.mean([np.mean(own) for own in self.samples.values()]))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -46,25 +46,15 @@ def front(candidates: Sequence[Contender]) -> tuple[str, ...]:
 
 def hypervolume(candidates: Sequence[Contender]) -> float:
     """Area that the front covers up to the fixed corner, in dB times decades of time."""
-    area, reached = 0.0, REFERENCE_DB
-    for candidate in sorted(candidates, key=lambda c: c.cost):
-        if candidate.cost < REFERENCE_MS and candidate.quality > reached:
-            area += math.log10(REFERENCE_MS / candidate.cost) * (candidate.quality - reached)
-            reached = candidate.quality
-    return area
+    return _area([c.quality for c in candidates], [c.cost for c in candidates])
 
 
 def hypervolume_interval(
     candidates: Sequence[Contender], *, rng: np.random.Generator, resamples: int = 1000
 ) -> tuple[float, float]:
-    """95 % interval of the hypervolume by drawing seeds anew."""
-    areas = []
-    for _ in range(resamples):
-        drawn = [
-            Contender(name=c.name, cost=c.cost, qualities=tuple(rng.choice(c.qualities, len(c.qualities)).tolist()))
-            for c in candidates
-        ]
-        areas.append(hypervolume(drawn))
+    """95 % interval of the hypervolume by drawing captures anew, or of a single one, seeds."""
+    samples, costs = [c.samples for c in candidates], [c.cost for c in candidates]
+    areas = [_area(redrawn(samples, rng=rng), costs) for _ in range(resamples)]
     low, high = np.quantile(areas, [0.025, 0.975])
     return float(low), float(high)
 
@@ -72,16 +62,28 @@ def hypervolume_interval(
 def smallest_sufficient(candidates: Sequence[Contender], *, margin: float = SUFFICIENT_DB) -> Sufficient | None:
     """The cheapest candidate whose loss to the best has an upper 95 % bound (one-sided) below the margin.
 
-    None with fewer than two seeds, for one seed bounds nothing. The best itself loses nothing and always qualifies.
+    Captures are compared in pairs; on a single one, seeds. None where there is one of each, for it bounds nothing. The
+    best itself loses nothing and always qualifies.
     """
-    if not candidates or any(len(c.qualities) < 2 for c in candidates):
+    if not candidates:
         return None
     best = max(candidates, key=lambda c: c.quality)
     for candidate in sorted(candidates, key=lambda c: c.cost):
-        bound = 0.0 if candidate is best else welch(best.qualities, candidate.qualities, level=0.90).high
-        if bound < margin:
-            return Sufficient(name=candidate.name, best=best.name, loss_bound_db=bound)
+        loss = compared(best.samples, candidate.samples, level=0.90)
+        if loss is None or math.isnan(loss.high):
+            return None
+        if candidate is best or loss.high < margin:
+            return Sufficient(name=candidate.name, best=best.name, loss_bound_db=loss.high)
     return None
+
+
+def _area(qualities: Sequence[float], costs: Sequence[float]) -> float:
+    area, reached = 0.0, REFERENCE_DB
+    for cost, quality in sorted(zip(costs, qualities, strict=True)):
+        if cost < REFERENCE_MS and quality > reached:
+            area += math.log10(REFERENCE_MS / cost) * (quality - reached)
+            reached = quality
+    return area
 
 
 def _dominates(a: Contender, b: Contender) -> bool:

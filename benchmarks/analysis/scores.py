@@ -15,7 +15,7 @@ import pandas as pd
 
 from ash.files import InputError
 from benchmarks.analysis.names import is_ours
-from benchmarks.analysis.statistics import mean_interval
+from benchmarks.analysis.statistics import independent, mean_interval
 from benchmarks.cell.cells import CellConfig, CellResult
 from benchmarks.cell.metrics import METRICS
 from benchmarks.suites.suites import capture_name
@@ -200,43 +200,60 @@ class Scores:
         self.seeds = int(self.clean["seed"].nunique())
 
     @cached_property
-    def _cells(self) -> pd.DataFrame:
-        return self.clean.drop_duplicates(["scene", "method", "seed", "capture"])
+    def _cells(self) -> dict[str, dict[str, list[str]]]:
+        """How the cells of each scene and method ended."""
+        cells = self.clean.drop_duplicates(["scene", "method", "seed", "capture"])
+        found: dict[str, dict[str, list[str]]] = {}
+        for scene, method, status in zip(cells["scene"], cells["method"], cells["status"], strict=True):
+            found.setdefault(scene, {}).setdefault(method, []).append(status)
+        return found
 
     @cached_property
-    def _values(self) -> dict[tuple[str, ...], list[float]]:
-        """Per key, what its spread is taken over: the seeds; where the scene has several captures, their means."""
-        found: dict[tuple[str, ...], list[float]] = {}
-        for scene, rows in self.clean.groupby("scene", sort=False):
-            unit = "capture" if rows["capture"].nunique() > 1 else "seed"
-            means = rows.groupby([*KEYS, unit], sort=False)["value"].mean()
-            found |= {(scene, *key[1:]): list(own) for key, own in means.groupby(level=KEYS, sort=False)}
+    def _captures(self) -> dict[str, int]:
+        return {str(scene): int(count) for scene, count in self.clean.groupby("scene")["capture"].nunique().items()}
+
+    @cached_property
+    def _samples(self) -> dict[tuple[str, ...], dict[str, list[float]]]:
+        found: dict[tuple[str, ...], dict[str, list[float]]] = {}
+        for key, values in self.clean.groupby([*KEYS, "capture"], sort=False)["value"].agg(list).items():
+            found.setdefault(key[:-1], {})[key[-1]] = values
         return found
 
     @cached_property
     def _scores(self) -> dict[tuple[str, ...], Score]:
-        return {key: _score(values) for key, values in self._values.items()}
+        return {key: _score(self.values(key[0], key[1], Quantity(*key[2:]))) for key in self._samples}
 
     def methods(self, scene: str) -> tuple[str, ...]:
         """Methods on a scene: the user's own first, then ours in the suite's order."""
-        names = self._cells.loc[self._cells["scene"] == scene, "method"].unique()
-        return tuple(sorted(names, key=is_ours))
+        return tuple(sorted(self._cells.get(scene, ()), key=is_ours))
 
     def cells(self, scene: str, method: str) -> int:
         """How many cells a method has on a scene."""
-        return len(self._cells.query("scene == @scene and method == @method"))
+        return len(self._cells.get(scene, {}).get(method, ()))
 
     def captures(self, scene: str) -> int:
         """How many captures a scene has."""
-        return int(self._cells.loc[self._cells["scene"] == scene, "capture"].nunique())
+        return self._captures.get(scene, 0)
+
+    def unit(self, scene: str) -> str:
+        """What intervals of a scene are taken over."""
+        return "captures" if self.captures(scene) > 1 else "seeds"
+
+    def repeated(self, scene: str) -> bool:
+        """Whether a scene has what intervals need: several captures or several seeds."""
+        return self.captures(scene) > 1 or self.seeds > 1
 
     def failed(self, scene: str, method: str) -> int:
-        """How many of them failed."""
-        return len(self._cells.query("scene == @scene and method == @method and status != 'done'"))
+        """How many cells of a method on a scene failed."""
+        return sum(status != "done" for status in self._cells.get(scene, {}).get(method, ()))
+
+    def samples(self, scene: str, method: str, quantity: Quantity) -> dict[str, list[float]]:
+        """The quantity for each seed, by capture."""
+        return self._samples.get((scene, method, *quantity), {})
 
     def values(self, scene: str, method: str, quantity: Quantity) -> list[float]:
-        """The quantity for each seed, or for each capture where the scene has several."""
-        return self._values.get((scene, method, *quantity), [])
+        """What the quantity's spread is taken over: its seeds, or where the scene has several captures, their means."""
+        return independent(self.samples(scene, method, quantity))
 
     def get(self, scene: str, method: str, quantity: Quantity) -> Score | None:
         """The quantity with its spread, or None where no cell has it."""

@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 from itertools import product
+from math import isnan
 
 import pandas as pd
 
 from benchmarks.analysis.names import look_of
 from benchmarks.analysis.scores import RANKED_SPLITS, Scores
-from benchmarks.analysis.statistics import Interval, mean_interval, wilson
+from benchmarks.analysis.statistics import Interval, independent, mean_interval, wilson
 from benchmarks.suites.stress import AXES
 
 TRIVIAL = "nearest"  # the training image of the nearest pose and camera: below half the way to it, a method is broken
@@ -15,7 +16,7 @@ TRIVIAL = "nearest"  # the training image of the nearest pose and camera: below 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Step:
-    """A method at one severity: foreground PSNR over seeds (failed cells count with the worst score), and failures."""
+    """A method at one severity: foreground PSNR (failed cells count with the worst score), and failures."""
 
     severity: float
     quality: Interval
@@ -78,7 +79,7 @@ class Reliability:
     failures: int
     diverged: int
     rate: tuple[float, float]  # Wilson's interval of the failure rate
-    spread_db: float | None  # standard deviation over seeds, held-out views
+    spread_db: float | None  # standard deviation over the seeds of a capture, held-out views
 
     @property
     def title(self) -> str:
@@ -107,7 +108,7 @@ def reliability(scores: Scores, scene: str) -> tuple[Reliability, ...]:
         status = rows.drop_duplicates(["seed", "axis", "severity", "capture"])["status"]
         failures = int((status != "done").sum())
         good = rows.query("axis == '' and status == 'done' and region == 'foreground' and metric == 'psnr'")
-        clean = good.query("split == 'novel_view'")["value"]
+        spread = good.query("split == 'novel_view'").groupby("capture")["value"].var().mean() ** 0.5
         found.append(
             Reliability(
                 method=str(method),
@@ -115,7 +116,7 @@ def reliability(scores: Scores, scene: str) -> tuple[Reliability, ...]:
                 failures=failures,
                 diverged=int((status == "diverged").sum()),
                 rate=wilson(failures, len(status)),
-                spread_db=float(clean.std()) if len(clean) > 1 else None,
+                spread_db=None if isnan(spread) else float(spread),
             )
         )
     return tuple(found)
@@ -140,7 +141,12 @@ def _curve(rows: pd.DataFrame, scene: str, axis: str, split: str) -> Curve:
 
 def _step(severity: float, rows: pd.DataFrame) -> Step:
     failures = int((rows["status"] != "done").sum())
-    return Step(severity=severity, quality=mean_interval(list(rows["value"])), failures=failures, cells=len(rows))
+    return Step(
+        severity=severity,
+        quality=mean_interval(independent(rows.groupby("capture")["value"].agg(list).to_dict())),
+        failures=failures,
+        cells=len(rows),
+    )
 
 
 def _upper(quality: Interval) -> float:

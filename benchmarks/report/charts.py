@@ -31,31 +31,31 @@ def speed(
     for panel, own in placed.groupby("panel", sort=False):
         at = _xy("ms:Q", "psnr:Q", x, y, "ms per frame, one core", "foreground PSNR [dB]", log=True)
         tips = [("series", "method", ""), ("ms", "ms per frame", ".1f"), ("psnr", "PSNR [dB]", ".2f")]
-        seen = alt.Chart(_data(own)).transform_filter("indexof(hidden, datum.series) < 0")
+        seen = alt.Chart(inline(own)).transform_filter("indexof(hidden, datum.series) < 0")
         step = front[front["panel"] == panel]
         stair = pd.concat([step.head(1).assign(psnr=y[0]), step, step.tail(1).assign(ms=x[1])])
         layers = [
-            alt.Chart(_data(stair))
+            alt.Chart(inline(stair))
             .mark_line(interpolate="step-after", color=LINE, strokeWidth=1, clip=True)
             .encode(**at),
-            alt.Chart(_data(links[links["panel"] == panel]))
+            alt.Chart(inline(links[links["panel"] == panel]))
             .mark_line(color=LINE, strokeDash=[3, 3], clip=True)
             .encode(**at, detail="link:N"),
             _whiskers(seen, at, series),
             seen.transform_filter("datum.ringed").mark_point(size=330, filled=False, color=INK, clip=True).encode(**at),
             seen.mark_point(size=80, opacity=1, strokeWidth=2, clip=True).encode(
-                **at, **_look(series), tooltip=_tips(tips)
+                **at, **_look(series), tooltip=tooltips(tips)
             ),
             *_labels(seen, at, own),
             _text(seen.transform_filter("isValid(datum.below)"), at, "note:N", dy=-14),
         ]
         if x[0] < REAL_TIME_MS < x[1]:
             mark = pd.DataFrame({"ms": [REAL_TIME_MS], "psnr": [y[0]], "text": ["30 frames/s"]})
-            layers.append(alt.Chart(_data(mark)).mark_rule(strokeDash=[2, 4]).encode(x=at["x"]))
+            layers.append(alt.Chart(inline(mark)).mark_rule(strokeDash=[2, 4]).encode(x=at["x"]))
             late = math.log(REAL_TIME_MS / x[0]) > 0.8 * math.log(x[1] / x[0])  # No room is left on the right.
             place: dict[str, Any] = {"dx": -4, "align": "right"} if late else {"dx": 4, "align": "left"}
-            layers.append(_text(alt.Chart(_data(mark)), at, "text:N", dy=-6, color=DIM, **place))
-        panels.append(_layer(layers, f"{panel}", size, notes.get(str(panel), "")))
+            layers.append(_text(alt.Chart(inline(mark)), at, "text:N", dy=-6, color=DIM, **place))
+        panels.append(layered(layers, f"{panel}", size, notes.get(str(panel), "")))
     return tuple(panels), named
 
 
@@ -73,15 +73,15 @@ def curves(
     gaps = ends["y"].sort_values().diff().dropna() / (span[1] - span[0]) * size[1]
     named = names_at_ends and bool((gaps > 14).all())
     at = _xy("x:Q", "y:Q", domain, span, x, y, log=log)
-    seen = alt.Chart(_data(points)).transform_filter("indexof(hidden, datum.series) < 0")
-    last = alt.Chart(_data(ends)).transform_filter("indexof(hidden, datum.series) < 0")
-    tips = _tips([("series", "method", ""), ("x", x, ".3~s"), ("y", y, ".2f")])
+    seen = alt.Chart(inline(points)).transform_filter("indexof(hidden, datum.series) < 0")
+    last = alt.Chart(inline(ends)).transform_filter("indexof(hidden, datum.series) < 0")
+    tips = tooltips([("series", "method", ""), ("x", x, ".3~s"), ("y", y, ".2f")])
     layers = [
         seen.mark_line(strokeWidth=1.8, clip=True).encode(**at, **_stroke(series, dashes=True)),
         seen.mark_point(size=22, opacity=1, clip=True).encode(**at, **_look(series), tooltip=tips),
         *([_text(last, at, "series:N", dx=9, align="left")] if named else []),
     ]
-    return (_layer(layers, "", size),), named
+    return (layered(layers, "", size),), named
 
 
 def bars(rows: pd.DataFrame, series: Sequence[Series], *, x: str) -> tuple[alt.LayerChart, ...]:
@@ -90,19 +90,19 @@ def bars(rows: pd.DataFrame, series: Sequence[Series], *, x: str) -> tuple[alt.L
     totals = rows.groupby("row", sort=False, as_index=False)["value"].sum()
     y = alt.Y("row:N", sort=order, title=None, axis=alt.Axis(ticks=False, domain=False))
     limit = alt.Scale(domain=[0, float(totals["value"].max()) * 1.12])
-    seen = alt.Chart(_data(rows.assign(order=rows["series"].map({s.title: i for i, s in enumerate(series)}))))
+    seen = alt.Chart(inline(rows.assign(order=rows["series"].map({s.title: i for i, s in enumerate(series)}))))
     drawn = seen.transform_filter("indexof(hidden, datum.series) < 0").mark_bar(clip=True)
-    tips = _tips([("row", "method", ""), ("series", "stage", ""), ("value", x, ".2f")])
+    tips = tooltips([("row", "method", ""), ("series", "stage", ""), ("value", x, ".2f")])
     value = alt.X("value:Q", title=x, scale=limit)
     layers = [
         drawn.encode(
             y=y, x=value, order="order:Q", tooltip=tips, fill=_scale("fill", series, [s.colour for s in series])
         ),
-        alt.Chart(_data(totals))
+        alt.Chart(inline(totals))
         .mark_text(align="left", dx=5, color=DIM)
         .encode(y=y, x=alt.X("value:Q"), text=alt.Text("value:Q", format=".1f")),
     ]
-    return (_layer(layers, "", (WIDTH - 220, 30 * len(order))),)
+    return (layered(layers, "", (WIDTH - 220, 30 * len(order))),)
 
 
 def forest(effects: pd.DataFrame, series: Sequence[Series], *, x: str) -> tuple[alt.LayerChart, ...]:
@@ -126,11 +126,12 @@ def forest(effects: pd.DataFrame, series: Sequence[Series], *, x: str) -> tuple[
         y = alt.Y(
             "row:N", sort=order, title=None, scale=alt.Scale(domain=order), axis=alt.Axis(ticks=False, domain=False)
         )
-        seen = alt.Chart(_data(own)).transform_filter("indexof(hidden, datum.series) < 0")
-        tips = _tips([("row", "", ""), ("mean", "difference", "+.2f"), ("low", "from", "+.2f"), ("high", "to", "+.2f")])
+        seen = alt.Chart(inline(own)).transform_filter("indexof(hidden, datum.series) < 0")
+        span = [("low", "from", "+.2f"), ("high", "to", "+.2f")]
+        tips = tooltips([("row", "", ""), ("mean", "difference", "+.2f"), *span])
         arrow: dict[str, Any] = {"size": 40, "opacity": 1, "clip": True}
         layers = [
-            alt.Chart(_data(own.head(1))).mark_rule().encode(x=alt.X("zero:Q")),
+            alt.Chart(inline(own.head(1))).mark_rule().encode(x=alt.X("zero:Q")),
             seen.mark_rule(strokeWidth=1.8, clip=True).encode(x=alt.X("start:Q"), x2="end:Q", y=y, **_stroke(series)),
             seen.transform_filter("datum.mean >= datum.left && datum.mean <= datum.right")
             .mark_point(size=60, opacity=1)
@@ -142,7 +143,7 @@ def forest(effects: pd.DataFrame, series: Sequence[Series], *, x: str) -> tuple[
             .mark_point(shape="triangle-right", **arrow)
             .encode(x="right:Q", y=y, **_stroke(series)),
         ]
-        panels.append(_layer(layers, str(panel), (300, 24 * len(order))))
+        panels.append(layered(layers, str(panel), (300, 24 * len(order))))
     return tuple(panels)
 
 
@@ -171,31 +172,31 @@ def lines(
             else alt.X("x:O", title=title, sort=list(own["x"].unique()), axis=alt.Axis(labelAngle=0)),
             "y": alt.Y("y:Q", title=y, scale=alt.Scale(domain=span, nice=False, zero=False)),
         }
-        seen = alt.Chart(_data(own)).transform_filter("indexof(hidden, datum.series) < 0")
+        seen = alt.Chart(inline(own)).transform_filter("indexof(hidden, datum.series) < 0")
         here = rules[rules["panel"] == panel]
-        tips = _tips(
+        tips = tooltips(
             [("series", "", ""), ("x", title, ""), ("y", y, ".2f"), ("low", "from", ".2f"), ("high", "to", ".2f")]
         )
         layers = [
-            alt.Chart(_data(here)).mark_rule(strokeDash=[2, 4]).encode(y=at["y"]),
+            alt.Chart(inline(here)).mark_rule(strokeDash=[2, 4]).encode(y=at["y"]),
             seen.mark_line(strokeWidth=1.8, clip=True).encode(**at, **_stroke(series)),
             _whiskers(seen, at, series),
             seen.mark_point(size=50, opacity=1, clip=True).encode(**at, **_look(series), tooltip=tips),
             seen.transform_filter("datum.crossed")
             .mark_point(shape="M-1,-1L1,1M1,-1L-1,1", size=110, strokeWidth=2, color=INK, opacity=1)
             .encode(**at),
-            alt.Chart(_data(here))
+            alt.Chart(inline(here))
             .mark_text(align="left", dx=4, dy=-6, color=DIM)
             .encode(x=alt.value(0), y=at["y"], text="text:N"),
         ]
-        panels.append(_layer(layers, str(panel), size))
+        panels.append(layered(layers, str(panel), size))
     return tuple(panels)
 
 
 def frames(points: pd.DataFrame, series: Sequence[Series]) -> tuple[alt.LayerChart, ...]:
     """PSNR per frame: `points` has track, series, frame, psnr. The page sets the signals `track` and `frame`."""
     span = _domain(points, ["psnr"], pad=0.06)
-    shown = alt.Chart(_data(points)).transform_filter("datum.track == track && indexof(hidden, datum.series) < 0")
+    shown = alt.Chart(inline(points)).transform_filter("datum.track == track && indexof(hidden, datum.series) < 0")
     at = {
         "x": alt.X(
             "frame:Q", title="frame", scale=alt.Scale(nice=False, zero=False), axis=alt.Axis(format="d", tickMinStep=1)
@@ -203,17 +204,18 @@ def frames(points: pd.DataFrame, series: Sequence[Series]) -> tuple[alt.LayerCha
         "y": alt.Y("psnr:Q", title="foreground PSNR [dB]", scale=alt.Scale(domain=span, nice=False, zero=False)),
     }
     now = alt.Chart(alt.Data(values=[{}])).transform_calculate(frame="frame")
-    tips = _tips([("series", "method", ""), ("frame", "frame", "d"), ("psnr", "PSNR [dB]", ".2f")])
+    tips = tooltips([("series", "method", ""), ("frame", "frame", "d"), ("psnr", "PSNR [dB]", ".2f")])
     layers = [
         now.mark_rule(color=INK, strokeWidth=1.5).encode(x=at["x"]),
         shown.mark_line(strokeWidth=1.6).encode(**at, **_stroke(series, dashes=True)),
         shown.mark_point(size=24, opacity=1).encode(**at, **_look(series), tooltip=tips),
     ]
     signals = [alt.param(name="track", value=0), alt.param(name="frame", value=0)]
-    return (_layer(layers, "", (WIDTH - 80, 190)).add_params(*signals),)
+    return (layered(layers, "", (WIDTH - 80, 190)).add_params(*signals),)
 
 
-def _layer(layers: Sequence[alt.Chart], title: str, size: tuple[int, int], note: str = "") -> alt.LayerChart:
+def layered(layers: Sequence[alt.Chart], title: str, size: tuple[int, int], note: str = "") -> alt.LayerChart:
+    """Layers as one panel, whose series the page can hide."""
     heading = alt.TitleParams(title, subtitle=note) if note else alt.TitleParams(title)
     hidden = alt.param(name="hidden", value=[])
     drawn: Any = alt.layer(*layers)
@@ -221,7 +223,7 @@ def _layer(layers: Sequence[alt.Chart], title: str, size: tuple[int, int], note:
     return chart.properties(title=heading) if title else chart
 
 
-def _data(table: pd.DataFrame) -> alt.Data:
+def inline(table: pd.DataFrame) -> alt.Data:
     """The rows inline, NaN as null."""
     return alt.Data(values=json.loads(table.to_json(orient="records", double_precision=6)))
 
@@ -273,7 +275,7 @@ def _whiskers(chart: alt.Chart, at: dict[str, Any], series: Sequence[Series]) ->
     )
 
 
-def _tips(fields: Sequence[tuple[str, str, str]]) -> list[alt.Tooltip]:
+def tooltips(fields: Sequence[tuple[str, str, str]]) -> list[alt.Tooltip]:
     """What is shown to the pointer: field, title and format."""
     return [
         alt.Tooltip(f"{field}:Q", title=title, format=how) if how else alt.Tooltip(f"{field}:N", title=title or " ")
@@ -363,4 +365,5 @@ def _number_axis(values: pd.Series, title: str, *, log: bool) -> alt.X:
         domain = _log_domain(values, 1.1)
         scale = alt.Scale(type="log", domain=domain, nice=False)
         return alt.X("x:Q", title=title, scale=scale, axis=alt.Axis(values=_log_ticks(domain), format="~s"))
-    return alt.X("x:Q", title=title, axis=alt.Axis(values=sorted(values.unique()), format="~g"))
+    scale = alt.Scale(padding=8, nice=False, zero=False)  # Room for the marks at both ends.
+    return alt.X("x:Q", title=title, scale=scale, axis=alt.Axis(values=sorted(values.unique()), format="~g"))

@@ -2,6 +2,7 @@
 
 import base64
 import io
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,12 +11,12 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 from PIL import Image
-from scipy import stats
 
 from ash.capture.formats import load_capture
 from ash.files import InputError, write_atomic
 from benchmarks.analysis.names import SPLIT_NAMES
 from benchmarks.analysis.scores import RANKED_SPLITS
+from benchmarks.analysis.statistics import Difference, compared
 from benchmarks.cell.cells import Cell, CellResult, ViewScore, read_result, stored_prediction
 from benchmarks.cell.metrics import METRICS, on_black
 from benchmarks.cell.views import View
@@ -23,7 +24,7 @@ from benchmarks.report.page import environment
 from benchmarks.report.pictures import crop_of, on_paper
 from benchmarks.suites.runs import Run, results_of
 
-Verdict = Literal["better", "worse", "identical", "no change seen", "one seed", "only before", "only after"]
+Verdict = Literal["better", "worse", "identical", "no change seen", "too few", "only before", "only after"]
 QUANTITIES = (
     ("novel_view", "foreground", "psnr"),
     ("novel_pose", "foreground", "psnr"),
@@ -40,7 +41,7 @@ Rows = dict[tuple[str, str], list[tuple[Cell, CellResult]]]
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Change:
-    """One quantity of one row, in both runs: means over seeds, and the 95 % interval of their difference (Welch)."""
+    """One quantity of one row, in both runs: means, and the 95 % interval of their difference."""
 
     scene: str
     method: str
@@ -129,14 +130,13 @@ def _change(
     after: list[tuple[Cell, CellResult]],
 ) -> Change | None:
     split, _, metric = quantity
-    old, new = ([v for _, result in cells if (v := result.value(*quantity)) is not None] for cells in (before, after))
+    old, new = (_samples(cells, quantity) for cells in (before, after))
     if not old and not new:
         return None
-    low = high = None
-    if len(old) > 1 and len(new) > 1 and np.ptp(old) + np.ptp(new) > 0:
-        interval = stats.ttest_ind(new, old, equal_var=False).confidence_interval(0.95)
-        low, high = float(interval.low), float(interval.high)
-    means = [float(np.mean(values)) if values else None for values in (old, new)]
+    means = [float(np.mean([np.mean(own) for own in samples.values()])) if samples else None for samples in (old, new)]
+    test = compared(new, old)
+    sure = test is not None and not math.isnan(test.low)
+    same = split != "speed" and _pictures(before) == _pictures(after) != set()
     return Change(
         scene=row[0],
         method=row[1],
@@ -144,35 +144,40 @@ def _change(
         unit=METRICS[metric].unit,
         before=means[0],
         after=means[1],
-        change=None if means[0] is None or means[1] is None else means[1] - means[0],
-        low=low,
-        high=high,
-        verdict=_verdict(
-            metric, old, new, low, high, split != "speed" and _pictures(before) == _pictures(after) != set()
-        ),
+        change=test.mean if test else None,
+        low=test.low if test and sure else None,
+        high=test.high if test and sure else None,
+        verdict="only before"
+        if not new
+        else "only after"
+        if not old
+        else "identical"
+        if same
+        else _verdict(metric, test),
     )
 
 
-def _verdict(
-    metric: str, old: list[float], new: list[float], low: float | None, high: float | None, same: bool
-) -> Verdict:
-    if not old or not new:
-        return "only before" if old else "only after"
-    if same:
-        return "identical"
-    if low is None or high is None:
-        if len(old) < 2 or len(new) < 2:
-            return "one seed"
-        low = high = float(np.mean(new) - np.mean(old))
-    if low <= 0 <= high:
+def _samples(cells: list[tuple[Cell, CellResult]], quantity: tuple[str, str, str]) -> dict[str, list[float]]:
+    """A quantity for each seed, by subject."""
+    found: dict[str, list[float]] = {}
+    for cell, result in cells:
+        if (value := result.value(*quantity)) is not None:
+            found.setdefault(str(cell.config.subject), []).append(value)
+    return found
+
+
+def _verdict(metric: str, test: Difference | None) -> Verdict:
+    if test is None or math.isnan(test.low):
+        return "too few"
+    if test.low <= 0 <= test.high:
         return "no change seen"
-    return "better" if (low > 0) == (METRICS[metric].direction == "up") else "worse"
+    return "better" if (test.low > 0) == (METRICS[metric].direction == "up") else "worse"
 
 
-def _pictures(cells: list[tuple[Cell, CellResult]]) -> set[tuple[int, str, str, int, str]]:
-    """Every picture of a row, by seed and view."""
+def _pictures(cells: list[tuple[Cell, CellResult]]) -> set[tuple[int, int, str, str, int, str]]:
+    """Every picture of a row, by subject, seed and view."""
     return {
-        (cell.config.seed, view.split, view.camera, view.frame, view.prediction)
+        (cell.config.subject, cell.config.seed, view.split, view.camera, view.frame, view.prediction)
         for cell, result in cells
         for view in result.views
     }

@@ -54,7 +54,7 @@ class Entry:
     """One number as it is printed; `sort` is the number itself (None: not measured)."""
 
     text: str
-    spread: str = ""  # half of the 95 % interval over seeds
+    spread: str = ""  # half of the 95 % interval
     sort: float | None = None
     mark: Mark = ""
 

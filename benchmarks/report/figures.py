@@ -80,8 +80,8 @@ def speed_figure(scores: Scores, scene: str) -> Figure | None:
         "those that "
         "no other beats in both."
     )
-    if scores.seeds > 1:
-        caption += " Whiskers: 95 % interval over seeds. Ringed: the smallest sufficient method."
+    if scores.repeated(scene):
+        caption += f" Whiskers: 95 % interval over {scores.unit(scene)}. Ringed: the smallest sufficient method."
     title = "Accuracy against speed"
     return Figure(name=scene, title=title, caption=caption, panels=panels, series=tuple(looks.values()), named=named)
 
@@ -106,8 +106,8 @@ AHEAD = (
 )
 
 
-def effects_figure(found: Sequence[Contrast], scene: str) -> Figure | None:
-    """The contrasts as a chart, where they are many enough for a table to be hard to read."""
+def effects_figure(found: Sequence[Contrast], scene: str, *, over: str) -> Figure | None:
+    """The contrasts as a chart, where they are many enough for a table to be hard to read, over seeds or captures."""
     rows = [
         {
             "panel": SPLIT_NAMES[c.split].title,
@@ -125,7 +125,7 @@ def effects_figure(found: Sequence[Contrast], scene: str) -> Figure | None:
     return Figure(
         name=f"effects_{scene}",
         title="Differences with intervals",
-        caption="Foreground PSNR of ASH minus that of the row, with the 95 % interval over seeds. Arrows: it goes on "
+        caption=f"Foreground PSNR of ASH minus that of the row, with the 95 % interval over {over}. Arrows: it goes on "
         "beyond the scale.",
         panels=charts.forest(table, AHEAD, x="ASH minus the row [dB]"),
         series=AHEAD,

@@ -76,10 +76,12 @@ GLOSSARY = {
     "hypervolume": "The area that the best methods cover between accuracy and the logarithm of time, up to a frame per "
     "second at 10 dB: one number for the whole field.",
     "smallest sufficient": "The cheapest method whose loss to the best is surely below half a decibel.",
-    "Welch": "Welch's t test: two means of unequal variance, here over seeds, or over captures in pairs.",
+    "Welch": "Welch's t test: two means of unequal variance, here over the seeds of a single capture.",
+    "paired t": "Student's t test of the differences between two methods, a mean over seeds for each capture.",
     "Holm": "Holm's correction (1979): keeps the chance of any false alarm among all rows at 5 %.",
-    "hierarchical bootstrap": "An interval from drawing seeds and images anew; a little too narrow for three seeds.",
-    "detectable": "The smallest true difference that this number of seeds would find four times in five.",
+    "hierarchical bootstrap": "An interval from drawing captures and images anew, or the seeds of a single capture; a "
+    "little too narrow for three of them.",
+    "detectable": "The smallest true difference that this number of captures or seeds would find four times in five.",
     "Kendall's tau": "Agreement of two rankings: 1 the same order, -1 the opposite one.",
     "breakdown point": "The least severity at which a method is surely worse than half way to the nearest "
     "training image.",

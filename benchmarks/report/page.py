@@ -12,7 +12,7 @@ from markupsafe import Markup, escape
 
 from ash.files import InputError, write_atomic
 from benchmarks.analysis.scores import Scores, csv_of, scores_of
-from benchmarks.report import content, escaping, glossary, sections, sentences, tables, vega
+from benchmarks.report import content, escaping, glossary, needs, sections, sentences, tables, vega
 from benchmarks.report.content import Report, Section
 from benchmarks.report.pictures import Album
 from benchmarks.report.scene import FEW_WORST, MANY, WORST, SceneData, SceneReport, scene_report
@@ -39,7 +39,7 @@ def write_report(run: Run) -> list[str]:
         title=f"Report of suite {run.suite}",
         sections=(
             Section(title="", blocks=(content.Text(text=run.about[:1].upper() + run.about[1:] + "."),)),
-            *sections.needs(scores),
+            *needs.sections(scores),
             *sections.stabilities(scores),
             *findings,
             *(section for scene in scenes.values() for section in scene.sections),

@@ -7,14 +7,13 @@ import pandas as pd
 from ash.capture.dataset import Capture
 from ash.capture.formats import load_capture
 from ash.files import InputError
-from benchmarks.analysis import contrasts, conventions
+from benchmarks.analysis import conventions
 from benchmarks.analysis.causes import REGIONS
-from benchmarks.analysis.contrasts import Contrast
 from benchmarks.analysis.names import EXACT, SPLIT_NAMES, is_ours, look_of
 from benchmarks.analysis.scores import RANKED_SPLITS, Quantity, Scores, curves_of, foreground
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS
-from benchmarks.report import charts, figures, pictures, sentences, tables, vega
+from benchmarks.report import charts, established, figures, pictures, sentences, tables, vega
 from benchmarks.report.content import (
     Block,
     Bullets,
@@ -86,12 +85,13 @@ def scene_report(data: SceneData) -> SceneReport:
     quality = tables.build(scores, scene, _quality_quantities(), title=f"Accuracy on {scene}", exposed=exposed)
     cost = tables.build(scores, scene, tables.cost_columns(COSTS), title=f"Cost on {scene}", exposed=exposed)
     more = _more_tables(scores, scene)
+    quality_note = f"{QUALITY_NOTE} {established.note(scores, scene)}"
     picture_sections, sheets = _picture_sections(data, capture, shown, trouble)
     sections = [
         Section(title=scene, headline=sentences.headline(scores, scene), blocks=tuple(_opening(data, capture))),
-        Section(title=quality.title, blocks=(_untitled(quality), Text(text=QUALITY_NOTE, note=True), *notes)),
+        Section(title=quality.title, blocks=(_untitled(quality), Text(text=quality_note, note=True), *notes)),
         Section(title=cost.title, blocks=(_untitled(cost), Text(text=COST_NOTE, note=True), *notes)),
-        *_contrasts(scores, scene),
+        *established.sections(scores, scene),
         *_exact(scores, scene),
         *picture_sections,
         *_time(data),
@@ -107,8 +107,7 @@ QUALITY_NOTE = (
     "methods that see only training views; those below the line were given the exact surface, and are not "
     "ranked. n/a: not "
     "measured (LPIPS needs the user's AlexNet weights). Where an interval would reach below zero, the range of "
-    "the seeds "
-    "stands instead."
+    "the values stands instead."
 )
 COST_NOTE = (
     "A frame and its stages: median over frames after warm-up, one core, while other cells may run beside it. "
@@ -178,44 +177,6 @@ def _more_tables(scores: Scores, scene: str) -> tuple[Table, ...]:
     }
     found = [tables.build(scores, scene, quantities, title=title) for title, quantities in asked.items()]
     return tuple(table for table in found if table.columns)
-
-
-def _contrasts(scores: Scores, scene: str) -> list[Section]:
-    found = contrasts.contrasts(scores, scene)
-    if not found:
-        return []
-    heads = (
-        Head(title="split"),
-        Head(title="difference", unit="dB"),
-        Head(title="95 % interval", unit="seed means, Welch", term="Welch"),
-        Head(title="95 % interval of images", unit="bootstrap", term="hierarchical bootstrap"),
-        Head(title="p", unit="Holm", term="Holm"),
-        Head(title="effect", unit="standard deviations"),
-        Head(title="detectable", unit="dB", term="detectable"),
-    )
-    table = Table(title="", corner="ASH minus", columns=heads, rows=tuple(map(_contrast_row, found)))
-    note = (
-        "Foreground PSNR. Bold: chance is excluded at 5 % among all rows. Detectable: the smallest true "
-        "difference that this "
-        "number of seeds would find four times in five."
-    )
-    figure = figures.effects_figure(found, scene)
-    charted: tuple[Block, ...] = (Chart(figure=figure),) if figure else ()
-    blocks = (*charted, table, Text(text=note, note=True))
-    return [Section(title=f"Which differences are established on {scene}", blocks=blocks)]
-
-
-def _contrast_row(c: Contrast) -> Row:
-    numbers = (
-        Entry(text=SPLIT_NAMES[c.split].title),
-        Entry(text=f"{c.test.mean:+.2f}", sort=c.test.mean, mark="strong" if c.established else ""),
-        Entry(text=f"[{c.test.low:+.2f}, {c.test.high:+.2f}]", sort=c.test.low),
-        Entry(text="n/a" if c.bootstrap[0] != c.bootstrap[0] else f"[{c.bootstrap[0]:+.2f}, {c.bootstrap[1]:+.2f}]"),
-        Entry(text=f"{c.p_adjusted:.2g}", sort=c.p_adjusted),
-        Entry(text=f"{c.test.effect:.1f}", sort=c.test.effect),
-        Entry(text=f"{c.test.detectable:.2f}", sort=c.test.detectable),
-    )
-    return Row(name=c.title, entries=numbers)
 
 
 def _exact(scores: Scores, scene: str) -> list[Section]:

@@ -4,29 +4,18 @@ from collections.abc import Iterable, Sequence
 
 import pandas as pd
 
-from benchmarks.analysis import anytime, footage, margin, necessity, paper, stability
+from benchmarks.analysis import anytime, footage, margin, paper, stability
 from benchmarks.analysis.names import SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Scores, foreground
-from benchmarks.analysis.statistics import Difference
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS, PROTOCOL
 from benchmarks.report import charts, vega
-from benchmarks.report.content import Block, Bullets, Chart, Entry, Head, Mark, Row, Section, Table, Text, texts
+from benchmarks.report.content import Block, Bullets, Chart, Entry, Head, Row, Section, Table, Text, texts
 from benchmarks.report.glossary import GLOSSARY
 from benchmarks.report.tables import entry_of
 from benchmarks.report.vega import Figure, Series
 
-WHISKERS = "Whiskers: 95 % interval over seeds."
-
-
-def needs(scores: Scores) -> list[Section]:
-    """What each scene needs, where parts were taken away."""
-    tables = [_need_table(matrix) for split in RANKED_SPLITS if (matrix := necessity.matrix(scores, split))]
-    note = (
-        "Foreground PSNR in dB that ASH loses when the part is taken away, with the 95 % interval over seeds. Needed: "
-        "surely more than 0.2 dB. Not needed: surely less. Harmful: the scene is better off without."
-    )
-    return [Section(title="What each scene needs", blocks=(*tables, Text(text=note, note=True)))] if tables else []
+WHISKERS = "Whiskers: 95 % interval over seeds, or over captures where there are several."
 
 
 def margins(scores: Scores) -> list[Section]:
@@ -110,7 +99,7 @@ def _spent_figure(table: pd.DataFrame, name: str, title: str, spent: str, x_titl
         }
     )
     panels = charts.lines(samples, looks, y="foreground PSNR [dB]", size=(390, 240), log=True)
-    caption = "Foreground PSNR, mean over seeds and its 95 % interval."
+    caption = f"Foreground PSNR. {WHISKERS}"
     return Figure(name=name, title=title, caption=caption, panels=panels, series=looks)
 
 
@@ -134,7 +123,8 @@ def beside_the_paper(scores: Scores, suite: str) -> list[Section]:
     note = (
         "The paper: captured data at 1285x940 and weeks on a GPU, PSNR of the release's convention. Ours: "
         "foreground PSNR "
-        f"on {suite}. Levels cannot be compared, orders can; interval of Kendall's tau: seeds drawn anew."
+        f"on {suite}. Levels cannot be compared, orders can; interval of Kendall's tau: captures, or seeds of a "
+        "single one, drawn anew."
     )
     return [Section(title="Beside the paper", blocks=(*blocks, Text(text=note, note=True)))] if blocks else []
 
@@ -154,6 +144,7 @@ def provenance(results: Sequence[CellResult], command: str) -> Section:
     """Where the numbers come from; cells made at several places are listed with all of them."""
     known = [result.provenance for result in results if result.provenance is not None]
     facts = [("protocol", PROTOCOL), ("commit", _all_of(p.commit for p in known))]
+    facts.append(("code", _all_of(r.config.code for r in results)))
     for name in ("processor", "cores", "memory_gb", "system", "gpu", "python"):
         facts.append((name.replace("_gb", " [GB]"), _all_of(p.machine.get(name, "unknown") for p in known)))
     for name in sorted({name for p in known for name in p.versions}):
@@ -164,7 +155,8 @@ def provenance(results: Sequence[CellResult], command: str) -> Section:
     facts += [("command", command)] if command else []
     note = (
         f"Protocol {PROTOCOL}: predictions are quantised to 8 bits on black before anything is compared. "
-        f"results.csv beside "
+        "Code: hash of the sources that decide a cell. "
+        "results.csv beside "
         "this report has every number; each cell's result.json the scores of every image. Differences are taken before "
         "numbers are rounded."
     )
@@ -187,21 +179,6 @@ def _all_of(values: Iterable[str]) -> str:
 
 def _chart(figure: Figure) -> Chart:
     return Chart(figure=figure)
-
-
-def _need_table(matrix: necessity.Matrix) -> Table:
-    marks: dict[str, Mark] = {"needed": "best", "harmful": "second"}
-
-    def entry(loss: Difference | None) -> Entry:
-        if loss is None:
-            return Entry(text="n/a")
-        verdict = necessity.verdict(loss)
-        interval = "" if verdict == "unknown" else f" [{loss.low:+.2f}, {loss.high:+.2f}] {verdict}"
-        return Entry(text=f"{loss.mean:+.2f}{interval}", sort=loss.mean, mark=marks.get(verdict, ""))
-
-    rows = tuple(Row(name=row.scene, entries=tuple(map(entry, row.losses))) for row in matrix.rows)
-    columns = tuple(Head(title=part, unit="dB lost") for part in matrix.parts)
-    return Table(title=SPLIT_NAMES[matrix.split].title, corner="scene", columns=columns, rows=rows)
 
 
 def _place(curve: margin.MarginCurve) -> str:
@@ -290,7 +267,12 @@ def _reliability(scores: Scores, scene: str) -> Table:
         )
         for row in stability.reliability(scores, scene)
     )
-    titles = ("failed cells", "95 % interval of the rate", "diverged", "spread over seeds, clean, held-out views")
+    titles = (
+        "failed cells",
+        "95 % interval of the rate",
+        "diverged",
+        "spread over the seeds of a capture, clean, held-out views",
+    )
     return Table(title="Reliability", columns=tuple(Head(title=title) for title in titles), rows=rows)
 
 

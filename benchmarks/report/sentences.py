@@ -47,8 +47,10 @@ def remarks(scores: Scores, scene: str) -> list[str]:
     found.append(f"Decoders carry nothing, the same output in every frame: {dead}." if dead else "")
     failed = [look_of(method).title for method in scores.methods(scene) if scores.failed(scene, method)]
     found.append(f"Failed, and scored with the worst value: {', '.join(failed)}." if failed else "")
-    if scores.seeds == 1:
+    if not scores.repeated(scene):
         found.append("One seed: a difference of a few tenths of a dB may be chance; --seeds 3 gives intervals.")
+    elif scores.captures(scene) == 1:
+        found.append("One capture: intervals are over seeds, and say nothing about other people; --subjects 8 does.")
     return [remark for remark in found if remark]
 
 
@@ -88,7 +90,7 @@ def frontier(scores: Scores, scene: str) -> tuple[str, ...]:
             continue
         names = ", ".join(look_of(name).title for name in pareto.front(competing))
         area = f"hypervolume {pareto.hypervolume(competing):.1f} dB·decades"
-        if scores.seeds > 1:
+        if scores.repeated(scene):
             low, high = pareto.hypervolume_interval(competing, rng=np.random.default_rng(0))
             area += f" [{low:.1f}, {high:.1f}]"
         sentence = f"On {SPLIT_NAMES[split].words}, nobody beats {names} in both accuracy and speed ({area})."

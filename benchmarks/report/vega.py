@@ -123,7 +123,7 @@ def _alive(panel: alt.LayerChart) -> dict[str, Any]:
     """A panel for the page: as wide as its box, on the page's paper, with zoom, its legend left to the page."""
     spec: dict[str, Any] = _without_legends(panel.properties(width="container").to_dict(validate=False))
     zoom = {"type": "interval", "zoom": "wheel![event.ctrlKey || event.metaKey]"}
-    at = next(i for i, layer in enumerate(spec["layer"]) if layer["mark"]["type"] in ("point", "bar"))
+    at = next(i for i, layer in enumerate(spec["layer"]) if layer["mark"]["type"] in ("point", "bar", "rect"))
     if spec["layer"][at]["mark"]["type"] == "point" and _is_continuous(spec["layer"][at]["encoding"]):
         spec["layer"][at]["params"] = [{"name": "zoom", "select": zoom, "bind": "scales"}]
     return spec | {"config": {**CONFIG, "background": None}, "autosize": {"type": "fit-x", "contains": "padding"}}

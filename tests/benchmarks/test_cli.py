@@ -269,7 +269,7 @@ for verb in VERBS:
         ("run ci extra", "unexpected 'extra'"),
         ("run --scenes nosuch", "unknown scene 'nosuch', expected one of mannequin, "),
         ("run --methods nosuch", "unknown method 'nosuch', expected one of"),
-        ("run --size huge --dry-run", "unknown size 'huge', expected one of ci, quick, long, table, paper"),
+        ("run --size huge --dry-run", "unknown size 'huge', expected one of ci, rung, quick, long, table, paper"),
         ("speed else", "WHAT: expected one of kernels, frame, got 'else'"),
         ("verify", "expected FOLDER"),
         ("export", "expected FOLDER and --format"),

@@ -5,7 +5,7 @@ from benchmarks.analysis.pareto import Contender, front, hypervolume, hypervolum
 
 
 def candidate(name: str, quality: float, cost: float, spread: float = 0.05) -> Contender:
-    return Contender(name=name, qualities=(quality - spread, quality, quality + spread), cost=cost)
+    return Contender(name=name, samples={"a": (quality - spread, quality, quality + spread)}, cost=cost)
 
 
 FIELD = [candidate("best", 30.0, 100.0), candidate("near", 29.8, 40.0), candidate("fast", 25.0, 5.0)]
@@ -37,4 +37,21 @@ def test_the_smallest_sufficient_is_the_cheapest_that_is_not_inferior() -> None:
     assert strict is not None and strict.name == "best"
     noisy = [FIELD[0], candidate("near", 29.8, 40.0, spread=1.0), FIELD[2]]
     assert smallest_sufficient(noisy).name == "best", "what is not known not to be inferior does not suffice"
-    assert smallest_sufficient([Contender(name="a", qualities=(20.0,), cost=1.0)]) is None
+    assert smallest_sufficient([Contender(name="a", samples={"a": (20.0,)}, cost=1.0)]) is None
+
+
+def test_captures_are_compared_and_drawn_in_pairs() -> None:
+    """Captures differ by far more than the methods: seen as samples nothing would suffice, in pairs the cheap one."""
+    levels = {"a": 20.0, "b": 24.0, "c": 29.0, "d": 31.0}
+    best = Contender(name="best", cost=50.0, samples={name: (level + 0.2,) for name, level in levels.items()})
+    shifts = (0.0, 0.02, -0.02, 0.01)
+    cheap = Contender(
+        name="cheap",
+        cost=5.0,
+        samples={name: (level + shift,) for (name, level), shift in zip(levels.items(), shifts, strict=True)},
+    )
+    found = smallest_sufficient([best, cheap])
+    assert found is not None and found.name == "cheap" and 0.2 < found.loss_bound_db < 0.25
+    low, high = hypervolume_interval([best, cheap], rng=np.random.default_rng(0), resamples=300)
+    assert high - low > 5, "which captures there are matters"
+    assert smallest_sufficient([best, Contender(name="x", cost=1.0, samples={"elsewhere": (20.0, 21.0)})]) is None

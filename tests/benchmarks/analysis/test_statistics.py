@@ -3,12 +3,16 @@ import pytest
 from scipy import optimize, stats
 
 from benchmarks.analysis.statistics import (
+    compared,
+    detectable,
     hierarchical_bootstrap,
     holm,
+    independent,
     kendall,
     mean_interval,
     noncentrality,
     paired,
+    redrawn,
     welch,
     wilson,
 )
@@ -133,3 +137,44 @@ def test_no_spread_and_too_few() -> None:
     for wrong in (lambda: welch([1.0], [1.0, 2.0]), lambda: paired([1.0, 2.0], [1.0, 2.0, 3.0]), lambda: wilson(3, 2)):
         with pytest.raises(ValueError, match="expected"):
             wrong()
+
+
+def test_captures_are_compared_in_pairs_and_their_seeds_are_averaged() -> None:
+    a = {"x": [24.0, 26.0], "y": [30.0, 32.0], "z": [28.0, 28.0], "of a alone": [99.0]}
+    b = {"z": [27.5], "y": [30.0], "x": [24.6]}
+    found, by_hand = compared(a, b), stats.ttest_rel([25.0, 31.0, 28.0], [24.6, 30.0, 27.5])
+    assert found is not None and found.pairs == 3
+    assert (found.mean, found.p) == pytest.approx((1.9 / 3, by_hand.pvalue))
+    assert found.spread == pytest.approx(np.std([0.4, 1.0, 0.5], ddof=1))
+    assert found.detectable == pytest.approx(detectable(found.spread, 3))
+    assert independent(a)[:3] == [25.0, 31.0, 28.0] and independent({"x": [1.0, 2.0]}) == [1.0, 2.0]
+
+
+def test_on_one_capture_seeds_are_samples_and_one_value_knows_no_interval() -> None:
+    a, b = {"x": [24.0, 24.2, 24.4]}, {"x": [23.0, 23.3], "y": [50.0, 51.0]}
+    assert compared(a, b) == welch(a["x"], b["x"])
+    single = compared({"x": [24.0]}, {"x": [23.0, 23.5]})
+    assert single is not None and single.mean == 0.75 and np.isnan([single.low, single.p, single.detectable]).all()
+    assert compared({"x": [1.0]}, {"y": [1.0]}) is None
+
+
+def test_what_is_detectable_falls_with_the_number_of_captures() -> None:
+    found = [detectable(0.3, captures) for captures in (1, 2, 4, 8, 16)]
+    assert found[0] == np.inf and found == sorted(found, reverse=True)
+    assert found[3] == pytest.approx(power_of_80_percent(7) * 0.3 / np.sqrt(8))
+    rng = np.random.default_rng(5)
+    shown = sum(paired(list(rng.normal(found[2], 0.3, 4)), [0.0] * 4).p < 0.05 for _ in range(1000))
+    assert shown / 1000 == pytest.approx(0.8, abs=0.04)
+
+
+def test_evidence_is_drawn_anew_by_captures_for_all_methods_alike() -> None:
+    rng = np.random.default_rng(6)
+    levels = {"x": [20.0], "y": [25.0], "z": [30.0]}
+    drawn = [
+        redrawn([levels, {name: [v + 1 for v in own] for name, own in levels.items()}], rng=rng) for _ in range(50)
+    ]
+    assert {round(b - a, 9) for a, b in drawn} == {1.0} and len({a for a, _ in drawn}) > 3
+    seeds = [redrawn([{"x": [1.0, 2.0]}, {"x": [1.0, 2.0]}], rng=rng) for _ in range(50)]
+    assert {a == b for a, b in seeds} == {True, False}, "seeds of two methods have nothing to do with each other"
+    with pytest.raises(ValueError, match="a capture in common"):
+        redrawn([{"x": [1.0]}, {"y": [1.0]}], rng=rng)

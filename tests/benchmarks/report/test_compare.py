@@ -37,7 +37,7 @@ def test_a_change_is_sure_where_its_interval_leaves_out_zero() -> None:
 
 
 def test_one_seed_and_a_missing_row_tell_nothing_else() -> None:
-    assert views(row(30.0), row(35.0)).verdict == "one seed"
+    assert views(row(30.0), row(35.0)).verdict == "too few"
     assert {change.verdict for change in changes(row(30.0), row(30.0, method="ddc"))} == {"only before", "only after"}
 
 
@@ -130,3 +130,17 @@ def test_nothing_is_wrong_with_the_comparison_in_a_browser(
     assert (seen.errors, seen.requests, seen.too_wide(), seen.poor_contrast()) == ([], [], [], [])
     pictures = seen.page.evaluate("[...document.images].map((image) => image.naturalWidth > 0)")
     assert len(pictures) >= 9 and all(pictures)
+
+
+def test_subjects_are_compared_in_pairs() -> None:
+    """Eight people differ by far more than the change does; in pairs it is sure, as two samples it never would be."""
+
+    def people(shift: float) -> Rows:
+        (cells,) = row(*(20.0 + 2 * n + shift + 0.01 * (n % 3) for n in range(8))).values()
+        told = [(replace(kept, config=replace(kept.config, subject=n, seed=0)), r) for n, (kept, r) in enumerate(cells)]
+        return {("loose", "ash"): told}
+
+    change = views(people(0.0), people(0.3))
+    assert change.verdict == "better" and change.change == pytest.approx(0.3)
+    two, others = people(0.0), people(0.3)
+    assert views({k: v[:1] for k, v in two.items()}, {k: v[1:2] for k, v in others.items()}).verdict == "too few"

@@ -1,0 +1,190 @@
+"""What each scene needs: the matrix as a picture and in numbers, its surprises, its doses, and what would suffice."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import pandas as pd
+
+from benchmarks.analysis import contrasts, necessity, pareto
+from benchmarks.analysis.names import SPLIT_NAMES, look_of
+from benchmarks.analysis.necessity import Dose, Matrix, Need
+from benchmarks.analysis.scores import RANKED_SPLITS, Quantity, Scores
+from benchmarks.cell.metrics import METRICS
+from benchmarks.report import charts, tables, vega
+from benchmarks.report.content import Block, Bullets, Chart, Entry, Head, Mark, Row, Section, Table, Text
+from benchmarks.report.heatmap import heatmap
+from benchmarks.report.vega import Figure
+
+LIMIT_DB = 2.0  # A loss of more has the deepest colour.
+NOTE = (
+    "Foreground PSNR in dB that is lost when the column's row takes ASH's place, with its 95 % interval. Needed: a "
+    f"loss of more than {necessity.MARGIN_DB} dB that is sure at 5 %, corrected over all cells (Benjamini-Hochberg). "
+    "Harmful: as sure and as large a gain. Not needed: surely less is lost. One seed on one capture tells nothing."
+)
+MANY_ROWS = 6  # from which on it is worth asking which of them would suffice
+PARAMETERS = Quantity("memory", "", "params")
+
+
+def sections(scores: Scores) -> list[Section]:
+    """What is needed, where parts were taken away; and what suffices, where there is a choice."""
+    return [*_matrix_section(scores), *_dose_section(scores), *_sufficient_section(scores)]
+
+
+def _matrix_section(scores: Scores) -> list[Section]:
+    found = [matrix for split in RANKED_SPLITS if (matrix := necessity.matrix(scores, split))]
+    if not found:
+        return []
+    blocks: list[Block] = []
+    for matrix in found:
+        blocks += [Chart(figure=_picture(matrix)), *_surprises(matrix)]
+    tables_ = tuple(map(_table, found))
+    return [Section(title="What each scene needs", blocks=(*blocks, *tables_, Text(text=NOTE, note=True)))]
+
+
+def _picture(matrix: Matrix) -> Figure:
+    """The matrix, a row per scene and a column per part."""
+    cells = pd.DataFrame(
+        [
+            {
+                "row": need.scene,
+                "column": need.part.title,
+                "value": None if need.loss is None else need.loss.mean,
+                "text": "n/a" if need.loss is None else f"{need.loss.mean:+z.2f}",
+                "interval": _interval(need),
+                "verdict": need.verdict,
+                "framed": need.expected,
+            }
+            for need in matrix.needs
+        ]
+    )
+    words = SPLIT_NAMES[matrix.split].words
+    return Figure(
+        name=f"needs_{matrix.split}",
+        title=f"What each scene needs, {words}",
+        caption=f"Foreground PSNR lost without the part, {words}: blue where something is lost, orange where the scene "
+        f"is better off without, deepest from {LIMIT_DB:g} dB on. Below: the 95 % interval. Bold: needed, or harmful. "
+        "Framed: expected to be needed.",
+        panels=heatmap(
+            cells, rows=matrix.scenes, columns=[part.title for part in matrix.parts], limit=LIMIT_DB, title=words
+        ),
+        columns=1,
+    )
+
+
+def _interval(need: Need) -> str:
+    if need.loss is None or math.isnan(need.loss.low):
+        return ""
+    return f"{need.loss.low:z.1f} to {need.loss.high:z.1f}"
+
+
+def _surprises(matrix: Matrix) -> tuple[Block, ...]:
+    """In words: what contradicts the expected diagonal, and how much of it was found."""
+    framed = [need for need in matrix.needs if need.expected]
+    if not framed:
+        return ()
+    found = sum(need.verdict == "needed" for need in framed)
+    words = SPLIT_NAMES[matrix.split].words
+    surprises = tuple(need.surprise for need in matrix.needs if need.surprise)
+    told = f"On {words}, {found} of {len(framed)} parts are needed where they should be."
+    told += " Surprises:" if surprises else " No surprises."
+    return (Text(text=told), Bullets(items=surprises)) if surprises else (Text(text=told),)
+
+
+def _table(matrix: Matrix) -> Table:
+    by_place = {(need.scene, need.part.row): need for need in matrix.needs}
+    rows = tuple(
+        Row(name=scene, entries=tuple(_entry(by_place[scene, part.row]) for part in matrix.parts))
+        for scene in matrix.scenes
+    )
+    columns = tuple(Head(title=part.title, unit="dB lost") for part in matrix.parts)
+    return Table(title=SPLIT_NAMES[matrix.split].title, corner="scene", columns=columns, rows=rows)
+
+
+def _entry(need: Need) -> Entry:
+    marks: dict[str, Mark] = {"needed": "best", "harmful": "second"}
+    if need.loss is None:
+        return Entry(text="n/a")
+    told = "" if need.verdict == "unknown" else f" [{need.loss.low:+z.2f}, {need.loss.high:+z.2f}] {need.verdict}"
+    return Entry(text=f"{need.loss.mean:+z.2f}{told}", sort=need.loss.mean, mark=marks.get(need.verdict, ""))
+
+
+def _dose_section(scores: Scores) -> list[Section]:
+    blocks: list[Block] = []
+    for split in RANKED_SPLITS:
+        if found := necessity.doses(scores, split):
+            blocks += [Chart(figure=_dose_figure(found, split)), Bullets(items=tuple(map(_dose_sentence, found)))]
+    return [Section(title="More of a phenomenon", blocks=tuple(blocks))] if blocks else []
+
+
+def _dose_figure(found: Sequence[Dose], split: str) -> Figure:
+    parts = {dose.part.row: dose.part for dose in found}
+    plain = zip(parts, vega.series_of(tuple(parts)), strict=True)
+    looks = {row: replace(look, title=parts[row].title) for row, look in plain}
+    samples = pd.DataFrame(
+        [
+            {
+                "panel": dose.scene,
+                "x_title": "strength of the phenomenon",
+                "series": looks[dose.part.row].title,
+                "x": strength,
+                "y": loss.mean,
+                "low": loss.low,
+                "high": loss.high,
+                "crossed": False,
+            }
+            for dose in found
+            for strength, loss in dose.losses
+        ]
+    )
+    words = SPLIT_NAMES[split].words
+    zero = pd.DataFrame({"panel": samples["panel"].unique(), "y": 0.0, "text": ""})
+    return Figure(
+        name=f"doses_{split}",
+        title=f"Loss against dose, {words}",
+        caption=f"Foreground PSNR lost without a part that the rung asks for, {words}, by the phenomenon's strength "
+        "(1: the rung as it is; 0: the scene without any). Whiskers: 95 % interval.",
+        panels=charts.lines(samples, tuple(looks.values()), y="dB lost", size=(230, 170), rules=zero),
+        series=tuple(looks.values()),
+        columns=3,
+    )
+
+
+def _dose_sentence(dose: Dose) -> str:
+    course = ", ".join(f"{loss.mean:+z.2f} dB at {strength:g}" for strength, loss in dose.losses)
+    rises = "rises" if dose.rises else "does not rise"
+    return f"{dose.scene}, {dose.part.title}: {course}; it {rises} with every dose."
+
+
+def _sufficient_section(scores: Scores) -> list[Section]:
+    """The smallest sufficient row of every scene that has many."""
+    rows = [row for scene in scores.scenes for split in RANKED_SPLITS if (row := _sufficient(scores, scene, split))]
+    if not rows:
+        return []
+    heads = [Head(title=title) for title in ("split", "cheapest that suffices")]
+    heads += [Head(title="frame", unit="ms"), Head(title="parameters")]
+    heads += [Head(title="loss at most", unit="dB"), Head(title="best"), Head(title="frame of the best", unit="ms")]
+    table = Table(title="", corner="scene", columns=tuple(heads), rows=tuple(rows))
+    note = (
+        f"The cheapest row by milliseconds per frame whose loss to the best is below {pareto.SUFFICIENT_DB} dB (upper "
+        "95 % bound). Rows that were given the exact surface take no part."
+    )
+    return [Section(title="The smallest that suffices, per scene", blocks=(table, Text(text=note, note=True)))]
+
+
+def _sufficient(scores: Scores, scene: str, split: str) -> Row | None:
+    competing = contrasts.candidates(scores, scene, split)
+    found = pareto.smallest_sufficient(competing) if len(competing) >= MANY_ROWS else None
+    if found is None:
+        return None
+    frames = {contender.name: contender.cost for contender in competing}
+    entries = (
+        Entry(text=SPLIT_NAMES[split].title),
+        Entry(text=look_of(found.name).title),
+        Entry(text=f"{frames[found.name]:.1f}", sort=frames[found.name]),
+        tables.entry_of(scores.get(scene, found.name, PARAMETERS), METRICS["params"]),
+        Entry(text=f"{found.loss_bound_db:.2f}", sort=found.loss_bound_db),
+        Entry(text=look_of(found.best).title),
+        Entry(text=f"{frames[found.best]:.1f}", sort=frames[found.best]),
+    )
+    return Row(name=scene, entries=entries)
