@@ -51,7 +51,7 @@ class SynthVerb:
     """
 
     scene: Positional[str]  # its name
-    size: str = "quick"  # of the capture: ci, quick, table or paper
+    size: str = "quick"  # of the capture: ci, rung, quick, long, table or paper
     out: Folder | None = None  # default: data/SCENE-SIZE-SEED
     seed: Natural = 0  # root seed of the scene
     subject: Natural = 0  # who it is: body, skin, hair, clothes and prints follow from the number

@@ -48,7 +48,7 @@ class RunVerb:
     methods: Names = ()  # only these rows, or installed methods besides
     scenes: Names = ()  # only these rows, or other scenes
     capture: UseAppendAction[tuple[Path, ...]] = ()  # in place of the scenes: a finished capture; may be repeated
-    size: str | None = None  # of scenes: ci, quick, table or paper
+    size: str | None = None  # of scenes: ci, rung, quick, long, table or paper
     preset: str | None = None  # budget of the methods
     device: DeviceName = CPU  # where methods learn and draw that can choose: cpu, cuda, cuda:1, or auto
     seeds: CountIfAny = None  # train every method with so many seeds
