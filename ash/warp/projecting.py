@@ -254,6 +254,23 @@ def compensation(found: Footprint):
     return wp.sqrt(wp.max(found.sharp / found.det, COMPENSATION_MIN))
 
 
+@wp.func
+@no_type_check
+def conic_of(found: Footprint, dilation: float):
+    """The inverse of the dilated covariance: xx, xy, yy, 1 / px^2."""
+    return wp.vec3((found.yy + dilation) / found.det, -found.xy / found.det, (found.xx + dilation) / found.det)
+
+
+@wp.func
+@no_type_check
+def colour_of(basis: vec16, sh: wp.array(dtype=wp.vec3), number: int, coefficients: int):
+    """The colour of a Gaussian along a direction, before what is negative becomes 0."""
+    colour = wp.vec3(0.5, 0.5, 0.5)
+    for k in range(coefficients):
+        colour += basis[k] * sh[number * coefficients + k]
+    return colour
+
+
 @wp.kernel
 @no_type_check
 def project(
@@ -309,14 +326,13 @@ def project(
     if compensate != 0:
         opacity *= compensation(found)
     basis = harmonics(wp.normalize(mean - view.centre), coefficients)
-    colour = wp.vec3(0.5, 0.5, 0.5)
-    for k in range(coefficients):
-        colour += basis[k] * sh[number * coefficients + k]
-    a, c = found.xx + dilation, found.yy + dilation
-    shapes[thread] = wp.vec4(c / found.det, -found.xy / found.det, a / found.det, opacity)
+    colour = colour_of(basis, sh, number, coefficients)
+    conic = conic_of(found, dilation)
+    shapes[thread] = wp.vec4(conic[0], conic[1], conic[2], opacity)
     looks[thread] = wp.vec4(wp.max(colour[0], 0.0), wp.max(colour[1], 0.0), wp.max(colour[2], 0.0), position[2])
     if opacity < ALPHA_MIN:
         return
     reach = 2.0 * wp.log(opacity / ALPHA_MIN)
     columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    boxes[thread] = tile_box(centre, wp.vec2(wp.sqrt(reach * a), wp.sqrt(reach * c)), columns, rows)
+    extent = wp.vec2(wp.sqrt(reach * (found.xx + dilation)), wp.sqrt(reach * (found.yy + dilation)))
+    boxes[thread] = tile_box(centre, extent, columns, rows)

@@ -8,7 +8,9 @@ from ash.warp.projecting import (
     COMPENSATION_MIN,
     Footprint,
     Pinhole,
+    colour_of,
     compensation,
+    conic_of,
     footprint_of,
     harmonics,
     harmonics_gradient,
@@ -110,8 +112,7 @@ def project_backward(
             splat = camera * means.shape[0] + number
             g_shape, g_look = g_shapes[splat], g_looks[splat]
             if found.det > 0.0:
-                a, c = found.xx + dilation, found.yy + dilation
-                conic = wp.vec3(c / found.det, -found.xy / found.det, a / found.det)
+                conic = conic_of(found, dilation)
                 g_ratio = wp.float32(0.0)
                 if compensate != 0:
                     factor = compensation(found)
@@ -132,9 +133,7 @@ def project_backward(
             away = mean - view.centre
             direction = wp.normalize(away)
             basis = harmonics(direction, coefficients)
-            colour = wp.vec3(0.5, 0.5, 0.5)
-            for k in range(coefficients):
-                colour += basis[k] * sh[number * coefficients + k]
+            colour = colour_of(basis, sh, number, coefficients)
             g_colour = wp.vec3()
             for i in range(3):
                 if colour[i] >= 0.0:

@@ -4,7 +4,6 @@ The other way round, a step on the CPU runs while `meta` is the device of every 
 """
 
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
@@ -28,12 +27,6 @@ from ash.textures import TexelLattice, build_lattice
 @pytest.fixture(scope="module")
 def tube(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return write_tube_capture(tmp_path_factory.mktemp("tube"))
-
-
-@pytest.fixture
-def default_is_meta() -> Iterator[None]:
-    yield
-    torch.set_default_device(None)
 
 
 def refining() -> AshConfig:
@@ -61,11 +54,11 @@ def test_a_training_step_stays_on_its_device(variant: str, tube: Capture, monkey
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_nothing_of_a_step_is_made_on_the_default_device(variant: str, tube: Capture, default_is_meta: None) -> None:
+def test_nothing_of_a_step_is_made_on_the_default_device(variant: str, tube: Capture) -> None:
     config, template = VARIANTS[variant]
     avatar = AshAvatar(tiny(config, **template), tube)
-    torch.set_default_device(META)
-    learned = step_of(avatar, tube, CPU)
+    with META:
+        learned = step_of(avatar, tube, CPU)
     assert learned and all(bool(torch.isfinite(parameter).all()) for parameter in learned)
 
 

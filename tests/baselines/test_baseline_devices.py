@@ -1,6 +1,5 @@
 """One code path for every device: the mesh and the other baselines, as `tests/ash/test_devices.py` has ASH."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -38,12 +37,6 @@ def tube(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return write_tube_capture(tmp_path_factory.mktemp("tube"))
 
 
-@pytest.fixture
-def default_is_meta() -> Iterator[None]:
-    yield
-    torch.set_default_device(None)
-
-
 def avatar_of(name: str, capture: Capture) -> Any:
     recipe = RECIPES[name]
     return recipe.build(tiny(recipe.config("ci")), capture)
@@ -59,10 +52,10 @@ def test_a_training_step_stays_on_its_device(name: str, tube: Capture, monkeypat
 
 
 @pytest.mark.parametrize("name", RECIPES)
-def test_nothing_of_a_step_is_made_on_the_default_device(name: str, tube: Capture, default_is_meta: None) -> None:
+def test_nothing_of_a_step_is_made_on_the_default_device(name: str, tube: Capture) -> None:
     avatar = avatar_of(name, tube)
-    torch.set_default_device(META)
-    learned = step_of(avatar, tube, CPU)
+    with META:
+        learned = step_of(avatar, tube, CPU)
     assert learned and all(bool(torch.isfinite(parameter).all()) for parameter in learned)
 
 
