@@ -21,9 +21,8 @@ SIGHT_NOTE = (
 )
 
 
-def sections(scores: Scores, scene: str) -> list[Section]:
+def sections(scores: Scores, scene: str, found: Sequence[Contrast]) -> list[Section]:
     """The differences with their intervals, and what more captures would show; none without two seeds or captures."""
-    found = contrasts.contrasts(scores, scene)
     if not found:
         return []
     figure = figures.effects_figure(found, scene, over=scores.unit(scene))
@@ -32,9 +31,8 @@ def sections(scores: Scores, scene: str) -> list[Section]:
     return [Section(title=f"Which differences are established on {scene}", blocks=blocks)]
 
 
-def note(scores: Scores, scene: str) -> str:
+def note(scores: Scores, scene: str, found: Sequence[Contrast]) -> str:
     """What a table of the scene can show at all, in one sentence."""
-    found = contrasts.contrasts(scores, scene)
     smallest = []
     for split in RANKED_SPLITS:
         here = sorted(contrast.test.detectable for contrast in found if contrast.split == split)

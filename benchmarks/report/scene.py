@@ -7,7 +7,7 @@ import pandas as pd
 from ash.capture.dataset import Capture
 from ash.capture.formats import load_capture
 from ash.files import InputError
-from benchmarks.analysis import conventions
+from benchmarks.analysis import contrasts, conventions
 from benchmarks.analysis.causes import REGIONS
 from benchmarks.analysis.names import EXACT, SPLIT_NAMES, is_ours, look_of
 from benchmarks.analysis.scores import RANKED_SPLITS, Quantity, Scores, curves_of, foreground
@@ -85,13 +85,14 @@ def scene_report(data: SceneData) -> SceneReport:
     quality = tables.build(scores, scene, _quality_quantities(), title=f"Accuracy on {scene}", exposed=exposed)
     cost = tables.build(scores, scene, tables.cost_columns(COSTS), title=f"Cost on {scene}", exposed=exposed)
     more = _more_tables(scores, scene)
-    quality_note = f"{QUALITY_NOTE} {established.note(scores, scene)}"
+    compared = contrasts.contrasts(scores, scene)
+    quality_note = f"{QUALITY_NOTE} {established.note(scores, scene, compared)}"
     picture_sections, sheets = _picture_sections(data, capture, shown, trouble)
     sections = [
         Section(title=scene, headline=sentences.headline(scores, scene), blocks=tuple(_opening(data, capture))),
         Section(title=quality.title, blocks=(_untitled(quality), Text(text=quality_note, note=True), *notes)),
         Section(title=cost.title, blocks=(_untitled(cost), Text(text=COST_NOTE, note=True), *notes)),
-        *established.sections(scores, scene),
+        *established.sections(scores, scene, compared),
         *_exact(scores, scene),
         *picture_sections,
         *_time(data),

@@ -93,17 +93,22 @@ def test_what_more_captures_would_show_follows_from_the_spread_over_captures() -
 
 def test_a_report_says_what_was_compared_and_what_could_be_seen() -> None:
     many = scores_of(people({"ash": (20.0, 25.0, 30.0), "ddc": (19.0, 24.2, 29.2)}))
-    (section,) = established.sections(many, "loose")
+    (section,) = established.sections(many, "loose", contrasts(many, "loose"))
     tables = [block for block in section.blocks if isinstance(block, Table)]
     assert tables[0].columns[2].unit == "captures, paired t"
     assert tables[1].rows[0].entries[0].text == "none"
-    assert "Smallest detectable difference to ASH, middle row: 0." in established.note(many, "loose")
-    assert "3 captures, compared in pairs" in established.note(many, "loose")
+    assert "Smallest detectable difference to ASH, middle row: 0." in established.note(
+        many, "loose", contrasts(many, "loose")
+    )
+    assert "3 captures, compared in pairs" in established.note(many, "loose", contrasts(many, "loose"))
     one = scores_of(people({"ash": (20.0,), "ddc": (19.0,)}, seeds=(0.0, 0.1, 0.3)))
-    (section,) = established.sections(one, "loose")
+    (section,) = established.sections(one, "loose", contrasts(one, "loose"))
     (table,) = (block for block in section.blocks if isinstance(block, Table))
     assert table.columns[2].unit == "seeds, Welch" and isinstance(section.blocks[-1], Text)
-    assert "nothing about other people" in established.note(one, "loose")
+    assert "nothing about other people" in established.note(one, "loose", contrasts(one, "loose"))
     alone = scores_of(people({"ash": (20.0,), "ddc": (19.0,)}))
-    assert established.sections(alone, "loose") == []
-    assert established.note(alone, "loose") == "One value per row: no difference between rows is established."
+    assert established.sections(alone, "loose", contrasts(alone, "loose")) == []
+    assert (
+        established.note(alone, "loose", contrasts(alone, "loose"))
+        == "One value per row: no difference between rows is established."
+    )
