@@ -31,6 +31,7 @@ class AtlasConfig:
     norm: str = "none"  # of the U-Nets: "batch-as-released" (always on the statistics of its batch of 1), or "instance"
     shuffle: int = 1  # decode at 1/shuffle of the lattice's resolution and shuffle pixels up; not in the paper
     standardise: bool = False  # decoders see deviations from the mean training texture, in its units; not in the paper
+    bound: float = 3.0  # spreads at which those are cut off: what lies farther out was hardly ever learned from
     fade: float = (
         0.0  # novelty of a pose, in spreads, at which a static avatar has 1 - 1/e of it; 0: never; not in the paper
     )
@@ -53,6 +54,8 @@ class AtlasConfig:
             raise InputError(f"texels: expected a multiple of {unit}, got {self.texels}")
         if min(self.window, self.width) < 1:
             raise InputError(f"window and width: expected at least 1, got {self.window} and {self.width}")
+        if not self.bound > 0:
+            raise InputError(f"bound: expected more than 0 spreads (inf: none), got {self.bound}")
         if not 0 <= self.fade < math.inf:
             raise InputError(f"fade: expected a finite novelty of at least 0, got {self.fade}")
         if self.fade and not (self.standardise and self.decoded_texels % 4 == 0):

@@ -50,6 +50,7 @@ class AshModel(MovingModule):
                 window=config.window,
                 yaw_normalise=config.yaw_normalise,
                 standardise=config.standardise,
+                bound=config.bound,
                 fade=config.fade,
             )
         self.base = nn.Parameter(initial.clone(), requires_grad=config.base)

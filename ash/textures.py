@@ -26,7 +26,6 @@ NOISE_GRID = 4
 POOL = 4  # Texels per side that are one when frames are compared: poses differ over limbs, not over texels.
 COMPARED_FRAMES = 512  # Training frames, evenly taken, that a new frame is compared with.
 LEAST_TRUST = 0.02  # Of exp(-(novelty / fade)^2): below it nothing that is decoded counts, and nothing need be decoded.
-BOUND = 3.0  # Of standardised textures: what lies farther out was hardly ever learned from, or never.
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -148,17 +147,25 @@ def smooth_noise(shape: torch.Size, seed: tuple[int, ...]) -> Float[Tensor, "c h
 class TextureDrawer(MovingModule):
     """Stg.2 as a network sees it: the motion-aware textures of a frame, standardised if asked.
 
-    What is standardised is a deviation from the mean training texture, in units of its channel's spread, at most three
-    of them (not in the paper). Mean, spread and the frames that others are compared with are part of a checkpoint.
+    What is standardised is a deviation from the mean training texture, in units of its channel's spread, cut
+    off at `bound` of them (not in the paper). Mean, spread and the frames that others are compared with are part of a
+    checkpoint.
     """
 
     def __init__(
-        self, lattice: TexelLattice, *, window: int, yaw_normalise: bool, standardise: bool, fade: float = 0.0
+        self,
+        lattice: TexelLattice,
+        *,
+        window: int,
+        yaw_normalise: bool,
+        standardise: bool,
+        bound: float = 3.0,
+        fade: float = 0.0,
     ) -> None:
         """`fade`: see `trust`; 0: what is decoded always counts."""
         super().__init__()
         self.lattice, self.window, self.yaw_normalise, self.standardise = lattice, window, yaw_normalise, standardise
-        self.fade = fade
+        self.bound, self.fade = bound, fade
         self.mean: Tensor
         self.spread: Tensor
         self.seen: Tensor  # [t, d]: the newest frame's textures of training frames, coarse
@@ -179,7 +186,9 @@ class TextureDrawer(MovingModule):
     def forward(self, template: Template, pose: Pose) -> Float[Tensor, "c r r"]:
         """The textures of a frame, `c = 6 window` channels."""
         textures = self._draw(template, pose)
-        return ((textures - self.mean) / self.spread).clamp(-BOUND, BOUND) if self.standardise else textures
+        if not self.standardise:
+            return textures
+        return ((textures - self.mean) / self.spread).clamp(-self.bound, self.bound)
 
     @torch.no_grad()
     def novelty(self, textures: Float[Tensor, "c r r"]) -> float:

@@ -206,6 +206,7 @@ class DdcAvatar:
             window=config.model.window,
             yaw_normalise=config.model.yaw_normalise,
             standardise=config.model.standardise,
+            bound=config.model.bound,
             fade=config.model.fade,
         )
         textures.observe(self.template, capture.motion, capture.splits["train"].frames)

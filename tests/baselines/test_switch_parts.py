@@ -90,7 +90,10 @@ def places(s: Subject) -> str:
 
 
 def textures(s: Subject) -> str:
-    return fingerprint(s.avatar._conditions_of(2).textures)
+    """Of a pose that was learned from, and of one that was not."""
+    drawer, last = s.avatar.module.textures, len(s.capture.motion.dofs) - 1
+    unseen = None if drawer is None else drawer(s.avatar.template, Pose(s.capture.motion, last))
+    return fingerprint(s.avatar._conditions_of(2).textures, unseen)
 
 
 def trust(s: Subject) -> str:
@@ -233,6 +236,7 @@ CHANGED_BY_SWITCH = {
     "wo_light": {"light"},
     "wo_light_and_motion": {"light", "decoding", "textures", "trust", "warm_up"},  # No motion: no decoders at all.
     "wo_standardise": {"textures", "trust"},  # Novelty is told in units of the standardised textures.
+    "wo_bound": {"textures"},
     "wo_heading": {"textures"},
     "two_trunks": {"decoding"},
     "noisy_textures": {"noise"},
