@@ -80,9 +80,7 @@ def _made(capture: Capture, name: str) -> Act:
         raise InputError(f"motion: {name} is made for a person's skeleton, which {capture.folder} has not")
     clip = Clip(generator=name, frames=frames)
     motion = make_motion(capture.skeleton, (clip,), fps=capture.motion.fps, seed=MADE_SEED)
-    return Act(
-        name=name, title=f"{name.capitalize()}, made", motion=motion, frames=tuple(range(frames)), captured=False
-    )
+    return Act(name=name, title=name.capitalize(), motion=motion, frames=tuple(range(frames)), captured=False)
 
 
 def frames_in(act: Act, text: str | None) -> tuple[int, ...]:
