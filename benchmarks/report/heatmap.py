@@ -12,6 +12,7 @@ from benchmarks.report.charts import inline, layered, tooltips
 WRITING, FRAME = "#17202c", "#c2415c"  # The frame is seen on light cells and on dark paper.
 RANGE = ("#e8995a", "#f1f3f6", "#6f9ceb")
 CELL = (70, 40)  # pixels
+LEAST = 0.7  # Of its size: what stands in the cells is hardly read below it.
 
 
 def heatmap(
@@ -52,3 +53,8 @@ def heatmap(
         seen.mark_text(dy=9, fontSize=10, color=WRITING).encode(**at, text="interval:N"),
     ]
     return (layered(layers, title, (CELL[0] * len(columns), CELL[1] * len(rows))),)
+
+
+def least_width(columns: int) -> int:
+    """Pixels that a matrix of so many columns and the names of its rows need at least."""
+    return round(LEAST * CELL[0] * (columns + 2))

@@ -13,7 +13,7 @@ from benchmarks.analysis.scores import RANKED_SPLITS, Quantity, Scores
 from benchmarks.cell.metrics import METRICS
 from benchmarks.report import charts, tables, vega
 from benchmarks.report.content import Block, Bullets, Chart, Entry, Head, Mark, Row, Section, Table, Text
-from benchmarks.report.heatmap import heatmap
+from benchmarks.report.heatmap import heatmap, least_width
 from benchmarks.report.vega import Figure
 
 LIMIT_DB = 2.0  # A loss of more has the deepest colour.
@@ -69,6 +69,7 @@ def _picture(matrix: Matrix) -> Figure:
             cells, rows=matrix.scenes, columns=[part.title for part in matrix.parts], limit=LIMIT_DB, title=words
         ),
         columns=1,
+        least=least_width(len(matrix.parts)),
     )
 
 

@@ -62,7 +62,10 @@ class Series:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Figure:
-    """A chart: its file is `chart_NAME.svg`. `named`: the series are named in the drawing, and need no legend there."""
+    """A chart: its file is `chart_NAME.svg`. `named`: the series are named in the drawing, and need no legend there.
+
+    `least`: the pixels of a page below which it would be unreadable; on a narrower page it is moved with the finger.
+    """
 
     name: str
     title: str
@@ -71,6 +74,7 @@ class Figure:
     series: tuple[Series, ...] = ()
     columns: int = 2
     named: bool = False
+    least: int = 0
 
     @property
     def file(self) -> str:
