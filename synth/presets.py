@@ -15,7 +15,7 @@ from synth.scene import Clip, Light, Outfit, Rig, Scene, Take
 SIZES = ("ci", "rung", "quick", "long", "table", "paper")
 
 
-EVENING = Light(falloff=0.5, gloss=0.3)  # a lamp that lights one side of the floor, on cloth that shines a little
+EVENING = Light(falloff=0.4, gloss=0.2)  # a lamp that lights one side of the floor, on cloth that shines a little
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
