@@ -240,6 +240,7 @@ def describe(scene: Scene, folder: Path, executor: Executor | None = None) -> No
 def paint(scene: Scene, folder: Path) -> None:
     """Write the texture."""
     seed, person = stream(scene, "texture"), subject(scene.subject)
+    person = person.loose if scene.outfit.skirt else person
     image = texture.paint(make_body(scene), size=scene.texture, seed=seed, subject=person)
     write_image(folder / "truth" / "texture.png", image)
 

@@ -32,7 +32,8 @@ def estimate(scene: Scene) -> Estimate:
     novel_views = rig.held_out * (len(range(scene.novel_view_stride // 2, training, scene.novel_view_stride)))
     images = train_views + novel_views + rig.held_out * (scene.frames - training)
     pixels = rig.width * rig.height
-    per_image = 0.07 + 1.6e-7 * pixels * scene.samples
+    longer = 1.4 if scene.depth > 2 or scene.light.gloss else 1.0  # than direct light on diffuse cloth takes
+    per_image = 0.07 + 1.6e-7 * pixels * scene.samples * longer
     fixed = (40.0 if scene.body == "anny" else 6.0) + 0.25 * scene.frames + 0.5 * training * (scene.scanner.rms_mm > 0)
     size = int(images * pixels * 1.1 + scene.frames * 1.2e6 + 3 * scene.texture**2)
     return Estimate(images=images, core_seconds=fixed + images * per_image, bytes=size)

@@ -15,6 +15,9 @@ from synth.scene import Clip, Light, Outfit, Rig, Scene, Take
 SIZES = ("ci", "rung", "quick", "long", "table", "paper")
 
 
+EVENING = Light(falloff=0.4, gloss=0.2)  # a lamp that lights one side of the floor, on cloth that shines a little
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Size:
     """How much of everything."""
@@ -36,9 +39,9 @@ def _size(name: str) -> Size:
         rig = Rig(cameras=20, held_out=4, width=192, height=192)
         return Size(rig=rig, repeats=1, frames=10, test_frames=12, stride=5, samples=50, texture=1024)
     if name == "quick":
-        return Size(rig=Rig(), repeats=1, frames=10, test_frames=12, stride=5, samples=50, texture=2048)
+        return Size(rig=Rig(), repeats=1, frames=10, test_frames=12, stride=5, samples=60, texture=2048)
     if name == "long":  # `quick` with eight times the training motion.
-        return Size(rig=Rig(), repeats=8, frames=10, test_frames=12, stride=40, samples=50, texture=2048)
+        return Size(rig=Rig(), repeats=8, frames=10, test_frames=12, stride=40, samples=60, texture=2048)
     if name == "table":
         rig = Rig(cameras=34, held_out=4, width=512, height=512)
         return Size(rig=rig, repeats=4, frames=20, test_frames=80, stride=20, samples=128, texture=4096)
@@ -74,14 +77,15 @@ def mannequin(*, size: str, seed: int) -> Scene:
 
 
 def loose(*, size: str, seed: int) -> Scene:
-    """A realistic body in loose clothes and a swinging skirt, everything on: the default of the main job."""
-    outfit = Outfit(skirt=True, folds_mm=4.0, slack_mm=3.0, swing=0.2, scan_mm=1.5)
-    return _base("loose", size, seed, body="anny", outfit=outfit)
+    """A realistic body in loose clothes that swing, everything on: the default of the main job."""
+    outfit = Outfit(skirt=True, folds_mm=4.0, slack_mm=3.0, swing=0.7, scan_mm=1.5)
+    return replace(_base("loose", size, seed, body="anny", outfit=outfit), light=EVENING, depth=3)
 
 
 def tight(*, size: str, seed: int) -> Scene:
-    """A realistic body in tight clothes that fold a little."""
-    return _base("tight", size, seed, body="anny", outfit=Outfit(folds_mm=3.0, scan_mm=1.0))
+    """A realistic body in tight clothes that fold a little, everything else on."""
+    outfit = Outfit(folds_mm=3.0, scan_mm=1.0)
+    return replace(_base("tight", size, seed, body="anny", outfit=outfit), light=EVENING, depth=3)
 
 
 def skinned(*, size: str, seed: int) -> Scene:

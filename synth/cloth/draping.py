@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from ash.capture.dataset import Motion
 from synth.cloth.layers import beneath
-from synth.cloth.xpbd import Contacts, Sheet, State, limit_stretch, make_sheet, step
+from synth.cloth.xpbd import Contacts, Sheet, State, crowd, edges_of, limit_stretch, make_sheet, step
 from synth.motion.plans import smooth
 from synth.person.body import Body, neighbour_mean, vertex_normals
 from synth.posing import dual_quaternion_skinning, skinning_transforms
@@ -27,6 +27,7 @@ TIGHT = 0.2  # metres below the waistband to where it yields
 NEAR = 0.1  # metres from which on a piece of the body can be touched before the next pose
 PUSH = 6.0  # metres per second at which the solid can push cloth out of itself
 FRICTION = 0.3
+APART = 0.7  # of the cage's median edge, that its layers keep from each other
 STRETCH = 1.03  # most of the cage's edges, over their rest length, in a frame
 DRAG = 1.2  # 1/s, of still air
 PULL = 450.0  # 1/s^2, of the guides at strength 1/2
@@ -150,6 +151,8 @@ def simulate(fitting: Fitting, dofs: np.ndarray, *, fps: float, strength: float)
     cage, solids, normals = fitting.pose(path[0])
     state = State(place=cage.copy(), velocity=(fitting.pose(path[1])[0] - cage) * fps * poses)
     pull = PULL * (1 - strength) / strength
+    sides = np.diff(fitting.sheet.rest[edges_of(fitting.sheet.faces)], axis=1)
+    least = APART * float(np.median(np.linalg.norm(sides, axis=-1)))
     result = []
     for k in range(len(path)):
         if k >= count and (k - count) % poses == 0:
@@ -159,6 +162,7 @@ def simulate(fitting: Fitting, dofs: np.ndarray, *, fps: float, strength: float)
             break
         cage_next, solids_next, normals_next = fitting.pose(path[k + 1])
         outward = _normals(state.place, fitting.sheet.faces)
+        crowded = crowd(fitting.sheet, state.place, least=least, soon=least)
         touches = []
         for solid, a, b, n, m in zip(fitting.solids, solids, solids_next, normals, normals_next, strict=True):
             near, margin = _touched(solid, state.place, outward, a, n)
@@ -169,7 +173,7 @@ def simulate(fitting: Fitting, dofs: np.ndarray, *, fps: float, strength: float)
             contacts = tuple(touch.at(share, seconds) for touch in touches)
             step(
                 fitting.sheet, state, seconds=seconds, pins=guide, weight=strength, drag=DRAG, guide=guide,
-                pull=pull, contacts=contacts, friction=FRICTION,
+                pull=pull, contacts=contacts, friction=FRICTION, crowded=crowded,
             )  # fmt: skip
         cage, solids, normals = cage_next, solids_next, normals_next
     return np.array(result)

@@ -27,8 +27,8 @@ class Layer:
 
 
 def beneath(body: Body) -> np.ndarray:
-    """The surface vertices of legs and hips, that a skirt can touch, `[s]` bool."""
-    lower = ("pelvis", "spine", *(f"{bone}_{side}" for bone in ("thigh", "shin") for side in SIDES))
+    """The surface vertices of legs, hips and trunk, that a skirt or dress can touch, `[s]` bool."""
+    lower = ("pelvis", "spine", "chest", *(f"{bone}_{side}" for bone in ("thigh", "shin") for side in SIDES))
     share = body.skin_weights[:, [body.skeleton.names.index(name) for name in lower]].sum(axis=1)
     top = body.surface.vertices[body.surface.vertices_of("skirt"), 1].max()
     return (share > 0.5) & ~body.surface.vertices_of("skirt") & (body.surface.vertices[:, 1] < top + 0.05)

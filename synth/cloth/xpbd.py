@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
 
 GRAVITY = np.array([0.0, -9.81, 0.0])
 
@@ -54,6 +55,14 @@ class Contacts:
     normal: np.ndarray  # [v, 3] unit, out of the solid
     margin: np.ndarray  # [v] metres to keep from it; -inf where nothing is near
     most: float = np.inf  # metres that a vertex is pushed in a step: one found deep inside gets out gently
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Crowd:
+    """Pairs of vertices of one cloth that are near in space and not along the cloth."""
+
+    pairs: np.ndarray  # [n, 2]
+    least: float  # metres that they keep
 
 
 def edges_of(faces: np.ndarray) -> np.ndarray:
@@ -143,6 +152,18 @@ def _tethers(rest: np.ndarray, edges: np.ndarray, pinned: np.ndarray) -> tuple[n
     return np.where(np.isfinite(reach), anchor, -1), reach
 
 
+def crowd(sheet: Sheet, place: np.ndarray, *, least: float, soon: float) -> Crowd:
+    """The pairs that may come nearer than `least` metres while they approach by `soon`, and at rest lie far apart.
+
+    Vertices are balls: those of two layers cannot pass between each other when `least` is about two thirds of the
+    cloth's edges. Neighbours, nearer than twice `least` at rest, are kept apart by bending.
+    """
+    near = cKDTree(place).query_pairs(least + soon, output_type="ndarray")
+    apart = np.linalg.norm(sheet.rest[near[:, 0]] - sheet.rest[near[:, 1]], axis=1) > 2 * least
+    near = near[apart & ~sheet.pinned[near].all(axis=1)]
+    return Crowd(pairs=near[np.lexsort((near[:, 1], near[:, 0]))], least=least)
+
+
 def step(
     sheet: Sheet,
     state: State,
@@ -155,12 +176,14 @@ def step(
     pull: float = 0.0,
     contacts: tuple[Contacts, ...] = (),
     friction: float = 0.0,
+    crowded: Crowd | None = None,
 ) -> None:
     """One step of the simulation, in place.
 
     Pinned vertices go to their rows of `pins` `[v, 3]`. Others fall under `weight` times gravity, are slowed by still
-    air (`drag`, 1/s), drawn to `guide` `[v, 3]` by springs (`pull`, 1/s^2, relative to mass), keep their distances and
-    stay in front of `contacts`, later ones winning, on which they slide against Coulomb friction.
+    air (`drag`, 1/s), drawn to `guide` `[v, 3]` by springs (`pull`, 1/s^2, relative to mass), keep their distances, do
+    not pass through `crowded` others and stay in front of `contacts`, later ones winning, on which they slide against
+    Coulomb friction.
     """
     before = state.place
     place = before + seconds / (1 + drag * seconds) * (state.velocity + seconds * weight * GRAVITY)
@@ -173,6 +196,8 @@ def step(
     tied = sheet.anchor >= 0
     if tied.any():
         _tether(place, sheet, tied)
+    if crowded is not None and len(crowded.pairs):
+        _part(place, crowded, sheet.pinned)
     for contact in contacts:
         _separate(place, before, contact, friction, sheet.pinned)
     state.velocity = (place - before) / seconds
@@ -222,6 +247,22 @@ def _tether(place: np.ndarray, sheet: Sheet, tied: np.ndarray) -> None:
     offset = place[tied] - place[sheet.anchor[tied]]
     length = np.sqrt(np.einsum("na,na->n", offset, offset))
     place[tied] -= (np.maximum(1 - sheet.reach[tied] / np.maximum(length, 1e-9), 0))[:, None] * offset
+
+
+def _part(place: np.ndarray, crowded: Crowd, pinned: np.ndarray) -> None:
+    """Push pairs that are too near apart, all at once: a vertex moves by the mean of what its pairs ask of it."""
+    first, second = crowded.pairs.T
+    offset = place[second] - place[first]
+    length = np.sqrt(np.einsum("na,na->n", offset, offset))
+    close = np.flatnonzero(length < crowded.least)
+    if not len(close):
+        return
+    push = (0.5 * (crowded.least / np.maximum(length[close], 1e-9) - 1))[:, None] * offset[close]
+    ends = np.concatenate([first[close], second[close]])
+    asked = np.concatenate([-push, push])
+    moved = np.stack([np.bincount(ends, weights=asked[:, k], minlength=len(place)) for k in range(3)], axis=1)
+    count = np.maximum(np.bincount(ends, minlength=len(place)), 1)
+    place += moved / count[:, None] * ~pinned[:, None]
 
 
 def _separate(

@@ -4,13 +4,13 @@ Subject 0 is written out. The others are drawn in blocks of sixteen, each block 
 the range of every trait evenly, and traits go together by chance only. All are adults of ordinary proportions.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TypeVar
 
 from ash.files import InputError, hash_of
+from synth.person.palettes import GREY, HAIRS, IRISES, PALETTES, SKINS, Colour, Palette
 
-Colour = tuple[float, float, float]  # sRGB, 0..1
 Choice = TypeVar("Choice")
 VALIDATION = 100  # subjects and capture seeds from here on are for validation and tuning; no table has them
 MOST = 2**31 - 1
@@ -72,6 +72,7 @@ class Shirt:
     collar: Colour
     seam: Colour
     sleeve: float = 1.0  # of the way from shoulder to wrist; 1: to the hand
+    buttons: Colour | None = None  # down the front; none: it has none
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -87,12 +88,18 @@ class Trousers:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Skirt:
-    """The skirt of the loose outfit."""
+    """What hangs in the loose outfit: a skirt, or what a dress, a coat or a smock is below its yoke or waist."""
 
     cloth: Print
     hem: Colour
-    length: float = 0.49  # metres from its band to its hem, on a body of subject 0's legs
+    length: float = 0.49  # metres from the waist to its hem, on a body of subject 0's legs
     fullness: float = 1.0  # of subject 0's flare
+    kind: str = "skirt"  # one of GARMENTS
+
+    @property
+    def is_yoked(self) -> bool:
+        """Whether it hangs from the chest, not from the waist."""
+        return self.kind in ("dress", "smock")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -117,62 +124,25 @@ class Subject:
     skirt: Skirt
     shoes: Shoes
 
+    @property
+    def loose(self) -> "Subject":
+        """The person in the loose outfit, whose dress, coat or smock is of one cloth with what is above it."""
+        garment = self.skirt
+        if garment.kind == "skirt":
+            return self
+        coat = garment.kind == "coat"
+        shirt = replace(
+            self.shirt,
+            cloth=garment.cloth,
+            words=None,
+            collar=garment.hem,
+            seam=garment.cloth.colours[0],
+            sleeve=1.0 if coat else self.shirt.sleeve,
+            buttons=garment.hem if coat else None,
+        )
+        return replace(self, shirt=shirt)
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Palette:
-    """Colours that go together."""
 
-    light: Colour
-    soft: Colour
-    middle: Colour
-    deep: Colour
-    dark: Colour
-    accent: Colour
-
-
-PALETTES = (
-    Palette(  # harbour
-        light=(0.87, 0.87, 0.83), soft=(0.66, 0.73, 0.77), middle=(0.4, 0.53, 0.63), deep=(0.22, 0.33, 0.45),
-        dark=(0.13, 0.18, 0.26), accent=(0.8, 0.43, 0.24),
-    ),
-    Palette(  # woodland
-        light=(0.87, 0.84, 0.74), soft=(0.68, 0.71, 0.57), middle=(0.45, 0.53, 0.37), deep=(0.26, 0.36, 0.27),
-        dark=(0.19, 0.18, 0.15), accent=(0.78, 0.55, 0.22),
-    ),
-    Palette(  # heather
-        light=(0.89, 0.84, 0.85), soft=(0.74, 0.63, 0.7), middle=(0.56, 0.39, 0.5), deep=(0.36, 0.21, 0.31),
-        dark=(0.2, 0.17, 0.22), accent=(0.42, 0.56, 0.52),
-    ),
-    Palette(  # clay
-        light=(0.91, 0.85, 0.76), soft=(0.83, 0.68, 0.54), middle=(0.7, 0.45, 0.33), deep=(0.45, 0.26, 0.2),
-        dark=(0.22, 0.19, 0.19), accent=(0.29, 0.46, 0.5),
-    ),
-    Palette(  # slate
-        light=(0.85, 0.86, 0.87), soft=(0.67, 0.69, 0.71), middle=(0.46, 0.49, 0.53), deep=(0.29, 0.31, 0.36),
-        dark=(0.15, 0.16, 0.19), accent=(0.73, 0.25, 0.24),
-    ),
-    Palette(  # lagoon
-        light=(0.85, 0.9, 0.88), soft=(0.6, 0.76, 0.74), middle=(0.29, 0.55, 0.56), deep=(0.12, 0.35, 0.4),
-        dark=(0.13, 0.2, 0.25), accent=(0.9, 0.6, 0.38),
-    ),
-    Palette(  # dusk
-        light=(0.87, 0.85, 0.9), soft=(0.68, 0.66, 0.78), middle=(0.45, 0.43, 0.62), deep=(0.28, 0.26, 0.43),
-        dark=(0.17, 0.17, 0.25), accent=(0.86, 0.66, 0.36),
-    ),
-    Palette(  # harvest
-        light=(0.92, 0.88, 0.76), soft=(0.86, 0.74, 0.5), middle=(0.75, 0.54, 0.25), deep=(0.48, 0.3, 0.16),
-        dark=(0.2, 0.22, 0.28), accent=(0.5, 0.2, 0.2),
-    ),
-)  # fmt: skip
-SKINS: tuple[Colour, ...] = (
-    (0.91, 0.75, 0.65), (0.86, 0.68, 0.56), (0.8, 0.6, 0.46), (0.71, 0.51, 0.38), (0.58, 0.4, 0.29),
-    (0.46, 0.31, 0.22), (0.36, 0.24, 0.175),
-)  # fmt: skip
-HAIRS: tuple[Colour, ...] = (
-    (0.09, 0.07, 0.065), (0.16, 0.1, 0.07), (0.27, 0.17, 0.1), (0.4, 0.25, 0.14), (0.6, 0.44, 0.26), (0.47, 0.22, 0.11),
-)  # fmt: skip
-GREY: Colour = (0.6, 0.59, 0.57)
-IRISES: tuple[Colour, ...] = ((0.2, 0.13, 0.08), (0.3, 0.21, 0.12), (0.25, 0.36, 0.3), (0.28, 0.4, 0.5))
 WORDS = (
     ("NORTH", "1904"),
     ("RIVER", "CLUB"),
@@ -184,6 +154,8 @@ WORDS = (
 TOPS = ("stripes", "dots", "checks", "plain", "zigzag", "leaves", "pinstripes", "tartan")
 BOTTOMS = ("plain", "pinstripes", "checks", "argyle", "plain", "zigzag")
 SKIRTS = ("tartan", "dots", "leaves", "stripes", "plain", "zigzag", "checks", "pinstripes")
+GARMENTS = ("skirt", "dress", "coat", "smock")
+COATS = ("plain", "checks", "pinstripes", "tartan")
 FINEST, COARSEST = 0.005, 0.1  # metres, periods of prints
 FIRST = Subject(
     number=0,
@@ -300,14 +272,25 @@ def _trousers(number: int, palette: Palette) -> Trousers:
 
 
 def _skirt(number: int, palette: Palette) -> Skirt:
-    length = _between(number, "length", 0.36, 0.68)
-    return Skirt(
-        cloth=_print(number, "skirt", SKIRTS, (palette.deep, palette.middle, palette.accent, palette.soft), palette),
-        hem=palette.light,
-        length=length,
-        # A long skirt that is narrow would bind the knees.
-        fullness=round(max(_between(number, "fullness", 0.75, 1.5), 1.6 * (length - 0.49) + 0.9), 3),
-    )
+    kind = _one_of(GARMENTS, number, "garment")
+    length, fullness = _between(number, "length", 0.36, 0.68), _between(number, "fullness", 0.75, 1.5)
+    # A long skirt that is narrow would bind the knees.
+    full = round(max(fullness, 1.6 * (length - 0.49) + 0.9), 3)
+    grounds = (palette.deep, palette.middle, palette.accent, palette.soft)
+    if kind == "coat":
+        cloth = _print(number, "skirt", COATS, (palette.deep, palette.dark, palette.middle), palette, strength=0.5)
+        ground = cloth.colours[0]
+        trim = _mixed(ground, palette.light if _luma(ground) < 0.3 else palette.dark, 0.45)
+        # Open in front, it binds no knees.
+        return Skirt(
+            cloth=cloth, hem=trim, length=round(0.48 + 0.5 * (length - 0.36), 3), fullness=round(0.8 * fullness, 3),
+            kind=kind,
+        )  # fmt: skip
+    cloth = _print(number, "skirt", SKIRTS, grounds, palette)
+    if kind == "smock":
+        length = round(0.14 + 0.3 * (length - 0.36), 3)
+        return Skirt(cloth=cloth, hem=palette.light, length=length, fullness=round(0.8 * fullness, 3), kind=kind)
+    return Skirt(cloth=cloth, hem=palette.light, length=length, fullness=full, kind=kind)
 
 
 def _shoes(number: int, palette: Palette) -> Shoes:

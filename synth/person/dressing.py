@@ -6,6 +6,7 @@ import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ash.capture.dataset import Skeleton
 from ash.files import InputError, read_arrays, write_arrays
@@ -34,6 +35,8 @@ FLARE = (
     (0.95, 0.022),
     (1.01, 0.006),
 )  # of a skirt, by height
+YOKE = 0.035  # metres above the joint of the chest from where dresses and smocks hang
+SLIT = 0.8  # of a coat's length below the waist, that is open in front
 DENSITY = {"head": 1.45, "hand": 1.25, "eye": 2.0}
 STORED = (
     "vertices", "weights", "faces", "uvs", "uv_faces", "part", "kept", "template_faces", "template_uv_faces",
@@ -63,11 +66,11 @@ class Measures:
 
 def anny_body(*, skirt: bool, number: int = 0) -> Body:
     """A subject's dressed body: in loose clothes with a skirt, or in tight clothes without."""
-    person = subject(number)
+    person = subject(number).loose if skirt else subject(number)
     modules = (sys.modules[__name__], garments, mesh, tubes, body)
     source = "".join(inspect.getsource(module) for module in modules)
     cut = (person.head.depth, person.head.nape, person.shirt.sleeve, person.trousers.cuff)
-    sewn = (person.skirt.length, person.skirt.fullness) if skirt else ()
+    sewn = (person.skirt.kind, person.skirt.length, person.skirt.fullness) if skirt else ()
     key = hashlib.sha256(f"{skirt} {cut} {sewn} {bake_key(person.shape)} {source}".encode()).hexdigest()[:12]
     path = cache_folder() / f"dressed-{key}.npz"
     if path.is_file():
@@ -101,7 +104,8 @@ def _dress(person: Subject, *, skirt: bool) -> dict[str, np.ndarray]:
     body, chart, density = _clothed(baked, person, "loose" if skirt else "tight")
     tubes = [_shoe(skeleton, side, measures.foot) for side in SIDES]
     if skirt:
-        tubes.append(_skirt(body, person.skirt, measures.leg))
+        yoke = skeleton.heads[skeleton.names.index("chest"), 1] + YOKE
+        tubes.append(_skirt(_trunk(body, skeleton), person.skirt, measures.leg, yoke=yoke))
     for tube in tubes:
         body = _append(body, tube, skeleton, measures.leg)
         chart = np.concatenate([chart, np.full(len(body.faces) - len(chart), chart.max() + 1)])
@@ -279,26 +283,58 @@ def _shoe(skeleton: Skeleton, side: str, scale: float) -> Tube:
     )  # fmt: skip
 
 
-def _skirt(body: Charted, skirt: Skirt, leg: float) -> Tube:
-    """A flared skirt that leaves room for the legs."""
-    clothed = np.unique(body.faces[np.isin(body.part, [PARTS.index("shirt"), PARTS.index("trousers")])])
-    points = body.vertices[clothed]
-    points = points[(np.abs(points[:, 0]) < 0.3) & (points[:, 1] < 1.05 * leg)]
+def _trunk(body: Charted, skeleton: Skeleton) -> np.ndarray:
+    """The points `[n, 3]` of shirt and trousers but the arms, that a garment hangs around."""
+    clothed = np.zeros(len(body.vertices), dtype=bool)
+    clothed[body.faces[np.isin(body.part, [PARTS.index("shirt"), PARTS.index("trousers")])]] = True
+    arms = [j for j, name in enumerate(skeleton.names) if "arm" in name or "hand" in name]
+    return body.vertices[clothed & (body.weights[:, arms].sum(axis=1) < 0.4)]
+
+
+def _skirt(trunk: np.ndarray, skirt: Skirt, leg: float, *, yoke: float) -> Tube:
+    """A flared garment that leaves room for the legs: from the waist, or from the `yoke` (metres above the floor)."""
+    points = trunk[(np.abs(trunk[:, 0]) < 0.3) & (trunk[:, 1] < max(1.05 * leg, (yoke + 0.05) * skirt.is_yoked))]
     shape = np.array(FLARE)
     top = shape[-1, 0]
     longer = skirt.length / FIRST.skirt.length
-    knots, radii = [], []
-    for height, flare in np.round(np.stack([top - (top - shape[:, 0]) * longer, shape[:, 1]], axis=1), 9) * [leg, 1]:
+    heights = np.round(top - (top - shape[:, 0]) * longer, 9) * leg
+    flares = shape[:, 1] * skirt.fullness
+    if skirt.is_yoked:
+        heights = np.concatenate([heights, np.linspace(heights[-1], yoke, 4)[1:]])
+        share = np.clip((yoke - heights) / (yoke - heights[0]), 0, 1)
+        flares = flares[-1] + share * (flares[0] - flares[-1]) * (1.0 if skirt.kind == "smock" else share)
+    centres, radii = [], []
+    for height in heights:
         # Below shorts there is no cloth to measure: the skirt goes on as wide as it is there.
         ring = points[np.abs(points[:, 1] - max(height, points[:, 1].min() + 0.03)) < 0.02]
         low, high = ring.min(axis=0), ring.max(axis=0)
-        knots.append([0, height, (low[2] + high[2]) / 2])
-        radii.append([(high[k] - low[k]) / 2 + flare * skirt.fullness for k in (0, 2)])
+        centres.append([0, height, (low[2] + high[2]) / 2])
+        radii.append([(high[k] - low[k]) / 2 for k in (0, 2)])
+    wide = np.array(radii)
+    if skirt.kind == "smock":  # It falls from the widest place above.
+        wide = np.maximum.accumulate(wide[::-1])[::-1]
+    length = np.ptp(heights) / np.ptp(shape[:, 0]) / leg
     return Tube(
-        part="skirt", knots=np.array(knots), radii=np.array(radii), front=(0.0, 0.0, 1.0), chain=("pelvis",),
-        borders=(), rings=round(20 * longer), segments=56,
-        chart=(0.0, 0.0, 1.5 * max(1.0, skirt.fullness**0.5), 0.5 * longer),
+        part="skirt", knots=np.array(centres), radii=wide + flares[:, None],
+        front=(0.0, 0.0, -1.0 if skirt.kind == "coat" else 1.0), chain=("pelvis",), borders=(),
+        rings=round(20 * length), segments=56, slit=SLIT if skirt.kind == "coat" else 0.0,
+        chart=(0.0, 0.0, 1.5 * max(1.0, skirt.fullness**0.5), 0.5 * length),
     )  # fmt: skip
+
+
+def _hung_weights(flat: np.ndarray, mesh: Charted, skeleton: Skeleton, leg: float) -> np.ndarray:
+    """A skirt's weights up to the waist; above it those of the trunk beneath."""
+    weights = skirt_weights(flat, skeleton.names, top=leg, length=0.48 * leg)
+    above = np.clip((flat[:, 1] - 1.02 * leg) / 0.08, 0, 1)[:, None]
+    if not above.any():
+        return weights
+    arms = [j for j, name in enumerate(skeleton.names) if "arm" in name or "hand" in name]
+    shirt = np.unique(mesh.faces[mesh.part == PARTS.index("shirt")])
+    shirt = shirt[mesh.weights[shirt][:, arms].sum(axis=1) < 0.4]
+    near = shirt[cKDTree(mesh.vertices[shirt]).query(flat, k=8)[1]]
+    trunk = mesh.weights[near].mean(axis=1)
+    trunk[:, arms] = 0
+    return (1 - above) * weights + above * trunk / trunk.sum(axis=1, keepdims=True)
 
 
 def _append(mesh: Charted, tube: Tube, skeleton: Skeleton, leg: float) -> Charted:
@@ -308,9 +344,12 @@ def _append(mesh: Charted, tube: Tube, skeleton: Skeleton, leg: float) -> Charte
         flat[:, 1] = np.maximum(flat[:, 1], 0)  # A flat sole.
         weights = np.repeat(chain_weights(tube, along, skeleton.names), tube.segments, axis=0)
     else:
-        weights = skirt_weights(flat, skeleton.names, top=leg, length=0.48 * leg)
+        weights = _hung_weights(flat, mesh, skeleton, leg)
     faces = grid_faces(tube.rings, tube.segments, stride=tube.segments, wrap=tube.segments)
     uv_faces = grid_faces(tube.rings, tube.segments, stride=tube.segments + 1, wrap=tube.segments + 1)
+    row, column = np.divmod(np.arange(len(faces)) // 2, tube.segments)
+    closed = (column < tube.segments - 1) | (row >= tube.slit * (tube.rings - 1))
+    faces, uv_faces = faces[closed], uv_faces[closed]
     return Charted(
         vertices=np.concatenate([mesh.vertices, flat]),
         weights=np.concatenate([mesh.weights, weights]),

@@ -4,7 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from synth.person.cast import Colour, Print
+from synth.person.cast import Print
+from synth.person.palettes import Colour
 
 SHARP = 0.0015  # metres over which a figure's edge is softened
 

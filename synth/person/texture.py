@@ -232,6 +232,11 @@ def _shirt(body: Body, shirt: Shirt, texels: Texels, along: np.ndarray, grain: n
     colour = mix(colour, shirt.collar, torso * edge(0.018 - collar, 0.003))
     seam = torso * edge(0.0025 - np.abs(position[:, 2]), 0.001)
     colour = mix(colour, shirt.seam, 0.6 * seam)
+    if shirt.buttons is not None:
+        x, front = position[:, 0], torso * (normal[:, 2] > 0.1) * (collar > 0.012)
+        colour = mix(colour, shirt.seam, front * edge(0.002 - np.abs(x - 0.02), 0.001))
+        height = (position[:, 1] / 0.11) % 1.0 - 0.5
+        colour = mix(colour, shirt.buttons, front * edge(0.009 - np.hypot(x, 0.11 * height), 0.002))
     return colour * _weave(position, grain)[:, None]
 
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+AJAR = 0.08  # of half its girth, that each edge of a slit is drawn back at the open end
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Tube:
@@ -20,6 +22,7 @@ class Tube:
     segments: int
     chart: tuple[float, float, float, float]  # u, v, width, height in metres
     blend: float = 0.12  # half the width of a hand-over along the curve
+    slit: float = 0.0  # share of the rings, from the first, between which the last column is left open
 
 
 def lattice(tube: Tube, rings: int, segments: int) -> tuple[np.ndarray, np.ndarray]:
@@ -33,9 +36,11 @@ def lattice(tube: Tube, rings: int, segments: int) -> tuple[np.ndarray, np.ndarr
     side = np.cross(axis, tube.front)
     side /= np.linalg.norm(side)
     front = np.cross(side, axis)
-    angle = 2 * np.pi * np.arange(segments) / segments
-    ring = -np.sin(angle)[None, :, None] * side * radii[:, None, :1]
-    ring = ring - np.cos(angle)[None, :, None] * front * radii[:, None, 1:]
+    angle = np.tile(2 * np.pi * np.arange(segments) / segments, (rings, 1))
+    if tube.slit:  # Its edges part more and more.
+        angle += AJAR * np.clip(1 - along / tube.slit, 0, 1)[:, None] * (np.pi * (1 - 1 / segments) - angle)
+    ring = -np.sin(angle)[..., None] * side * radii[:, None, :1]
+    ring = ring - np.cos(angle)[..., None] * front * radii[:, None, 1:]
     return centre[:, None] + ring, along
 
 

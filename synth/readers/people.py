@@ -83,6 +83,7 @@ def draw_person(scene: Scene) -> np.ndarray:
     motion = make_motion(body.skeleton, scene.train, fps=scene.fps, seed=stream(scene, "motion"))
     posed = true_surface(body, motion, scene.outfit, seed=stream(scene, "folds"))[0]
     seed, person = stream(scene, "texture"), subject(scene.subject)
+    person = person.loose if scene.outfit.skirt else person
     image = texture.paint(body, size=scene.texture, seed=seed, subject=person)
     camera = make_cameras(scene.rig, np.concatenate([posed, ROOM]))[1]
     studio = Studio(probe(), body.surface, image, scene.light, depth=scene.depth)

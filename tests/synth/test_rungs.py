@@ -14,7 +14,7 @@ from ash.capture.formats import load_capture
 from ash.files import InputError
 from synth import presets
 from synth.capture import make_capture
-from synth.cloth.surface import true_surface
+from synth.cloth.surface import Folds, true_surface
 from synth.motion.clips import make_motion
 from synth.person.body import PARTS
 from synth.person.mannequin import mannequin
@@ -80,6 +80,38 @@ def test_wrinkles_move_cloth_by_millimetres_and_depend_on_the_pose_only():
     elsewhere.dofs[:, :3] += [0.4, 0, 0.1]
     again = true_surface(BODY, elsewhere, outfit, seed=3)[::-1] - [0.4, 0, 0.1]
     np.testing.assert_allclose(again, folded, atol=1e-12)
+
+
+def test_folds_move_smoothly_with_the_pose():
+    """Neighbouring poses fold alike, so that folds can be learned from few frames; far poses do not."""
+    clips = tuple(Clip(generator=name, frames=8) for name in ("walk", "dance"))
+    motion = make_motion(BODY.skeleton, clips, fps=12.0, seed=0)
+    poses = motion.dofs[:, 3:].reshape(16, -1, 3)
+    for seed in range(3):
+        folds = Folds.of(BODY, seed=seed)
+        worn = folds.strength > 0.5
+
+        def alike(one: np.ndarray, other: np.ndarray, folds: Folds = folds, worn: np.ndarray = worn) -> float:
+            fields = [folds.displacement(BODY, pose)[worn] for pose in (one, other)]
+            return float(np.corrcoef(*fields)[0, 1])
+
+        direction = np.random.default_rng(seed).normal(size=poses[0].shape)
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        assert all(alike(pose, pose + np.deg2rad(1) * direction) > 0.99 for pose in poses)
+        assert np.median([alike(poses[k], poses[k + 1]) for k in range(7)]) > 0.8
+        far = [alike(poses[i], poses[8 + j]) for i in range(8) for j in range(8)]
+        assert np.median(far) < 0.6
+        turned = poses[0].copy()
+        turned[0] = [0, 2.0, 0]
+        np.testing.assert_array_equal(folds.displacement(BODY, turned), folds.displacement(BODY, poses[0]))
+
+
+def test_the_main_scenes_have_everything_on():
+    for name in ("tight", "loose"):
+        scene = presets.scene(name, size="quick")
+        assert min(scene.light.falloff, scene.light.gloss, scene.outfit.folds_mm, scene.outfit.scan_mm) > 0
+        assert scene.depth == 3 and scene.outfit.skirt == (name == "loose")
+    assert scene.outfit.swing >= 0.6 and scene.outfit.slack_mm > 0
 
 
 def test_swing_depends_on_history_and_the_skinned_skirt_does_not():

@@ -4,7 +4,7 @@ import numpy as np
 
 from ash.capture.dataset import surface_path
 from ash.files import read_arrays
-from synth.cloth.checks import penetrations, stretch
+from synth.cloth.checks import penetrations, self_intersections, stretch
 from synth.person.mannequin import mannequin
 
 BODY = mannequin(skirt=True)
@@ -23,6 +23,15 @@ def test_legs_that_poke_through_are_found_and_measured():
 def test_stretch_is_relative_to_rest():
     rest = BODY.surface.vertices
     np.testing.assert_allclose(stretch(BODY, np.stack([rest, 1.2 * rest]), "skirt"), [1.0, 1.2])
+
+
+def test_cloth_that_passes_through_itself_is_found():
+    """Two triangles that cross at a right angle, and the same ones apart."""
+    one, two = np.array([[0.0, 0, 0], [0, 1, 0], [1, 0, 0]]), np.array([[0, 1, 2], [3, 4, 5]])
+    far = np.concatenate([one, one[:, [2, 1, 0]] + [0.4, 0.1, -0.2]])
+    assert self_intersections(far, two).any()
+    assert not self_intersections(far + np.repeat([[0, 0, 0], [0, 0, 2]], 3, axis=0), two).any()
+    assert not self_intersections(BODY.surface.vertices[BODY.cage], BODY.cage_faces).any()
 
 
 def test_a_capture_tells_what_its_clothes_do_in_every_frame(small_capture: Path):

@@ -2,7 +2,19 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from synth.cloth.xpbd import Contacts, Sheet, State, colour, edges_of, hinges_of, limit_stretch, make_sheet, step
+from synth.cloth.checks import self_intersections
+from synth.cloth.xpbd import (
+    Contacts,
+    Sheet,
+    State,
+    colour,
+    crowd,
+    edges_of,
+    hinges_of,
+    limit_stretch,
+    make_sheet,
+    step,
+)
 
 
 def _grid(rows: int, columns: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
@@ -118,6 +130,37 @@ def test_cloth_that_falls_onto_a_capsule_stays_outside_of_it():
         axis[:, 0] = np.clip(axis[:, 0], -0.1, 0.1)
         assert np.linalg.norm(state.place - axis, axis=1).min() > 0.08
     assert state.place[:, 1].max() < 0.095 and state.place[:, 1].min() < 0.03  # It lies on top and hangs down.
+
+
+@pytest.mark.parametrize("colliding", [False, True])
+def test_cloth_does_not_pass_through_itself(colliding: bool):
+    """A strip folded in two whose upper half is thrown through the lower one."""
+    flat, faces = _grid(24, 8, 0.02)
+    sheet = make_sheet(flat, faces, pinned=flat[:, 1] > -0.2)
+    down = -flat[:, 1]
+    folded = np.stack([flat[:, 0], np.where(down > 0.23, 0.06, 0.0), np.minimum(down, 0.46 - down)], axis=1)
+    state = State(place=folded.copy(), velocity=np.where(down > 0.26, -2.0, 0.0)[:, None] * [0, 1, 0])
+    beyond, pierced = [], []
+    for _ in range(30):
+        crowded = crowd(sheet, state.place, least=0.015, soon=0.015) if colliding else None
+        for _ in range(5):
+            step(sheet, state, seconds=1e-3, pins=folded, weight=0.0, crowded=crowded)
+        beyond.append(np.mean(state.place[down > 0.28, 1] < 0))
+        pierced.append(self_intersections(state.place, faces)[down[faces].min(axis=1) > 0.28].mean())
+    if colliding:
+        assert max(beyond) == 0 and max(pierced) < 0.06 and state.place[down > 0.28, 1].mean() > 0.04
+    else:
+        assert max(beyond) > 0.5 and max(pierced) > 0.1
+
+
+def test_pairs_that_are_near_along_the_cloth_do_not_part():
+    rest, faces = _grid(12, 12, 0.02)
+    sheet = make_sheet(rest, faces, pinned=np.zeros(len(rest), dtype=bool))
+    assert not len(crowd(sheet, rest, least=0.013, soon=0.013).pairs)
+    rolled = rest * [1, 0.05, 1]
+    pairs = crowd(sheet, rolled, least=0.013, soon=0.0).pairs
+    assert len(pairs) and np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1).min() > 0.026
+    assert np.linalg.norm(rolled[pairs[:, 0]] - rolled[pairs[:, 1]], axis=1).max() <= 0.013
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3, 0.8])

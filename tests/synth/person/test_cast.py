@@ -13,11 +13,10 @@ from synth import presets
 from synth.person import anny_body, cast, texture
 from synth.person.body import PARTS
 from synth.person.cast import BLOCK, FIRST, MOST, Print, Shape, subject
-from synth.person.dressing import EYES, FOOT, LEG, Measures, _past_sleeve, _skirt
+from synth.person.dressing import EYES, FOOT, LEG, SLIT, Measures, _past_sleeve, _skirt
 from synth.person.mannequin import mannequin
-from synth.person.mesh import Charted
 from synth.person.prints import PATTERNS, printed
-from synth.person.tubes import chart_uvs, grid_faces
+from synth.person.tubes import lattice
 from synth.scene import stream
 from synth.skeleton import JOINTS
 
@@ -152,24 +151,51 @@ def test_skirts_are_as_long_and_as_full_as_they_are_told():
     rings = [
         np.stack([0.15 * np.sin(angle), 0 * angle + y, 0.12 * np.cos(angle)], 1) for y in np.arange(0.2, 1.1, 0.02)
     ]
-    vertices, rows = np.concatenate(rings), len(rings)
-    faces = grid_faces(rows, 24, stride=24, wrap=24)
-    legs = Charted(
-        vertices=vertices,
-        weights=np.ones((len(vertices), 1)),
-        faces=faces,
-        uvs=chart_uvs(rows, 24),
-        uv_faces=grid_faces(rows, 24, stride=25, wrap=25),
-        part=np.full(len(faces), PARTS.index("trousers")),
-    )
+    trunk = np.concatenate(rings)
     plain, long, full, tall = (
-        _skirt(legs, replace(FIRST.skirt, **changes), leg)
+        _skirt(trunk, replace(FIRST.skirt, **changes), leg, yoke=1.2)
         for changes, leg in (({}, 1.0), ({"length": 0.62}, 1.0), ({"fullness": 1.5}, 1.0), ({}, 0.9))
     )
     assert plain.knots[0, 1] == 0.52 and plain.knots[-1, 1] == 1.01 and plain.rings == 20
     assert long.knots[0, 1] == pytest.approx(0.39) and long.rings == 25
     assert full.radii[0, 0] - plain.radii[0, 0] == pytest.approx(0.5 * 0.115)
     np.testing.assert_allclose(tall.knots[:, 1], 0.9 * plain.knots[:, 1])
+
+
+def test_garments_of_a_block_are_of_every_kind_alike_and_subject_0_keeps_its_skirt():
+    assert FIRST.skirt.kind == "skirt" and FIRST.loose is FIRST
+    for start in (16, 48):
+        kinds = [subject(number).skirt.kind for number in range(start, start + BLOCK)]
+        assert all(kinds.count(kind) == BLOCK / len(cast.GARMENTS) for kind in cast.GARMENTS)
+    for person in CAST[1:]:
+        worn, garment = person.loose, person.skirt
+        if garment.kind == "skirt":
+            assert worn == person
+            continue
+        assert worn.shirt.cloth == garment.cloth and worn.shirt.words is None
+        assert (worn.shirt.buttons is not None) == (garment.kind == "coat") and person.shirt.buttons is None
+        assert replace(worn, shirt=person.shirt) == person
+    lengths = {kind: [p.skirt.length for p in CAST[1:] if p.skirt.kind == kind] for kind in cast.GARMENTS}
+    assert max(lengths["smock"]) < min(lengths["dress"]) and min(lengths["coat"]) > 0.45
+
+
+def test_dresses_and_smocks_hang_from_the_chest_and_a_coat_is_open_in_front():
+    angle = 2 * np.pi * np.arange(24) / 24
+    levels = np.arange(0.2, 1.3, 0.02)
+    girth = 1 - 0.3 * np.exp(-(((levels - 1.05) / 0.08) ** 2))  # a waist
+    across = np.stack([0.15 * np.sin(angle), 0.12 * np.cos(angle)], axis=1)
+    trunk = np.concatenate([np.insert(g * across, 1, y, axis=1) for y, g in zip(levels, girth, strict=True)])
+    tubes = {kind: _skirt(trunk, replace(FIRST.skirt, kind=kind), 1.0, yoke=1.22) for kind in cast.GARMENTS}
+    tops = {kind: tube.knots[-1, 1] for kind, tube in tubes.items()}
+    assert tops == {"skirt": 1.01, "dress": 1.22, "coat": 1.01, "smock": 1.22}
+    assert all(tube.knots[0, 1] == 0.52 for tube in tubes.values())
+    waist = {kind: tubes[kind].radii[5, 0] for kind in ("dress", "smock")}
+    assert waist["smock"] > 0.16 > waist["dress"]  # A smock falls past the waist, a dress follows it.
+    assert (np.diff(tubes["smock"].radii[:, 0]) <= 1e-12).all()
+    assert tubes["coat"].slit > 0 == tubes["skirt"].slit
+    place, along = lattice(tubes["coat"], 20, 56)
+    gap = np.linalg.norm(place[:, 0] - place[:, -1], axis=1)
+    assert place[:, [0, -1], 2].min() > 0 and gap[0] > 3 * gap[along > SLIT].max()
 
 
 def test_a_block_of_bodies_is_baked_by_two_models_and_what_is_there_is_kept(
