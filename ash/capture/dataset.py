@@ -203,7 +203,8 @@ def fewer_views(capture: Capture, *, cameras: float = 1.0, frames: float = 1.0) 
     """The capture with shares (0..1] of its training cameras and frames, at least one; other splits keep theirs.
 
     Cameras are spread evenly: they are added one by one, each the farthest from those chosen so far, so that a smaller
-    share is a part of a larger. Frames are the first ones.
+    share is a part of a larger. Frames are the first ones; where a part of the cameras saw each frame, frames that none
+    of those left saw are left out.
     """
     train = capture.splits["train"]
     positions = np.stack([capture.cameras[name].position for name in train.cameras])
@@ -213,7 +214,7 @@ def fewer_views(capture: Capture, *, cameras: float = 1.0, frames: float = 1.0) 
         chosen.append(int(distance.argmax()))
     names = tuple(train.cameras[index] for index in sorted(chosen))
     first = train.frames[: max(1, round(frames * len(train.frames)))]
-    return replace(capture, splits=capture.splits | {"train": replace(train, cameras=names, frames=first)})
+    return replace(capture, splits=capture.splits | {"train": train.only(cameras=names, frames=first)})
 
 
 def image_path(folder: Path, camera: str, frame: int) -> Path:
