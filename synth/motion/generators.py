@@ -23,7 +23,8 @@ def in_a_manner(plan: Plan, rng: np.random.Generator) -> Plan:
         plan.look[:, axis] += held(0.16, 0.1)
     for arm in range(2):
         plan.flexion[:, arm] += held(0.22, 0.1)
-        plan.abduction[:, arm] += 0.22 + held(0.14, 0.08)
+        # Over the head, sideways is across: there the arms are left where they are.
+        plan.abduction[:, arm] += (0.22 + held(0.14, 0.08)) * np.cos(np.clip(plan.flexion[:, arm], 0, np.pi / 2))
         plan.elbow[:, arm] += 0.35 + held(0.25, 0.1)
     plan.shift[:, 1] -= rng.uniform(0.0, 0.05)
     return plan
@@ -226,13 +227,11 @@ def spin(times: np.ndarray, rng: np.random.Generator) -> Plan:
 
 
 def arms_up(times: np.ndarray, rng: np.random.Generator) -> Plan:
-    """Stretch both arms up over the head, on tiptoe, and sway. A pose that no other motion is like."""
+    """Stretch both arms up and apart, on tiptoe, and sway. A pose that no other motion is like."""
     plan = standing(times)
     x = (times - times[0]) / (times[-1] - times[0])
     up, sway = smooth((x + 0.3) / 0.55), np.sin(2 * np.pi * x + rng.uniform(0, 2 * np.pi))
-    plan.flexion += rng.uniform(2.65, 2.85) * up[:, None]
-    plan.abduction += 0.2 * up[:, None]
-    plan.elbow += 0.15 * (1 - up)[:, None]
+    plan.abduction += rng.uniform(1.9, 2.1) * up[:, None]
     plan.bend[:, 0] = -0.12 * up
     plan.bend[:, 2] = 0.2 * up * sway
     plan.look[:, 0] = -0.35 * up
@@ -247,8 +246,8 @@ def deep_squat(times: np.ndarray, rng: np.random.Generator) -> Plan:
     """Sink onto the balls of the feet and stay down, the arms between the knees, looking around."""
     plan = standing(times)
     x = (times - times[0]) / (times[-1] - times[0])
-    deep, around = smooth((x + 0.2) / 0.65), np.sin(2 * np.pi * x + rng.uniform(0, 2 * np.pi))
-    plan.shift[:, 1] = -0.01 - rng.uniform(0.4, 0.44) * deep
+    deep, around = smooth((x + 0.3) / 0.85), np.sin(2 * np.pi * x + rng.uniform(0, 2 * np.pi))
+    plan.shift[:, 1] = -0.01 - rng.uniform(0.34, 0.38) * deep
     back = -0.1 * deep
     plan.bend[:, 0] = 0.45 * deep
     plan.bend[:, 1] = 0.3 * deep * around
@@ -259,7 +258,7 @@ def deep_squat(times: np.ndarray, rng: np.random.Generator) -> Plan:
     plan.elbow += 0.8 * deep[:, None]
     plan.yaw += rng.uniform(-0.4, 0.4)
     plan.shift[:, [0, 2]] = back[:, None] * np.stack([np.sin(plan.yaw), np.cos(plan.yaw)], axis=1)
-    _plant(plan, yaw=float(plan.yaw[0]), width=0.17, splay=0.35)
+    _plant(plan, yaw=float(plan.yaw[0]), width=0.12, splay=0.12)
     plan.heel = 0.5 * deep[:, None] * np.ones(2)
     return plan
 
