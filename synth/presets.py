@@ -40,7 +40,7 @@ def _size(name: str) -> Size:
         rig = Rig(cameras=20, held_out=4, part=8, width=192, height=192)
         apart = {"test_frames": 12, "stride": 10, "near_stride": 10, "far_stride": 4}
         return Size(rig=rig, repeats=2, frames=10, **apart, samples=50, texture=1024)
-    if name == "quick":  # 104 training frames; at 256x256 an image costs as much as the frame's cloth, or more.
+    if name == "quick":  # 104 training frames, and fewer than 550 images.
         apart = {"test_frames": 10, "stride": 17, "near_stride": 8, "far_stride": 4}
         return Size(rig=ROTATING, repeats=2, frames=13, **apart, samples=50, texture=2048)
     if name == "long":  # `quick` with three times the training motion.

@@ -2,14 +2,15 @@
 
 A capture is a folder:
 
-    manifest.json        schema, scene, its parameters, seed, versions, splits, SHA-256 of every file, complete or not
+    manifest.json        schema, scene, its parameters, seed, versions, SHA-256 of every file, complete or not; splits:
+                         cameras, frames, and parts (the cameras that saw each frame) where not all of them did
     cameras.json         width, height; per camera: name, K, viewmat (world -> camera, OpenCV axes); for a lens with
                          distortion its k1 k2 p1 p2, and then images and truth are those of the distorted picture
     skeleton.json        joints: name, parent, rest position of its head
     template.npz         the template mesh that methods are given: rest vertices, faces, UVs, skin weights
     body.npz             the same of the body without clothes, as a fitted body model would give it; may be absent
     motion.npz           degrees of freedom per frame, and the sequence each frame belongs to
-    frames/CAM/FRAME.png RGBA, uint8 sRGB, straight alpha
+    frames/CAM/FRAME.png RGBA, uint8 sRGB, straight alpha; of the pairs that a split names
     scans/FRAME.npz      vertices [n, 3] and faces [f, 3] of what a scanner made of a training frame: noise and holes;
                          may be absent
     truth/               what no real capture knows; only oracles and the evaluation may read it

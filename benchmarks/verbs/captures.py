@@ -42,7 +42,7 @@ Excerpts = Annotated[Excerpt, arg(name="", prefix_name=False)]
 class SynthVerb:
     """Render the ground truth of a scene into a capture folder.
 
-    Every field of the scene is a flag (--rig.cameras 24 --outfit.swing 0.8); `synth SCENE --help` lists them.
+    Every field of the scene is a flag (--rig.cameras 44 --outfit.swing 0.8); `synth SCENE --help` lists them.
 
     A motion file replaces the scene's own training (or test) motion: BVH, or AMASS-style .npz with poses, trans and
     mocap_framerate. It is retargeted to our skeleton, its path centred on the origin, its first frames at the scene's
@@ -191,7 +191,7 @@ class ExportVerb:
     folder: Positional[Path]  # of the capture
     form: Annotated[str, arg(name="format", metavar="FORMAT")]  # ash, nerfstudio, colmap or glb
     out: Folder | None = None  # default: DIR-FORMAT
-    split: str | None = None  # of nerfstudio and colmap: train (default), novel_view or novel_pose
+    split: str | None = None  # of nerfstudio and colmap: train (default), novel_view, near_pose, novel_pose or far_pose
     frame: int | None = None  # of nerfstudio and colmap: only this frame of the split
 
     def __call__(self) -> int:

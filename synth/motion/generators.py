@@ -247,7 +247,7 @@ def deep_squat(times: np.ndarray, rng: np.random.Generator) -> Plan:
     plan = standing(times)
     x = (times - times[0]) / (times[-1] - times[0])
     deep, around = smooth((x + 0.3) / 0.85), np.sin(2 * np.pi * x + rng.uniform(0, 2 * np.pi))
-    plan.shift[:, 1] = -0.01 - rng.uniform(0.34, 0.38) * deep
+    plan.shift[:, 1] = -0.01 - rng.uniform(0.32, 0.36) * deep
     back = -0.1 * deep
     plan.bend[:, 0] = 0.45 * deep
     plan.bend[:, 1] = 0.3 * deep * around
