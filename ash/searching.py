@@ -147,8 +147,8 @@ def without_a_sequence(capture: Capture) -> tuple[Capture, Split]:
     apart = [frame for frame, number in zip(train.frames, numbers, strict=True) if number == known[len(known) // 2]]
     if len(known) == 1:
         apart = list(train.frames[-max(1, len(train.frames) // 4) :])
-    rest = replace(train, frames=tuple(frame for frame in train.frames if frame not in apart))
-    return replace(capture, splits={"train": rest}), Split(cameras=train.cameras, frames=tuple(apart))
+    rest = train.only(frames=[frame for frame in train.frames if frame not in apart])
+    return replace(capture, splits={"train": rest}), train.only(frames=apart)
 
 
 def with_choice(outcome: TrainingOutcome | None, choice: Choice | None) -> TrainingOutcome | None:
@@ -207,8 +207,7 @@ def _key(config: Any, capture: Capture) -> str:
     decisive = {
         "capture": capture.identity,
         "config": repr(config),
-        "frames": train.frames,
-        "cameras": train.cameras,
+        "train": asdict(train),
         "sources": hash_sources(Path(__file__).parent),
         "torch": torch.__version__,
     }

@@ -50,9 +50,9 @@ class NearestImage:
             near = self.train.frames[int(distances.argmin())]
             seen = {
                 name: see_root(skeleton, Pose(self.capture.motion, near), self.capture.cameras[name])
-                for name in self.train.cameras
+                for name in self.train.seeing(near)
             }
-            name = max(self.train.cameras, key=lambda candidate: float(seen[candidate].direction @ wanted.direction))
+            name = max(seen, key=lambda candidate: float(seen[candidate].direction @ wanted.direction))
         with clock.stage("stg4"):
             return move_image(self.capture.image(name, near), seen[name], wanted, camera)
 

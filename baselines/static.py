@@ -11,7 +11,7 @@ from baselines.switches import wo_mot
 
 
 class StaticAvatar(AshAvatar):
-    """ASH without motion, which sees every camera of a single training frame."""
+    """ASH without motion, which sees what the cameras saw of a single training frame."""
 
     def __init__(self, config: AshConfig, capture: Capture) -> None:
         super().__init__(config, of_one_frame(capture))
@@ -25,7 +25,7 @@ def of_one_frame(capture: Capture) -> Capture:
     """The capture with one training frame: the one whose pose is nearest to all others."""
     train = capture.splits["train"]
     frame = central_frame(capture.motion, train.frames)
-    return replace(capture, splits=capture.splits | {"train": replace(train, frames=(frame,))})
+    return replace(capture, splits=capture.splits | {"train": train.only(frames=(frame,))})
 
 
 # One set of Gaussians from one frame, at the preset's budget; one frame teaches no deformation.

@@ -10,13 +10,14 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from dataclasses import replace
+from functools import lru_cache, partial
 from multiprocessing.connection import wait as wait_for_end
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ash.capture.dataset import image_path, scan_path, surface_path
+from ash.capture.dataset import Motion, image_path, scan_path, surface_path
 from ash.capture.formats import (
     read_motion,
     read_skeleton,
@@ -26,6 +27,7 @@ from ash.capture.formats import (
     write_template,
 )
 from ash.capture.manifest import Manifest, hash_files, is_capture, read_manifest
+from ash.capture.novelty import novelty_deg
 from ash.files import InputError, write_arrays, write_image
 from synth.camera.render import Renderer, probe
 from synth.camera.rig import make_cameras
@@ -33,7 +35,7 @@ from synth.cloth import surface
 from synth.cloth.checks import penetrations, stretch
 from synth.code import code_version, source_version
 from synth.cost import require_space
-from synth.motion.clips import make_motion, pose_novelty
+from synth.motion.clips import make_motion
 from synth.person import texture
 from synth.person.bare import bare_template
 from synth.person.body import Body
@@ -197,15 +199,15 @@ def make_body(scene: Scene) -> Body:
 def describe(scene: Scene, folder: Path, executor: Executor | None = None) -> None:
     """Write everything but images: motion, surface of every frame, template, cameras, texture. Kept where complete.
 
-    The texture is painted by the `executor` while the cloth moves here.
+    The `executor` paints the texture and moves the cloth, clip by clip.
     """
     last = folder / "cameras.json"
     if last.is_file():
         return
     body = make_body(scene)
     painted = executor.submit(paint, scene, folder) if executor else None
-    motion = make_motion(body.skeleton, scene.train + scene.test, fps=scene.fps, seed=stream(scene, "motion"))
-    moved = surface.true_surface(body, motion, scene.outfit, seed=stream(scene, "folds"))
+    motion = make_motion(body.skeleton, scene.clips, fps=scene.fps, seed=stream(scene, "motion"))
+    moved = _moved(scene, body, motion, executor)
     write_skeleton(folder / "skeleton.json", body.skeleton)
     write_motion(folder / "motion.npz", motion)
     offset = surface.scan_error(body, scene.outfit, seed=stream(scene, "scan"))
@@ -237,11 +239,30 @@ def describe(scene: Scene, folder: Path, executor: Executor | None = None) -> No
     write_cameras(last, cameras)
 
 
+def _moved(scene: Scene, body: Body, motion: Motion, executor: Executor | None) -> np.ndarray:
+    """The surface of every frame, `[t, s, 3]` metres. No clip knows of another: an `executor` shares them out."""
+    clips = [np.flatnonzero(motion.sequence == index) for index in np.unique(motion.sequence)]
+    parts = [replace(motion, dofs=motion.dofs[clip], sequence=motion.sequence[clip]) for clip in clips]
+    if executor is None or len(parts) == 1:
+        return surface.true_surface(body, motion, scene.outfit, seed=stream(scene, "folds"))
+    return np.concatenate(list(executor.map(partial(drape, scene), parts)))
+
+
+def drape(scene: Scene, motion: Motion) -> np.ndarray:
+    """The surface of every frame of a clip, `[t, s, 3]` metres."""
+    return surface.true_surface(_body(scene), motion, scene.outfit, seed=stream(scene, "folds"))
+
+
+@lru_cache(maxsize=1)
+def _body(scene: Scene) -> Body:
+    return make_body(scene)
+
+
 def paint(scene: Scene, folder: Path) -> None:
     """Write the texture."""
     seed, person = stream(scene, "texture"), subject(scene.subject)
     person = person.loose if scene.outfit.skirt else person
-    image = texture.paint(make_body(scene), size=scene.texture, seed=seed, subject=person)
+    image = texture.paint(_body(scene), size=scene.texture, seed=seed, subject=person)
     write_image(folder / "truth" / "texture.png", image)
 
 
@@ -290,6 +311,6 @@ def finish(scene: Scene, folder: Path, renderer: Renderer) -> None:
     }
     motion = read_motion(folder / "motion.npz", joints=len(read_skeleton(folder / "skeleton.json").names))
     parts = splits(scene)
-    novelty = pose_novelty(motion, train=parts["train"].frames, test=parts["novel_pose"].frames)
-    manifest = replace(_manifest(scene), made_with=made_with, pose_novelty_deg=round(novelty, 3))
+    novelty = np.mean(novelty_deg(motion, train=parts["train"].frames, test=parts["novel_pose"].frames))
+    manifest = replace(_manifest(scene), made_with=made_with, pose_novelty_deg=round(float(novelty), 3))
     replace(manifest, files=hash_files(folder)).write(folder)

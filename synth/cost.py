@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ash.files import InputError
 from synth.scene import Scene
+from synth.views import splits
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -27,11 +28,8 @@ class Estimate:
 def estimate(scene: Scene) -> Estimate:
     """Images, core seconds and bytes of a capture before it is made."""
     training = sum(clip.frames for clip in scene.train)
-    rig = scene.rig
-    train_views = (rig.cameras - rig.held_out) * training
-    novel_views = rig.held_out * (len(range(scene.novel_view_stride // 2, training, scene.novel_view_stride)))
-    images = train_views + novel_views + rig.held_out * (scene.frames - training)
-    pixels = rig.width * rig.height
+    images = sum(split.count for split in splits(scene).values())
+    pixels = scene.rig.width * scene.rig.height
     longer = 1.4 if scene.depth > 2 or scene.light.gloss else 1.0  # than direct light on diffuse cloth takes
     per_image = 0.07 + 1.6e-7 * pixels * scene.samples * longer
     fixed = (40.0 if scene.body == "anny" else 6.0) + 0.25 * scene.frames + 0.5 * training * (scene.scanner.rms_mm > 0)

@@ -13,8 +13,7 @@ from synth.motion.importing import WHOLE
 from synth.scene import Clip, Light, Outfit, Rig, Scene, Take
 
 SIZES = ("ci", "rung", "quick", "long", "table", "paper")
-
-
+ROTATING = Rig(cameras=24, held_out=4, part=4)
 EVENING = Light(falloff=0.4, gloss=0.2)  # a lamp that lights one side of the floor, on cloth that shines a little
 
 
@@ -24,9 +23,11 @@ class Size:
 
     rig: Rig
     repeats: int  # rounds of the training clips
-    frames: int  # per clip
+    frames: int  # per clip, of training and of what is near and far
     test_frames: int
-    stride: int
+    stride: int  # of novel views
+    near_stride: int
+    far_stride: int
     samples: int  # per pixel; halves of n n or n (n + 1) samples fill the strata of the sampler
     texture: int
 
@@ -34,27 +35,33 @@ class Size:
 def _size(name: str) -> Size:
     if name == "ci":
         rig = Rig(cameras=6, held_out=2, width=128, height=128)
-        return Size(rig=rig, repeats=1, frames=4, test_frames=3, stride=3, samples=16, texture=512)
+        apart = {"test_frames": 3, "stride": 3, "near_stride": 2, "far_stride": 2}
+        return Size(rig=rig, repeats=1, frames=4, **apart, samples=16, texture=512)
     if name == "rung":  # Enough cameras for held-out views to be between them, enough pixels for what a rung adds.
-        rig = Rig(cameras=20, held_out=4, width=192, height=192)
-        return Size(rig=rig, repeats=1, frames=10, test_frames=12, stride=5, samples=50, texture=1024)
-    if name == "quick":
-        return Size(rig=Rig(), repeats=1, frames=10, test_frames=12, stride=5, samples=60, texture=2048)
-    if name == "long":  # `quick` with eight times the training motion.
-        return Size(rig=Rig(), repeats=8, frames=10, test_frames=12, stride=40, samples=60, texture=2048)
+        rig = Rig(cameras=20, held_out=4, part=8, width=192, height=192)
+        apart = {"test_frames": 12, "stride": 10, "near_stride": 10, "far_stride": 4}
+        return Size(rig=rig, repeats=2, frames=10, **apart, samples=50, texture=1024)
+    if name == "quick":  # 104 training frames, and fewer than 550 images.
+        apart = {"test_frames": 10, "stride": 17, "near_stride": 8, "far_stride": 4}
+        return Size(rig=ROTATING, repeats=2, frames=13, **apart, samples=60, texture=2048)
+    if name == "long":  # `quick` with three times the training motion.
+        apart = {"test_frames": 12, "stride": 40, "near_stride": 8, "far_stride": 4}
+        return Size(rig=ROTATING, repeats=8, frames=10, **apart, samples=60, texture=2048)
     if name == "table":
-        rig = Rig(cameras=34, held_out=4, width=512, height=512)
-        return Size(rig=rig, repeats=4, frames=20, test_frames=80, stride=20, samples=128, texture=4096)
+        rig = Rig(cameras=34, held_out=4, part=10, width=512, height=512)
+        apart = {"test_frames": 80, "stride": 20, "near_stride": 4, "far_stride": 2}
+        return Size(rig=rig, repeats=4, frames=20, **apart, samples=128, texture=4096)
     if name == "paper":
         rig = Rig(kind="studio", cameras=120, held_out=4, width=1285, height=940, radius=4.5)
-        return Size(rig=rig, repeats=100, frames=50, test_frames=7000, stride=100, samples=60, texture=4096)
+        apart = {"test_frames": 7000, "stride": 100, "near_stride": 4, "far_stride": 2}
+        return Size(rig=rig, repeats=100, frames=50, **apart, samples=60, texture=4096)
     raise InputError(f"unknown size {name!r}, expected one of {', '.join(SIZES)}")
 
 
 def _base(name: str, size: str, seed: int, *, body: str, outfit: Outfit) -> Scene:
     amount = _size(size)
-    kinds = ("walk", "squat") if size == "ci" else ("walk", "reach", "turn", "squat")
-    return Scene(
+    kinds, far = ("walk", "reach", "turn", "squat"), ("arms_up", "deep_squat", "jump")
+    base = Scene(
         name=name,
         size=size,
         seed=seed,
@@ -62,12 +69,24 @@ def _base(name: str, size: str, seed: int, *, body: str, outfit: Outfit) -> Scen
         outfit=outfit,
         light=Light(),
         rig=amount.rig,
-        train=tuple(Clip(generator=kind, frames=amount.frames) for kind in kinds * amount.repeats),
+        train=(Clip(generator="stand", frames=amount.frames),),
         test=(Clip(generator="dance", frames=amount.test_frames),),
         novel_view_stride=amount.stride,
+        near_stride=amount.near_stride,
+        far_stride=amount.far_stride,
         samples=amount.samples,
         texture=amount.texture,
     )
+    return _moving(base, amount, ("walk", "squat") if size == "ci" else kinds, far[:1] if size == "ci" else far)
+
+
+def _moving(scene: Scene, amount: Size, kinds: tuple[str, ...], far: tuple[str, ...]) -> Scene:
+    """The scene with rounds of these kinds to train on, another take of each to be near, and others to be far."""
+    train, near, others = (
+        tuple(Clip(generator=kind, frames=amount.frames) for kind in some)
+        for some in (kinds * amount.repeats, tuple(dict.fromkeys(kinds)), far)
+    )
+    return replace(scene, train=train, near=near[:1] if scene.size == "ci" else near, far=others)
 
 
 def mannequin(*, size: str, seed: int) -> Scene:
@@ -97,8 +116,7 @@ def skinned(*, size: str, seed: int) -> Scene:
     # Nothing that lifts the knees through a skirt that is only skinned.
     kinds = ("walk", "reach") if size == "ci" else ("walk", "reach", "run", "reach")
     base = _base("skinned", size, seed, body="mannequin" if size == "ci" else "anny", outfit=Outfit(skirt=True))
-    clips = tuple(Clip(generator=kind, frames=amount.frames) for kind in kinds * amount.repeats)
-    return replace(base, train=clips)
+    return _moving(base, amount, kinds, ("arms_up",))
 
 
 def rung(name: str, *, size: str, seed: int = 0, strength: float = 1.0) -> Scene:
@@ -121,7 +139,8 @@ def still(*, size: str, seed: int) -> Scene:
     """One pose: the textured body, path-traced. Static Gaussians suffice."""
     base = skinned(size=size, seed=seed)
     train, test = (Clip(generator="stand", frames=frames) for frames in (4, 2))
-    return replace(base, name="still", train=(train,), test=(test,), novel_view_stride=2)
+    rig = replace(base.rig, part=0)
+    return replace(base, name="still", rig=rig, train=(train,), test=(test,), near=(), far=(), novel_view_stride=2)
 
 
 RUNGS = ("wrinkles", "swing", "lit", "glossy", "turning")
@@ -151,13 +170,16 @@ def scene(name: str, *, size: str, seed: int = 0, subject: int = 0) -> Scene:
 def with_motion(
     scene: Scene, skeleton: Skeleton, *, train: Path | None, test: Path | None, take: Take = WHOLE
 ) -> Scene:
-    """The scene driven by a user's BVH or AMASS files, for as many frames as the scene has; the rest stays."""
+    """The scene driven by a user's BVH or AMASS files, for as many frames as the scene has; the rest stays.
+
+    What is near or far of its own motion says nothing of another's, and is left out.
+    """
 
     def driven(clips: tuple[Clip, ...], path: Path | None) -> tuple[Clip, ...]:
         most = sum(clip.frames for clip in clips)
         return clips if path is None else (clip_from_file(path, skeleton, fps=scene.fps, most=most, take=take),)
 
-    return replace(scene, train=driven(scene.train, train), test=driven(scene.test, test))
+    return replace(scene, train=driven(scene.train, train), test=driven(scene.test, test), near=(), far=())
 
 
 def with_rig(scene: Scene, path: Path) -> Scene:

@@ -16,6 +16,8 @@ MOTIONS = (
     "run",
     "jump",
     "spin",
+    "arms_up",
+    "deep_squat",
 )  # as in `motion/generators.py`
 GIVEN = "given"  # the kind of a clip whose motion comes from a user's file
 UPS = ("auto", "x", "y", "z", "-x", "-y", "-z")
@@ -100,6 +102,7 @@ class Rig:
     given: str = ""  # the text of a user's cameras.json, for kind "given"
     cameras: int = 16
     held_out: int = 4
+    part: int = 0  # so many training cameras see each training frame, by turns; 0: all do
     width: int = 256
     height: int = 256
     radius: float = 3.4  # metres
@@ -114,6 +117,12 @@ class Rig:
             raise InputError("a rig of kind 'given' needs the text of a cameras.json, and only such a rig has one")
         if not 0 < self.held_out < self.cameras <= 1000:
             raise InputError(f"rig: {self.held_out} of {self.cameras} cameras held out, expected 1 to all but one")
+        training = self.cameras - self.held_out
+        if not 0 <= self.part <= training or (self.part and training % self.part):
+            raise InputError(
+                f"rig: a part of {self.part} of {training} training cameras sees each frame, expected a divisor of"
+                f" {training}, or 0 for all"
+            )
         if not (16 <= self.width <= 8192 and 16 <= self.height <= 8192):
             raise InputError(f"rig: images of {self.width}x{self.height}, expected 16 to 8192 pixels")
         if not (0.1 <= self.pixel_aspect <= 10 and 0 <= self.shutter <= 1):
@@ -149,8 +158,12 @@ class Scene:
     light: Light
     rig: Rig
     train: tuple[Clip, ...]
-    test: tuple[Clip, ...]
+    test: tuple[Clip, ...]  # held-out motion of kinds that training has not
     novel_view_stride: int  # novel views are judged on every so many training frames
+    near: tuple[Clip, ...] = ()  # held-out motion that is near: other takes of training's kinds
+    far: tuple[Clip, ...] = ()  # held-out motion that is far: poses that nothing in training is like
+    near_stride: int = 1  # every so many-th frame of a near clip has images; the others are history
+    far_stride: int = 1  # the same of far clips
     scanner: Scanner = Scanner()
     fps: float = 12.0
     samples: int = 48  # per pixel, in two halves
@@ -163,7 +176,9 @@ class Scene:
             raise InputError(f"unknown body {self.body!r}, expected one of {', '.join(BODIES)}")
         if not self.train or not self.test:
             raise InputError("a scene needs at least one training and one test clip")
-        if sum(clip.frames for clip in self.train + self.test) > 1_000_000:
+        if not (1 <= self.near_stride <= 100_000 and 1 <= self.far_stride <= 100_000):
+            raise InputError(f"strides of {self.near_stride} and {self.far_stride} frames, expected 1 to 100000")
+        if self.frames > 1_000_000:
             raise InputError("a scene of more than a million frames")
         if not 2 <= self.samples <= 65536 or self.samples % 2:
             raise InputError(f"{self.samples} samples per pixel, expected an even number from 2 to 65536")
@@ -171,9 +186,14 @@ class Scene:
             raise InputError(f"subject {self.subject}, expected 0 to 2^31 - 1")
 
     @property
+    def clips(self) -> tuple[Clip, ...]:
+        """All motion, in the order of its frames."""
+        return self.train + self.test + self.near + self.far
+
+    @property
     def frames(self) -> int:
-        """Number of frames, training and test."""
-        return sum(clip.frames for clip in self.train + self.test)
+        """Number of frames, training and held out."""
+        return sum(clip.frames for clip in self.clips)
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -181,7 +201,12 @@ class Scene:
         parameters = asdict(self)
         if not self.subject:
             del parameters["subject"]
-        for clip in (*parameters["train"], *parameters["test"]):
+        if not self.rig.part:
+            del parameters["rig"]["part"]
+        for name in ("near", "far"):
+            if not parameters[name]:
+                del parameters[name], parameters[f"{name}_stride"]
+        for clip in (clip for name in ("train", "test", "near", "far") for clip in parameters.get(name, ())):
             del clip["path"]
             if clip["take"] == asdict(Take()):
                 del clip["take"]

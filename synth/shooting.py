@@ -69,7 +69,7 @@ def _scan(scene: Scene, folder: Path, studio: Studio, cameras: dict[str, Camera]
     if not is_scanned(scene, frame) or scan_path(folder, frame).is_file():
         return
     studio.dress(pose)
-    training = [cameras[name] for name in splits(scene)["train"].cameras]
+    training = [cameras[name] for name in splits(scene)["train"].seeing(frame)]
     vertices, faces = scan(studio, training, scene.scanner, seed=stream(scene, "scan", frame))
     write_arrays(scan_path(folder, frame), vertices=vertices, faces=faces)
 
@@ -77,7 +77,7 @@ def _scan(scene: Scene, folder: Path, studio: Studio, cameras: dict[str, Camera]
 def _poses(scene: Scene, folder: Path, frame: int) -> tuple[np.ndarray, list[np.ndarray]]:
     """The surface in a frame, and while the shutter is open around it."""
     first = 0
-    for clip in scene.train + scene.test:
+    for clip in scene.clips:
         if frame < first + clip.frames:
             break
         first += clip.frames

@@ -2,10 +2,12 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from ash.capture.dataset import Split
-from synth.camera.rig import held_out
+from synth.camera.rig import held_out, rotation
 from synth.camera.rig import names as camera_names
-from synth.scene import Scene
+from synth.scene import Clip, Scene
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -17,17 +19,42 @@ class WantedView:
 
 
 def splits(scene: Scene) -> dict[str, Split]:
-    """Training views; held-out cameras on some training frames; held-out cameras on the test motion."""
+    """Training views; held-out cameras on some training frames; held-out cameras on near, new and far motion."""
     names = camera_names(scene.rig)
     apart = tuple(names[k] for k in held_out(scene.rig))
     training = sum(clip.frames for clip in scene.train)
-    return {
-        "train": Split(cameras=tuple(name for name in names if name not in apart), frames=tuple(range(training))),
-        "novel_view": Split(
-            cameras=apart, frames=tuple(range(scene.novel_view_stride // 2, training, scene.novel_view_stride))
-        ),
-        "novel_pose": Split(cameras=apart, frames=tuple(range(training, scene.frames))),
+    tested = training + sum(clip.frames for clip in scene.test)
+    nearby = tested + sum(clip.frames for clip in scene.near)
+    held_out_frames = {
+        "novel_view": tuple(range(scene.novel_view_stride // 2, training, scene.novel_view_stride)),
+        "near_pose": _some(scene.near, first=tested, stride=scene.near_stride),
+        "novel_pose": tuple(range(training, tested)),
+        "far_pose": _some(scene.far, first=nearby, stride=scene.far_stride),
     }
+    parts = _parts(scene, training)
+    used = {name for part in parts for name in part} or set(names) - set(apart)  # Few frames do not come to all.
+    train = Split(cameras=tuple(n for n in names if n in used), frames=tuple(range(training)), parts=parts)
+    return {"train": train} | {
+        name: Split(cameras=apart, frames=frames) for name, frames in held_out_frames.items() if frames
+    }
+
+
+def _some(clips: tuple[Clip, ...], *, first: int, stride: int) -> tuple[int, ...]:
+    """Every `stride`-th frame of each clip, of which the first one's begins at frame `first`; at least one of each."""
+    starts = np.cumsum([first, *(clip.frames for clip in clips)])[:-1]
+    return tuple(
+        int(start) + frame
+        for start, clip in zip(starts, clips, strict=True)
+        for frame in range(min(stride // 2, clip.frames - 1), clip.frames, stride)
+    )
+
+
+def _parts(scene: Scene, frames: int) -> tuple[tuple[str, ...], ...]:
+    """The names of the cameras that see each training frame; none where all do."""
+    if not scene.rig.part:
+        return ()
+    names = camera_names(scene.rig)
+    return tuple(tuple(names[k] for k in sorted(part)) for part in rotation(scene.rig, frames))
 
 
 def wanted_views(scene: Scene) -> list[WantedView]:

@@ -2,14 +2,15 @@
 
 A capture is a folder:
 
-    manifest.json        schema, scene, its parameters, seed, versions, splits, SHA-256 of every file, complete or not
+    manifest.json        schema, scene, its parameters, seed, versions, SHA-256 of every file, complete or not; splits:
+                         cameras, frames, and parts (the cameras that saw each frame) where not all of them did
     cameras.json         width, height; per camera: name, K, viewmat (world -> camera, OpenCV axes); for a lens with
                          distortion its k1 k2 p1 p2, and then images and truth are those of the distorted picture
     skeleton.json        joints: name, parent, rest position of its head
     template.npz         the template mesh that methods are given: rest vertices, faces, UVs, skin weights
     body.npz             the same of the body without clothes, as a fitted body model would give it; may be absent
     motion.npz           degrees of freedom per frame, and the sequence each frame belongs to
-    frames/CAM/FRAME.png RGBA, uint8 sRGB, straight alpha
+    frames/CAM/FRAME.png RGBA, uint8 sRGB, straight alpha; of the pairs that a split names
     scans/FRAME.npz      vertices [n, 3] and faces [f, 3] of what a scanner made of a training frame: noise and holes;
                          may be absent
     truth/               what no real capture knows; only oracles and the evaluation may read it
@@ -203,7 +204,8 @@ def fewer_views(capture: Capture, *, cameras: float = 1.0, frames: float = 1.0) 
     """The capture with shares (0..1] of its training cameras and frames, at least one; other splits keep theirs.
 
     Cameras are spread evenly: they are added one by one, each the farthest from those chosen so far, so that a smaller
-    share is a part of a larger. Frames are the first ones.
+    share is a part of a larger. Frames are the first ones; where a part of the cameras saw each frame, frames that none
+    of those left saw are left out.
     """
     train = capture.splits["train"]
     positions = np.stack([capture.cameras[name].position for name in train.cameras])
@@ -213,7 +215,7 @@ def fewer_views(capture: Capture, *, cameras: float = 1.0, frames: float = 1.0) 
         chosen.append(int(distance.argmax()))
     names = tuple(train.cameras[index] for index in sorted(chosen))
     first = train.frames[: max(1, round(frames * len(train.frames)))]
-    return replace(capture, splits=capture.splits | {"train": replace(train, cameras=names, frames=first)})
+    return replace(capture, splits=capture.splits | {"train": train.only(cameras=names, frames=first)})
 
 
 def image_path(folder: Path, camera: str, frame: int) -> Path:

@@ -1,5 +1,6 @@
 """The manifest of a capture: what it is, which files belong to it, and whether they are intact."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -9,20 +10,56 @@ from ash.files import InputError, read_json, require_plain, sha256_of, write_jso
 
 NAME = "manifest.json"
 SCHEMA = 1
-SPLITS = ("train", "novel_view", "novel_pose")
+SPLITS = ("train", "novel_view", "near_pose", "novel_pose", "far_pose")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Split:
-    """Which cameras and frames belong together; every pair has an image."""
+    """Which cameras and frames belong together: where no parts are told, every camera saw every frame."""
 
     cameras: tuple[str, ...]
     frames: tuple[int, ...]
+    parts: tuple[tuple[str, ...], ...] = ()  # the cameras that saw each frame, in the order of `frames`; none: all did
+
+    @property
+    def cameras_per_frame(self) -> tuple[tuple[str, ...], ...]:
+        """The cameras that saw each frame, in the order of `frames`."""
+        return self.parts or (self.cameras,) * len(self.frames)
 
     @property
     def views(self) -> list[tuple[str, int]]:
-        """All (camera, frame) pairs, frame by frame."""
-        return [(camera, frame) for frame in self.frames for camera in self.cameras]
+        """All (camera, frame) pairs that have an image, frame by frame."""
+        return [
+            (camera, frame) for frame, part in zip(self.frames, self.cameras_per_frame, strict=True) for camera in part
+        ]
+
+    @property
+    def count(self) -> int:
+        """How many images there are."""
+        return sum(map(len, self.cameras_per_frame))
+
+    def seeing(self, frame: int) -> tuple[str, ...]:
+        """The cameras that saw a frame of the split."""
+        return self.cameras_per_frame[self.frames.index(frame)]
+
+    def only(self, *, cameras: Sequence[str] | None = None, frames: Sequence[int] | None = None) -> "Split":
+        """The split's images by some of its cameras, in some of its frames. What is left without images is left out.
+
+        Raises:
+            InputError: none of its images is.
+        """
+        few_cameras, few_frames = set(self.cameras if cameras is None else cameras), set(frames or ())
+        kept = {
+            frame: tuple(name for name in part if name in few_cameras)
+            for frame, part in zip(self.frames, self.cameras_per_frame, strict=True)
+            if frames is None or frame in few_frames
+        }
+        kept = {frame: part for frame, part in kept.items() if part}
+        if not kept:
+            raise InputError("expected images of the split, got cameras and frames that have none together")
+        used = {name for part in kept.values() for name in part}
+        names = tuple(name for name in self.cameras if name in used)
+        return Split(cameras=names, frames=tuple(kept), parts=tuple(kept.values()) if self.parts else ())
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -40,16 +77,22 @@ class Manifest:
     source: str = ""  # version of our sources alone
     parameters: dict[str, Any] = field(default_factory=dict)  # every parameter of the scene
     made_with: dict[str, str] = field(default_factory=dict)
-    pose_novelty_deg: float | None = None  # of the test motion, see `synth.motion.clips.pose_novelty`
+    pose_novelty_deg: float | None = None  # mean over the split novel_pose, see `ash.capture.novelty`
     perturbed: dict[str, Any] = field(default_factory=dict)  # how it was spoilt, and of which capture
     undistorted: dict[str, str] = field(default_factory=dict)  # of which capture
 
     def write(self, folder: Path) -> None:
         """Write it into a capture's folder, atomically."""
         told = {f.name: getattr(self, f.name) for f in fields(self)}
-        told["splits"] = {n: {"cameras": list(s.cameras), "frames": list(s.frames)} for n, s in self.splits.items()}
+        told["splits"] = {name: _told(split) for name, split in self.splits.items()}
         said = {name: value for name, value in told.items() if name == "files" or value not in ("", {}, None)}
         write_json(folder / NAME, {"schema": SCHEMA} | said)
+
+
+def _told(split: Split) -> dict[str, Any]:
+    """A split as JSON, which says nothing of parts where every camera saw every frame."""
+    told: dict[str, Any] = {"cameras": list(split.cameras), "frames": list(split.frames)}
+    return told | ({"parts": [list(part) for part in split.parts]} if split.parts else {})
 
 
 def is_capture(folder: Path) -> bool:
@@ -84,6 +127,18 @@ def _require_splits(splits: dict[str, Split]) -> None:
             raise ValueError(f"splits.{name}: expected cameras and frames")
         if len(set(split.cameras)) < len(split.cameras) or len(set(split.frames)) < len(split.frames):
             raise ValueError(f"splits.{name}: a camera or a frame stands there twice")
+        if split.parts:
+            _require_parts(name, split)
+
+
+def _require_parts(name: str, split: Split) -> None:
+    if len(split.parts) != len(split.frames):
+        raise ValueError(f"splits.{name}: parts of {len(split.parts)} frames, expected {len(split.frames)}")
+    for part in split.parts:
+        if not part or len(set(part)) < len(part) or not set(part) <= set(split.cameras):
+            raise ValueError(f"splits.{name}: expected in every part some cameras of the split, each once")
+    if set(split.cameras) != {camera for part in split.parts for camera in part}:
+        raise ValueError(f"splits.{name}: a camera stands in no part")
 
 
 def files_below(folder: Path) -> list[str]:

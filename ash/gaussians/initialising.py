@@ -92,11 +92,12 @@ def initial_texture(capture: Capture, template: Template, lattice: TexelLattice)
 
 
 def mean_colours(capture: Capture, template: Template, lattice: TexelLattice) -> Float[Tensor, "n 3"]:
-    """Mean training pixel of every texel, over a few frames and all training cameras.
+    """Mean training pixel of every texel, over a few frames and all training cameras that saw them.
 
     Views count by how squarely they see the texel. Unseen texels take the mean colour of the seen.
     """
-    frames = capture.splits["train"].frames
+    train = capture.splits["train"]
+    frames = train.frames
     chosen = frames[:: max(1, len(frames) // COLOUR_FRAMES)]
     total = torch.zeros(len(lattice.texels), 3)
     weight = torch.zeros(len(lattice.texels), 1)
@@ -104,7 +105,7 @@ def mean_colours(capture: Capture, template: Template, lattice: TexelLattice) ->
         posed = template.pose(Pose(capture.motion, frame))
         positions = lattice.interpolate(posed.vertices)
         normals = lattice.interpolate(posed.normals)
-        for name in capture.splits["train"].cameras:
+        for name in train.seeing(frame):
             camera = capture.cameras[name]
             image = torch.from_numpy(capture.image(name, frame)).float() / 255
             pixels, facing = visible_pixels(camera, posed, template, positions, normals)

@@ -60,8 +60,8 @@ def track_images(capture: Capture, template: Template, graph: EmbeddedGraph, *, 
         paint = _Paint(subject.paint)
         for index, frame in enumerate(images.frames):
             views = [
-                observe(images.views[name, frame], camera, images.boxes[name, frame], blur=blur)
-                for name, camera in images.cameras.items()
+                observe(images.views[name, frame], images.cameras[name], images.boxes[name, frame], blur=blur)
+                for name in images.seeing(frame)
             ]
             subject.move(index, posed[index], views, paint, reach=reach)
         subject.paint = paint.mean()

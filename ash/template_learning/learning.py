@@ -78,7 +78,7 @@ def with_template(outcome: TrainingOutcome | None, template: Template) -> Traini
 def template_key(config: TemplateConfig, capture: Capture, *, seed: int) -> str:
     """Hash of everything that decides a learned template, sources included."""
     train = capture.splits["train"]
-    views = {"frames": train.frames, "cameras": train.cameras if config.supervision == "images" else ()}
+    views = {"train": asdict(train) if config.supervision == "images" else train.frames}
     drawn = seed if config.network == "graph" else 0  # Else nothing is random.
     decisive = {
         "capture": capture.identity,

@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from ash.capture.dataset import Camera, Capture
+from ash.capture.manifest import Split
 from ash.config import TrainingConfig
 from ash.devices import CPU
 from ash.files import InputError
@@ -18,7 +19,7 @@ from ash.native.library import address, float32_on_cpu, load
 CROP_MARGIN = 12  # Pixels around the subject, so that a Gaussian that strays outside the mask is still seen.
 RESERVED_VIEWS = 24  # Training views that no step sees, where there are enough: they tell when training may end.
 RESERVED_SHARE = 8  # No more than an eighth of the training views are reserved,
-RESERVED_OF_FRAME = 3  # and no more than a third of a frame's.
+RESERVED_OF_FRAME = 3  # and no more than a third of a frame's, where all cameras saw it.
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -32,6 +33,10 @@ class TrainingImages:
     reserved: tuple[tuple[str, int], ...] = ()  # views that no batch holds
     device: torch.device = CPU  # where batches are made; the images stay in the processor's memory
     plates: dict[str, UInt8[np.ndarray, "h w 3"]] = field(default_factory=dict)  # the empty studio, where it is known
+
+    def seeing(self, frame: int) -> list[str]:
+        """The cameras that saw a frame."""
+        return [name for name in self.cameras if (name, frame) in self.boxes]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -65,25 +70,34 @@ def load_training_images(capture: Capture, device: torch.device = CPU) -> Traini
         boxes=boxes,
         cameras={name: capture.cameras[name] for name in train.cameras},
         frames=tuple(train.frames),
-        reserved=reserved_views(tuple(train.cameras), tuple(train.frames)),
+        reserved=reserved_views(train),
         plates={name: plate for name in train.cameras if (plate := capture.plate(name)) is not None},
         device=device,
     )
 
 
-def reserved_views(cameras: tuple[str, ...], frames: tuple[int, ...]) -> tuple[tuple[str, int], ...]:
+def reserved_views(train: Split) -> tuple[tuple[str, int], ...]:
     """24 views, spread over frames and cameras; fewer of a small capture, none where a step would then lack cameras.
 
-    At most an eighth of all views, and at most a third of the cameras in a frame.
+    At most an eighth of all views, and at most a third of the cameras in a frame; of frames that a part of the cameras
+    saw, one of two.
     """
-    of_frame = len(cameras) // RESERVED_OF_FRAME
-    count = min(RESERVED_VIEWS, len(cameras) * len(frames) // RESERVED_SHARE, of_frame * len(frames))
-    if count == 0:
+    parts = dict(zip(train.frames, train.cameras_per_frame, strict=True))
+    room = {f: len(part) // RESERVED_OF_FRAME or int(bool(train.parts) and len(part) > 1) for f, part in parts.items()}
+    frames = [frame for frame, some in room.items() if some]
+    if not frames:
         return ()
+    count = min(RESERVED_VIEWS, train.count // RESERVED_SHARE, len(frames) * min(room[frame] for frame in frames))
+    cameras = len(train.cameras)
     # A stride without a common divisor comes to every camera before it comes back to one.
-    stride = next(s for s in range(max(1, round(0.4 * len(cameras))), len(cameras) + 1) if gcd(s, len(cameras)) == 1)
-    where = [(i * stride % len(cameras), i * len(frames) // count) for i in range(count)]
-    return tuple((cameras[camera], frames[frame]) for camera, frame in where)
+    stride = next(s for s in range(max(1, round(0.4 * cameras)), cameras + 1) if gcd(s, cameras) == 1)
+    chosen: list[tuple[str, int]] = []
+    for i in range(count):
+        frame, wanted = frames[i * len(frames) // count], i * stride % cameras
+        free = [name for name in parts[frame] if (name, frame) not in chosen]
+        # The camera whose turn it is, or the next one that saw the frame.
+        chosen.append((min(free, key=lambda name: (train.cameras.index(name) - wanted) % cameras), frame))
+    return tuple(chosen)
 
 
 def draw_batch(images: TrainingImages, config: TrainingConfig, seed: int, step: int) -> Batch:
@@ -92,7 +106,7 @@ def draw_batch(images: TrainingImages, config: TrainingConfig, seed: int, step: 
     order = np.random.default_rng([seed, 1, epoch]).permutation(len(images.frames))
     frame = images.frames[order[position]]
     rng = np.random.default_rng([seed, 2, step])
-    cameras = [name for name in images.cameras if (name, frame) not in images.reserved]
+    cameras = [name for name in images.seeing(frame) if (name, frame) not in images.reserved]
     count = min(config.views_per_step, len(cameras))
     names = [cameras[i] for i in rng.choice(len(cameras), count, replace=False)]
     colour = np.zeros(3) if config.background == "black" else rng.random(3)

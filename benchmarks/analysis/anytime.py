@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.analysis.names import SPLIT_NAMES, look_of
-from benchmarks.analysis.scores import RANKED_SPLITS
+from benchmarks.analysis.scores import HELD_OUT_SPLITS
 from benchmarks.analysis.statistics import independent, mean_interval
 from benchmarks.cell.cells import CellResult
 
@@ -26,7 +26,7 @@ def snapshots(results: Sequence[CellResult]) -> pd.DataFrame:
         end = result.training.seconds if result.training else result.value("speed", "", "train_s")
         config = result.config
         points = [(row.split, row.seconds, row.psnr) for row in result.snapshots]
-        final = [(split, end, result.value(split, "foreground", "psnr")) for split in RANKED_SPLITS]
+        final = [(split, end, result.value(split, "foreground", "psnr")) for split in HELD_OUT_SPLITS]
         for split, seconds, psnr in points + [point for point in final if None not in point]:
             rows.append((config.scene, split, config.method, seconds, config.capture, config.seed, psnr))
     return pd.DataFrame(rows, columns=list(COLUMNS))

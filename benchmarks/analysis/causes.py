@@ -15,11 +15,11 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from ash.capture.dataset import Capture, pixels_path
 from ash.capture.formats import load_capture
+from ash.capture.novelty import novelty_deg
 from ash.files import read_arrays
 from benchmarks.cell import metrics
 from benchmarks.cell.cells import Cell, CellResult, ViewScore, stored_prediction
 from benchmarks.cell.views import View
-from synth.motion.clips import pose_distances
 from synth.readers.truth import depth, normals, pixel_truth, points, surface_truth
 
 REGION_COLOURS = ("#2f6fde", "#dd6b20", "#c2415c", "#b8860b", "#c9ced6")
@@ -47,7 +47,7 @@ class Cause:
 
     view: ViewScore
     shares: tuple[Share, ...]
-    novelty_deg: float  # root mean square over joints
+    novelty_deg: float  # mean over joints
     novelty_rank: float  # 0: the most ordinary pose of the split, 1: the most novel
     map: np.ndarray  # [h, w] index into REGIONS, -1: background
     truth: np.ndarray  # [h, w, 4] uint8 on black
@@ -85,7 +85,7 @@ def worst_frames(
     seen = _seen_triangles(capture.folder, capture.identity)
     train = capture.splits["train"].frames
     frames = sorted({view.frame for view in views})
-    novelty = dict(zip(frames, pose_distances(capture.motion, train=train, test=tuple(frames)), strict=True))
+    novelty = dict(zip(frames, novelty_deg(capture.motion, train=train, test=frames), strict=True))
     ranks = {frame: _rank(list(novelty.values()), novelty[frame]) for frame in frames}
     return tuple(
         _cause(capture, cell, view, seen, novelty_deg=novelty[view.frame], novelty_rank=ranks[view.frame])
@@ -170,10 +170,10 @@ def _seen_triangles(folder: Path, identity: str) -> np.ndarray:
     faces = surface_truth(capture).faces
     seen = np.zeros(len(faces), bool)
     train = capture.splits["train"]
-    for frame in train.frames[:: max(1, len(train.frames) // FRAMES_SEEN)]:
-        for camera in train.cameras:
-            triangle = read_arrays(pixels_path(capture.folder, camera, frame), expected=("triangle",))["triangle"]
-            seen[triangle[triangle >= 0]] = True
+    # As many images whether all cameras saw a frame or a part of them: their frames lie the closer together.
+    for camera, frame in train.views[:: max(1, train.count // (FRAMES_SEEN * len(train.cameras)))]:
+        triangle = read_arrays(pixels_path(capture.folder, camera, frame), expected=("triangle",))["triangle"]
+        seen[triangle[triangle >= 0]] = True
     corners = np.zeros(faces.max() + 1, bool)
     corners[faces[seen]] = True
     return corners[faces].any(axis=1)

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.analysis.names import look_of
-from benchmarks.analysis.scores import RANKED_SPLITS
+from benchmarks.analysis.scores import HELD_OUT_SPLITS
 from benchmarks.analysis.statistics import independent, mean_interval
 from benchmarks.cell.cells import CellResult
 from benchmarks.suites.stress import FOOTAGE_FRAMES
@@ -22,7 +22,7 @@ def curves(results: Sequence[CellResult]) -> pd.DataFrame:
     places = dict.fromkeys((r.config.scene, r.config.method, r.config.severity) for r in used)
     for scene, method, severity in places:
         own = [r for r in used if (r.config.scene, r.config.method, r.config.severity) == (scene, method, severity)]
-        for split in RANKED_SPLITS:
+        for split in HELD_OUT_SPLITS:
             samples: dict[str, list[float]] = {}
             for result in own:
                 if (score := result.value(split, "foreground", "psnr")) is not None:

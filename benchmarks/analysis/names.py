@@ -58,7 +58,9 @@ LOOKS = {
 }
 SPLIT_NAMES = {
     "novel_view": SplitName(title="Novel view", words="held-out views"),
-    "novel_pose": SplitName(title="Novel pose", words="held-out motion"),
+    "near_pose": SplitName(title="Held-out motion: near", words="near held-out motion"),
+    "novel_pose": SplitName(title="Held-out motion: new", words="held-out motion"),
+    "far_pose": SplitName(title="Held-out motion: far", words="far held-out motion"),
     "train_view": SplitName(title="Training view", words="training views"),
     "speed": SplitName(title="Cost", words="cost"),
     "memory": SplitName(title="Cost", words="cost"),

@@ -4,6 +4,7 @@
 groups it: first by capture and seed, then over those, and answers look-ups.
 """
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -47,6 +48,8 @@ class Quantity(NamedTuple):
 
 
 RANKED_SPLITS = ("novel_view", "novel_pose")
+MOTION_SPLITS = ("near_pose", "novel_pose", "far_pose")  # held-out motion, nearest first
+HELD_OUT_SPLITS = ("novel_view", *MOTION_SPLITS)
 FRAME_MS = Quantity("speed", "", "frame_ms")
 
 
@@ -114,7 +117,9 @@ def read_csv(path: Path) -> pd.DataFrame:
 
 
 def images_of(results: Sequence[CellResult]) -> pd.DataFrame:
-    """One row per scored image of unspoilt captures: its cell, `split`, `camera`, `frame`, and foreground scores."""
+    """One row per scored image of unspoilt captures: its cell, `split`, `camera`, `frame`, foreground scores, and
+    `novelty_deg` of its pose where the result tells it.
+    """
     rows = [
         {
             "scene": result.config.scene,
@@ -124,14 +129,15 @@ def images_of(results: Sequence[CellResult]) -> pd.DataFrame:
             "split": view.split,
             "camera": view.camera,
             "frame": view.frame,
-            **{metric: value for (region, metric), value in view.scores.items() if region == "foreground"},
+            **{metric: value for (region, metric), value in view.scores.items() if region in ("foreground", "")},
         }
         for result in results
         if not result.config.axis
         for view in result.views
     ]
-    columns = ["scene", "method", "seed", "capture", "split", "camera", "frame", "psnr"]
-    return pd.DataFrame(rows) if rows else pd.DataFrame(columns=columns)
+    columns = ["scene", "method", "seed", "capture", "split", "camera", "frame", "psnr", "novelty_deg"]
+    found = pd.DataFrame(rows, columns=None if rows else columns)
+    return found if "novelty_deg" in found else found.assign(novelty_deg=math.nan)
 
 
 def curves_of(results: Sequence[CellResult]) -> pd.DataFrame:

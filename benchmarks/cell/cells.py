@@ -12,6 +12,7 @@ A cell lives in a folder of its own, named by the hash of what went in:
     result.json     what came out; written last, atomically: where it exists, the cell is finished
 """
 
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -167,9 +168,20 @@ class Cell:
     capture_folder: Path = field(default=Path())
 
 
-def failed_result(config: CellConfig, status: Status, reason: str, provenance: Provenance | None = None) -> CellResult:
-    """The result of a cell that did not come through: the worst of every quality, never a missing row."""
-    qualities = [(split, region, metric) for split in IMAGE_SPLITS for region, metric in VIEW_SCORES]
+def failed_result(
+    config: CellConfig,
+    status: Status,
+    reason: str,
+    provenance: Provenance | None = None,
+    *,
+    splits: Collection[str] = ("novel_view", "novel_pose"),
+) -> CellResult:
+    """The result of a cell that did not come through: the worst of every quality, never a missing row.
+
+    `splits`: those that the capture has.
+    """
+    scored = [split for split in IMAGE_SPLITS if split == "train_view" or split in splits]
+    qualities = [(split, region, metric) for split in scored for region, metric in VIEW_SCORES]
     rows = [Summary(split=s, region=r, metric=m, value=METRICS[m].worst) for s, r, m in qualities]
     rows.append(Summary(split="speed", region="", metric="frame_ms", value=METRICS["frame_ms"].worst))
     rows.append(Summary(split="speed", region="", metric="failed", value=1.0))

@@ -1,7 +1,7 @@
 """A trained method on held-out views and motion: drawn, stored, scored, its cost measured."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from hashlib import sha256
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from ash.capture.dataset import Capture, pixels_path, surface_path
 from ash.capture.formats import read_template_truth
+from ash.capture.novelty import novelty_deg
 from ash.files import read_arrays, write_image
 from ash.protocol import TrainingOutcome
 from benchmarks.cell import metrics
@@ -26,7 +27,7 @@ from benchmarks.cell.cells import (
 from benchmarks.cell.curves import read_curve, seconds_to_settle
 from benchmarks.cell.failing import MethodFailed
 from benchmarks.cell.host import EXAM, WORK, Described, Host, Timed, frame_times_ms
-from benchmarks.cell.metrics import IMAGE_SPLITS, VIEW_SCORES
+from benchmarks.cell.metrics import IMAGE_SPLITS, NOVELTY, VIEW_SCORES
 from benchmarks.cell.timing import TIMED_FRAMES, WARM_UP_FRAMES, Spent, reference_workload_ms
 from benchmarks.cell.views import View, evaluated_views, playback
 from benchmarks.cell.weights import weights_file
@@ -87,7 +88,7 @@ def judge(
     `training`: how training ended, where the avatar was loaded and does not know.
     """
     training = drawn.described.training or training
-    scored = [_score(cell, capture, view, stored_prediction(cell, capture, view)) for view in drawn.views]
+    scored = scored_views(cell, capture, drawn.views)
     curve = read_curve(cell.folder / "log.jsonl")
     summary = (
         _image_summary(scored)
@@ -164,6 +165,15 @@ def _agreement(shown: np.ndarray, scored: np.ndarray) -> float:
     return metrics.psnr(shown[..., :3], scored[..., :3], region if region.any() else None)
 
 
+def scored_views(cell: Cell, capture: Capture, views: Sequence[View]) -> list[ViewScore]:
+    """Every stored picture against the truth, with how far its pose lies from the nearest that training shows."""
+    frames = sorted({view.frame for view in views})
+    far = novelty_deg(capture.motion, train=capture.splits["train"].frames, test=frames)
+    novelty = dict(zip(frames, far, strict=True))
+    scored = [_score(cell, capture, view, stored_prediction(cell, capture, view)) for view in views]
+    return [replace(each, scores=each.scores | {NOVELTY: novelty[each.frame]}) for each in scored]
+
+
 def _score(cell: Cell, capture: Capture, view: View, prediction: np.ndarray) -> ViewScore:
     truth = metrics.on_black(capture.image(view.camera, view.frame))
     scores = metrics.score_view(prediction, truth)
@@ -194,7 +204,7 @@ def _image_summary(scored: list[ViewScore]) -> tuple[Summary, ...]:
     rows = []
     for split in IMAGE_SPLITS:
         views = [view for view in scored if view.split == split]
-        for region, metric in (*VIEW_SCORES, ("full", "lpips"), ("foreground", "noise_ceiling")):
+        for region, metric in (*VIEW_SCORES, ("full", "lpips"), ("foreground", "noise_ceiling"), NOVELTY):
             values = [view.scores[region, metric] for view in views if (region, metric) in view.scores]
             if values:
                 rows.append(Summary(split=split, region=region, metric=metric, value=float(np.mean(values))))

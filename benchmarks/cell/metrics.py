@@ -65,6 +65,7 @@ METRICS = {
         Metric(
             key="noise_ceiling", title="noise ceiling", unit="dB", direction="none", worst=0.0, decimals=1, abs_tol=0.1
         ),
+        Metric(key="novelty_deg", title="novelty", unit="deg", direction="none", worst=180.0, decimals=1, abs_tol=0.1),
         Metric(key="frame_ms", title="frame", unit="ms", direction="down", worst=1e6, decimals=1, abs_tol=0.0),
         Metric(key="stg1_ms", title="Stg.1", unit="ms", direction="down", worst=1e6, decimals=1, abs_tol=0.0),
         Metric(key="stg2_ms", title="Stg.2", unit="ms", direction="down", worst=1e6, decimals=1, abs_tol=0.0),
@@ -93,7 +94,8 @@ METRICS = {
     )
 }
 
-IMAGE_SPLITS = ("train_view", "novel_view", "novel_pose")
+IMAGE_SPLITS = ("train_view", "novel_view", "near_pose", "novel_pose", "far_pose")
+NOVELTY = ("", "novelty_deg")  # of every evaluated image, beside its scores
 VIEW_SCORES = (  # (region, metric) of every evaluated image
     ("foreground", "psnr"),
     ("full", "psnr"),

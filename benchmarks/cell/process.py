@@ -34,11 +34,10 @@ from benchmarks.cell.cells import (
     prediction_path,
     read_cell,
     result_of,
-    stored_prediction,
     write_result,
 )
 from benchmarks.cell.children import adopt_orphans
-from benchmarks.cell.evaluation import _flicker_summary, _gap_summary, _image_summary, _score, draw_all, judge
+from benchmarks.cell.evaluation import _flicker_summary, _gap_summary, _image_summary, draw_all, judge, scored_views
 from benchmarks.cell.failing import Killed, MethodFailed, Spoilt
 from benchmarks.cell.host import WORK, Host, give_files, hosted, take_files
 from benchmarks.cell.methods import ORACLES, configured, find_method
@@ -102,9 +101,10 @@ def run_cell(cell: Cell) -> CellResult:
             shutil.rmtree(cell.folder / WORK)
             return run_cell(cell)
         print(f"{cell.config.title}: {error.status}: {error}", file=sys.stderr)
-        result = failed_result(cell.config, error.status, str(error))
+        result = failed_result(cell.config, error.status, str(error), splits=capture.splits)
     except MemoryError as error:
-        result = failed_result(cell.config, "out of memory", str(error) or "the process could not allocate memory")
+        reason = str(error) or "the process could not allocate memory"
+        result = failed_result(cell.config, "out of memory", reason, splits=capture.splits)
     result = replace(result, provenance=_provenance(time.perf_counter() - start))
     write_result(cell.folder, result)
     return result
@@ -157,7 +157,7 @@ def rescore_cell(cell: Cell) -> CellResult:
     before = _finished(cell)
     capture = _capture_of(cell)
     views = [View(split=view.split, camera=view.camera, frame=view.frame) for view in before.views]
-    scored = [_score(cell, capture, view, stored_prediction(cell, capture, view)) for view in views]
+    scored = scored_views(cell, capture, views)
     for old, new in zip(before.views, scored, strict=True):
         if old.prediction != new.prediction:
             name = prediction_path(cell.folder, View(split=new.split, camera=new.camera, frame=new.frame))

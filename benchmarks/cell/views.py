@@ -1,4 +1,7 @@
-"""Which images of a capture the protocol scores. Part of protocol "1": a change here is a new version."""
+"""Which images of a capture the protocol scores. Part of the protocol: other images of a split are a new version.
+
+Captures from before motion was held out near and far lack these splits, and are scored as ever.
+"""
 
 from dataclasses import dataclass
 
@@ -27,6 +30,7 @@ def evaluated_views(capture: Capture) -> tuple[View, ...]:
     - train_view: 12 training images, spread evenly over all.
     - novel_view: held-out cameras in at most 12 training frames, spread evenly.
     - novel_pose: held-out cameras in the first 24 test frames, which follow each other, so that flicker can be seen.
+    - near_pose, far_pose: held-out cameras in at most 24 frames each, spread evenly over all clips.
     """
     pairs: dict[str, list[tuple[str, int]]] = {split: [] for split in IMAGE_SPLITS}
     train = capture.splits["train"].views
@@ -38,13 +42,21 @@ def evaluated_views(capture: Capture) -> tuple[View, ...]:
     if "novel_pose" in capture.splits:
         split = capture.splits["novel_pose"]
         pairs["novel_pose"] = [(camera, frame) for camera in split.cameras for frame in split.frames[:POSE_FRAMES]]
+    for name in ("near_pose", "far_pose"):
+        if name in capture.splits:
+            split = capture.splits[name]
+            frames = [split.frames[i] for i in spread(len(split.frames), POSE_FRAMES)]
+            pairs[name] = [(camera, frame) for camera in split.cameras for frame in frames]
     return tuple(View(split=s, camera=camera, frame=frame) for s in IMAGE_SPLITS for camera, frame in pairs[s])
 
 
 def playback(views: tuple[View, ...]) -> list[View]:
-    """One camera's views of the last split: every frame is new, as in playback, and only its history is not."""
-    first = next(view.camera for view in views if view.split == views[-1].split)
-    return [view for view in views if view.split == views[-1].split and view.camera == first]
+    """One camera's views of the held-out motion (of the last split, where there is none): every frame is new, as in
+    playback, and only its history is not.
+    """
+    split = "novel_pose" if any(view.split == "novel_pose" for view in views) else views[-1].split
+    first = next(view.camera for view in views if view.split == split)
+    return [view for view in views if view.split == split and view.camera == first]
 
 
 def spread(count: int, at_most: int) -> list[int]:

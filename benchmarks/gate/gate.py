@@ -29,6 +29,8 @@ FINE = ("pass", "not judged")
 GATED = (  # (split, region, metric): few, so that the correction for many comparisons leaves power
     ("novel_view", "foreground", "psnr"),
     ("novel_pose", "foreground", "psnr"),
+    ("near_pose", "foreground", "psnr"),
+    ("far_pose", "foreground", "psnr"),
     ("novel_view", "foreground", "flip"),
     ("novel_view", "full", "iou"),
     ("novel_pose", "", "template_mm"),

@@ -13,9 +13,9 @@ from synth.motion.generators import GENERATORS
 from synth.motion.importing import import_motion
 from synth.scene import Clip
 
-TRAIN, TEST = "train", "test"
-TITLES = {TRAIN: "Training motion", TEST: "Held-out motion"}
-SPLIT_OF = {TRAIN: "train", TEST: "novel_pose"}
+TRAIN, TEST, NEAR, FAR = "train", "test", "near", "far"
+TITLES = {TRAIN: "Training motion", TEST: "Held-out motion", NEAR: "Held-out motion, near", FAR: "Held-out motion, far"}
+SPLIT_OF = {TRAIN: "train", TEST: "novel_pose", NEAR: "near_pose", FAR: "far_pose"}
 MADE_SECONDS, MADE_SEED = 5.0, 7  # Another walk than that of any capture.
 MOST_FRAMES = 20_000  # of a file: half an hour
 
@@ -41,11 +41,20 @@ def acts_of(capture: Capture, more: Sequence[str] = ()) -> tuple[Act, ...]:
         InputError: an unknown motion, or a file that cannot be read.
     """
     own = [
-        Act(name=name, title=TITLES[name], motion=capture.motion, frames=capture.splits[split].frames, captured=True)
+        Act(name=name, title=TITLES[name], motion=capture.motion, frames=_frames(capture, split), captured=True)
         for name, split in SPLIT_OF.items()
         if split in capture.splits
     ]
     return (*own, *(act_named(capture, name) for name in more))
+
+
+def _frames(capture: Capture, split: str) -> tuple[int, ...]:
+    """The frames of a split; of near and far motion, some of which have images, the whole clips."""
+    frames = capture.splits[split].frames
+    if split not in ("near_pose", "far_pose"):
+        return frames
+    sequence = capture.motion.sequence
+    return tuple(np.flatnonzero(np.isin(sequence, sequence[list(frames)])).tolist())
 
 
 def _from_file(capture: Capture, path: Path) -> Act:

@@ -28,6 +28,8 @@ Verdict = Literal["better", "worse", "identical", "no change seen", "too few", "
 QUANTITIES = (
     ("novel_view", "foreground", "psnr"),
     ("novel_pose", "foreground", "psnr"),
+    ("near_pose", "foreground", "psnr"),
+    ("far_pose", "foreground", "psnr"),
     ("novel_view", "foreground", "flip"),
     ("novel_pose", "foreground", "flip"),
     ("novel_pose", "full", "iou"),

@@ -11,8 +11,8 @@ from benchmarks.report import figures
 from benchmarks.report.content import Block, Chart, Entry, Head, Row, Section, Table, Text
 
 NOTE = (
-    "Foreground PSNR. Bold: chance is excluded at 5 % among all rows. Detectable: the smallest true difference that "
-    "this design would find four times in five."
+    "Foreground PSNR. Bold: chance is excluded at 5 % among all rows of a table. Detectable: the smallest true "
+    "difference that this design would find four times in five."
 )
 SIGHT_NOTE = (
     "The smallest true difference that so many captures (subjects in this outfit) would show four times in five, from "
@@ -21,13 +21,17 @@ SIGHT_NOTE = (
 )
 
 
-def sections(scores: Scores, scene: str, found: Sequence[Contrast]) -> list[Section]:
-    """The differences with their intervals, and what more captures would show; none without two seeds or captures."""
+def sections(scores: Scores, scene: str, found: Sequence[Contrast], beside: Sequence[Contrast] = ()) -> list[Section]:
+    """The differences with their intervals, and what more captures would show; none without two seeds or captures.
+
+    `beside`: those on splits that are not ranked, in a table of their own.
+    """
     if not found:
         return []
     figure = figures.effects_figure(found, scene, over=scores.unit(scene))
     charted: tuple[Block, ...] = (Chart(figure=figure),) if figure else ()
-    blocks = (*charted, _table(scores, scene, found), Text(text=NOTE, note=True), *_sights(found))
+    apart = (_table(scores, scene, beside, title="On near and far motion"),) if beside else ()
+    blocks = (*charted, _table(scores, scene, found), *apart, Text(text=NOTE, note=True), *_sights(found))
     return [Section(title=f"Which differences are established on {scene}", blocks=blocks)]
 
 
@@ -46,7 +50,7 @@ def note(scores: Scores, scene: str, found: Sequence[Contrast]) -> str:
     return f"{words} (seeds of one capture, which say nothing about other people)."
 
 
-def _table(scores: Scores, scene: str, found: Sequence[Contrast]) -> Table:
+def _table(scores: Scores, scene: str, found: Sequence[Contrast], *, title: str = "") -> Table:
     pairs = scores.captures(scene) > 1
     heads = (
         Head(title="split"),
@@ -59,7 +63,7 @@ def _table(scores: Scores, scene: str, found: Sequence[Contrast]) -> Table:
         Head(title="effect", unit="standard deviations"),
         Head(title="detectable", unit="dB", term="detectable"),
     )
-    return Table(title="", corner="ASH minus", columns=heads, rows=tuple(map(_row, found)))
+    return Table(title=title, corner="ASH minus", columns=heads, rows=tuple(map(_row, found)))
 
 
 def _row(c: Contrast) -> Row:

@@ -12,6 +12,7 @@ METRIC_TERMS = {
     "surface_mm": "to surface",
     "flicker": "flicker",
     "noise_ceiling": "noise ceiling",
+    "novelty_deg": "novelty",
     "frame_ms": "frame time",
     "stg1_ms": "Stg.1",
     "stg2_ms": "Stg.2",
@@ -50,6 +51,10 @@ GLOSSARY = {
     "silhouette.",
     "held-out views": "Cameras that no method was trained on, in frames of the training motion.",
     "held-out motion": "A motion that no method was trained on, seen by cameras that none was trained on.",
+    "near motion": "Held-out motion that is another take of a kind that was trained on.",
+    "far motion": "Held-out motion unlike all that was trained on: arms stretched up, a deep squat, a jump.",
+    "novelty": "How far a pose lies from the nearest training pose, in degrees: the mean over the joints of the "
+    "geodesic angle between their rotations in their parents' frames, the heading removed.",
     "novel view": "Another name for held-out views.",
     "novel pose": "Another name for held-out motion.",
     "training view": "Images that the method was trained on.",

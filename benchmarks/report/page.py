@@ -34,7 +34,7 @@ def write_report(run: Run) -> list[str]:
     scores = scores_of(results, {cell.config.key: cell.capture_folder.name for cell in run.cells})
     album = Album()
     scenes = {scene: scene_report(_scene(run, scores, album, scene)) for scene in scores.scenes}
-    findings = [*sections.spent(results), *sections.margins(scores)]
+    findings = [*sections.spent(results), *sections.novelties(scores), *sections.margins(scores)]
     report = Report(
         title=f"Report of suite {run.suite}",
         sections=(

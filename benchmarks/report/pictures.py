@@ -88,8 +88,9 @@ def tracks(capture: Capture, shown: Sequence[Shown], album: Album, *, room: int)
     cameras are there if all of theirs fit. A track is {"title", "split", "camera", "frames", "width", "height",
     "truth": places in the album by frame, "pictures": the same by method, "psnr": dB by method}.
     """
-    places = [(split, camera) for split in ("novel_pose", "novel_view") for camera in _cameras(shown[0].result, split)]
-    places.sort(key=lambda place: _cameras(shown[0].result, place[0]).index(place[1]))  # Stable: both splits in turn.
+    splits = ("novel_pose", "novel_view", "far_pose", "near_pose")
+    places = [(split, camera) for split in splits for camera in _cameras(shown[0].result, split)]
+    places.sort(key=lambda place: _cameras(shown[0].result, place[0]).index(place[1]))  # Stable: all splits in turn.
     found: list[dict[str, Any]] = []
     start = album.size
     for split, camera in places:

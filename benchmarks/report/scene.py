@@ -10,7 +10,15 @@ from ash.files import InputError
 from benchmarks.analysis import contrasts, conventions
 from benchmarks.analysis.causes import REGIONS
 from benchmarks.analysis.names import EXACT, SPLIT_NAMES, is_ours, look_of
-from benchmarks.analysis.scores import RANKED_SPLITS, Quantity, Scores, curves_of, foreground
+from benchmarks.analysis.scores import (
+    HELD_OUT_SPLITS,
+    MOTION_SPLITS,
+    RANKED_SPLITS,
+    Quantity,
+    Scores,
+    curves_of,
+    foreground,
+)
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS
 from benchmarks.report import charts, established, figures, pictures, sentences, tables, vega
@@ -86,13 +94,14 @@ def scene_report(data: SceneData) -> SceneReport:
     cost = tables.build(scores, scene, tables.cost_columns(COSTS), title=f"Cost on {scene}", exposed=exposed)
     more = _more_tables(scores, scene)
     compared = contrasts.contrasts(scores, scene)
+    beside = contrasts.contrasts(scores, scene, splits=tuple(s for s in MOTION_SPLITS if s not in RANKED_SPLITS))
     quality_note = f"{QUALITY_NOTE} {established.note(scores, scene, compared)}"
     picture_sections, sheets = _picture_sections(data, capture, shown, trouble)
     sections = [
         Section(title=scene, headline=sentences.headline(scores, scene), blocks=tuple(_opening(data, capture))),
         Section(title=quality.title, blocks=(_untitled(quality), Text(text=quality_note, note=True), *notes)),
         Section(title=cost.title, blocks=(_untitled(cost), Text(text=COST_NOTE, note=True), *notes)),
-        *established.sections(scores, scene, compared),
+        *established.sections(scores, scene, compared, beside),
         *_exact(scores, scene),
         *picture_sections,
         *_time(data),
@@ -129,14 +138,16 @@ def what_was_compared(data: SceneData, capture: Capture | None) -> str:
     if capture is not None:
         camera, train = next(iter(capture.cameras.values())), capture.splits["train"]
         text += f": {_count(len(train.cameras), 'camera')}, {_count(len(train.frames), 'frame')}"
+        text += f", each seen by {len(train.parts[0])} of the cameras by turns," if train.parts else ""
         text += f" of {camera.width}x{camera.height} pixels"
     text += "."
     judged = []
     seen = scores.images.query("scene == @scene")[["split", "camera", "frame"]].drop_duplicates()
-    for split, images in seen[seen["split"].isin(RANKED_SPLITS)].groupby("split", sort=False):
+    for split, images in seen[seen["split"].isin(HELD_OUT_SPLITS)].groupby("split", sort=False):
         cameras, frames = (_count(images[name].nunique(), name) for name in ("camera", "frame"))
         judged.append(f"{len(images)} images of {SPLIT_NAMES[str(split)].words} ({cameras}, {frames})")
-    text += f" They are judged on {' and '.join(judged)}." if judged else ""
+    if judged:
+        text += f" They are judged on {', '.join(judged[:-1])}{' and ' if judged[1:] else ''}{judged[-1]}."
     seconds = rows.query("metric == 'train_s' and status == 'done'")["value"]
     if len(seconds):
         text += f" A training took {seconds.min():.0f} to {seconds.max():.0f} s on one core,"
@@ -165,16 +176,21 @@ def _quality_quantities() -> list[Quantity]:
 
 
 def _more_tables(scores: Scores, scene: str) -> tuple[Table, ...]:
-    geometry = [Quantity(split, "", metric) for split in RANKED_SPLITS for metric in ("template_mm", "surface_mm")]
+    geometry = [Quantity(split, "", metric) for split in HELD_OUT_SPLITS for metric in ("template_mm", "surface_mm")]
     geometry.append(foreground("novel_pose", "flicker"))
     regions = (("full", "psnr"), ("release_crop", "psnr"), ("full", "ssim"), ("full", "flip"))
     whole = [Quantity(split, region, metric) for split in IMAGE_SPLITS for region, metric in regions]
     training = [foreground("train_view", metric) for metric in ("psnr", "ssim", "flip")]
-    ceiling = [foreground(split, "noise_ceiling") for split in IMAGE_SPLITS]
+    ceiling = [foreground(split, "noise_ceiling") for split in (*HELD_OUT_SPLITS, "train_view")]
+    novelty = [Quantity(split, "", "novelty_deg") for split in MOTION_SPLITS]
     asked = {
         "Geometry against the truth, and flicker beyond the truth's own": geometry,
         "Whole frame, and the crop of the released ASH code": whole,
-        "Training views, and the noise ceiling of the renders": [*training, *ceiling],
+        "Training views, the noise ceiling of the renders, and how far poses are from training's": [
+            *training,
+            *ceiling,
+            *novelty,
+        ],
     }
     found = [tables.build(scores, scene, quantities, title=title) for title, quantities in asked.items()]
     return tuple(table for table in found if table.columns)

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 import pandas as pd
 
-from benchmarks.analysis import anytime, footage, margin, paper, stability
+from benchmarks.analysis import anytime, footage, margin, novelty, paper, stability
 from benchmarks.analysis.names import SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Scores, foreground
 from benchmarks.cell.cells import CellResult
@@ -79,6 +79,38 @@ def spent(results: Sequence[CellResult]) -> list[Section]:
         title = "Held-out motion against the number of training frames"
         found.append((_spent_figure(table, "footage", title, "frames", "training frames"), footage.sentences(table)))
     return [Section(title=f.title, blocks=(_chart(f), Bullets(items=tuple(said)))) for f, said in found]
+
+
+def novelties(scores: Scores) -> list[Section]:
+    """Quality by how far a pose lies from training's, where the held-out motion is wide enough for a curve."""
+    table = novelty.curves(scores.images)
+    if not len(table):
+        return []
+    methods = list(table["method"].unique())
+    looks = vega.series_of(methods)
+    names = {method: look.title for method, look in zip(methods, looks, strict=True)}
+    samples = pd.DataFrame(
+        {
+            "panel": table["scene"],
+            "x_title": "novelty of the pose [degrees]",
+            "series": table["method"].map(names),
+            "x": table["novelty_deg"].round(1),
+            "y": table["psnr"],
+            "low": table["low"],
+            "high": table["high"],
+            "crossed": False,
+        }
+    )
+    figure = Figure(
+        name="novelty",
+        title="Quality against novelty",
+        caption="Foreground PSNR by how far a pose lies from the nearest training pose: the mean over the joints of "
+        "the angle between their rotations, the heading removed. At zero: held-out views of training poses. The frames "
+        f"of near, new and far motion stand in bins of equal number, each at its mean. {WHISKERS}",
+        panels=charts.lines(samples, looks, y="foreground PSNR [dB]", size=(390, 240)),
+        series=looks,
+    )
+    return [Section(title=figure.title, blocks=(_chart(figure), Bullets(items=tuple(novelty.sentences(table)))))]
 
 
 def _spent_figure(table: pd.DataFrame, name: str, title: str, spent: str, x_title: str) -> Figure:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pandas as pd
 
 from benchmarks.analysis.names import SPLIT_NAMES, look_of
-from benchmarks.analysis.scores import RANKED_SPLITS, Quantity, Score, Scores, foreground
+from benchmarks.analysis.scores import HELD_OUT_SPLITS, RANKED_SPLITS, Quantity, Score, Scores, foreground
 from benchmarks.cell.methods import is_oracle
 from benchmarks.cell.metrics import METRICS, Metric
 from benchmarks.report.content import Entry, Head, Mark, Row, Table
@@ -16,13 +16,18 @@ from benchmarks.report.glossary import METRIC_TERMS
 REGION_TITLES = {"full": "whole frame", "release_crop": "release crop", "white_frame": "on white"}
 SEVERAL_REGIONS = ("psnr", "ssim", "flip")  # Their columns say which region they are of, if not the foreground.
 UNRANKED = ("gaussians",)  # Neither more nor fewer is better.
+BESIDE = ("psnr", "flip")  # What is shown of splits that are not ranked.
 MEMORY = ("peak_rss_mb", "params", "gaussians")
 
 
 def quality_columns(metrics: Sequence[str]) -> list[Quantity]:
-    """Foreground qualities on held-out views and poses (LPIPS and IoU are defined on whole frames)."""
+    """Foreground qualities on held-out views and motion (LPIPS and IoU are defined on whole frames).
+
+    Near and far motion, which rankings leave aside, have the first of them that say the most.
+    """
     whole = ("lpips", "iou")
-    return [Quantity(s, "full", m) if m in whole else foreground(s, m) for s in RANKED_SPLITS for m in metrics]
+    asked = [(s, m) for s in HELD_OUT_SPLITS for m in metrics if s in RANKED_SPLITS or m in BESIDE]
+    return [Quantity(s, "full", m) if m in whole else foreground(s, m) for s, m in asked]
 
 
 def cost_columns(metrics: Sequence[str]) -> list[Quantity]:

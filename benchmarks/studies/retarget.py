@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ash.capture import novelty
 from ash.capture.dataset import Capture, Motion
 from ash.capture.formats import load_capture, read_template_truth
 from ash.files import InputError, sha256_of, write_image, write_json
@@ -22,7 +23,6 @@ from benchmarks.cell.views import View, spread
 from benchmarks.report.pictures import on_paper
 from benchmarks.suites.progress import Progress
 from synth.capture import make_body, make_capture
-from synth.motion.clips import pose_novelty
 from synth.readers.retargeting import retargeted, scene_of
 
 STRIP_FRAMES = 6
@@ -57,7 +57,7 @@ def retarget(cells: list[Cell], motion: Path, out: Path, *, frames: int, workers
     for place in dict.fromkeys(cell.capture_folder for cell in driven):
         own = load_capture(place)
         truth = render_truth(own, motion, out / f"truth-{own.scene}", frames=frames, workers=workers)
-        novelty = novelty_deg(own, truth)
+        far = novelty_deg(own, truth)
         here = [cell for cell in driven if cell.capture_folder == place]
         found = [score(cell, own, truth, out) for cell in here]
         rows += found
@@ -69,7 +69,7 @@ def retarget(cells: list[Cell], motion: Path, out: Path, *, frames: int, workers
             "frames": len(truth.splits["novel_pose"].frames),
             "fps": truth.motion.fps,
             "made_by_the_same_code": own.manifest.code == truth.manifest.code,
-            "novelty_deg": novelty,
+            "novelty_deg": far,
             "avatars": [asdict(row) for row in found],
         }
         write_json(out / f"result-{own.scene}.json", content)
@@ -141,11 +141,12 @@ def drawn_in_isolation(
 
 
 def novelty_deg(own: Capture, truth: Capture) -> float:
-    """How far the motion's poses lie from the nearest training pose, degrees rms over joints."""
+    """How far the motion's poses lie from the nearest training pose, mean over them, degrees."""
     train, test = own.splits["train"].frames, truth.splits["novel_pose"].frames
     dofs = np.concatenate([own.motion.dofs[list(train)], truth.motion.dofs[list(test)]])
     both = Motion(dofs=dofs, sequence=np.zeros(len(dofs), dtype=np.int64), fps=truth.motion.fps)
-    return pose_novelty(both, train=tuple(range(len(train))), test=tuple(range(len(train), len(dofs))))
+    each = novelty.novelty_deg(both, train=range(len(train)), test=range(len(train), len(dofs)))
+    return float(np.mean(each))
 
 
 def strip(truth: Capture, images: dict[tuple[str, int], np.ndarray]) -> np.ndarray:

@@ -136,9 +136,10 @@ def without_one_camera(capture: Capture) -> tuple[Capture, Split]:
     if len(train.cameras) < 2:
         raise InputError(f"{capture.folder}: a search needs two training cameras or more, got one")
     apart = train.cameras[len(train.cameras) // 2]
-    rest = replace(train, cameras=tuple(name for name in train.cameras if name != apart))
-    frames = tuple(train.frames[i] for i in spread(len(train.frames), VALIDATION_FRAMES))
-    return replace(seen, splits={"train": rest}), Split(cameras=(apart,), frames=frames)
+    rest = train.only(cameras=[name for name in train.cameras if name != apart])
+    own = train.only(cameras=(apart,))
+    frames = [own.frames[i] for i in spread(len(own.frames), VALIDATION_FRAMES)]
+    return replace(seen, splits={"train": rest}), own.only(frames=frames)
 
 
 def _train(method: str, folder: str, out: str, preset: str, seed: int, index: int) -> SearchResult:

@@ -16,6 +16,7 @@ from typing import TypeVar
 
 import psutil
 
+from ash.capture.manifest import read_manifest
 from ash.files import InputError, one_line, read_json
 from benchmarks.cell.cells import (
     Cell,
@@ -253,7 +254,8 @@ def _outcome(cell: Cell, ending: Ending, limits: Limits) -> CellResult:
         log = last_line(cell.folder / "output.log")
         reason = f"the process ended with {_exit_name(ending.exit_code)}: {log}"
         failure = Failure(status="crashed", reason=reason)
-    result = failed_result(cell.config, failure.status, failure.reason)
+    splits = read_manifest(cell.capture_folder).splits
+    result = failed_result(cell.config, failure.status, failure.reason, splits=splits)
     write_result(cell.folder, result)
     return result
 

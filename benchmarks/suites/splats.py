@@ -90,7 +90,7 @@ def _person(scene: Scene) -> Person:
 
     body = make_body(scene)
     mesh = body.template()
-    motion = make_motion(body.skeleton, scene.train + scene.test, fps=scene.fps, seed=stream(scene, "motion"))
+    motion = make_motion(body.skeleton, scene.clips, fps=scene.fps, seed=stream(scene, "motion"))
     template = Template(mesh, body.skeleton, RestDeformation(mesh))
     seed = stream(scene, "splats") if scene.subject else scene.seed
     model = known_avatar(template, count=CI_COUNT if scene.size == "ci" else COUNT, seed=seed)

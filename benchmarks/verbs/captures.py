@@ -42,7 +42,7 @@ Excerpts = Annotated[Excerpt, arg(name="", prefix_name=False)]
 class SynthVerb:
     """Render the ground truth of a scene into a capture folder.
 
-    Every field of the scene is a flag (--rig.cameras 24 --outfit.swing 0.8); `synth SCENE --help` lists them.
+    Every field of the scene is a flag (--rig.cameras 44 --outfit.swing 0.8); `synth SCENE --help` lists them.
 
     A motion file replaces the scene's own training (or test) motion: BVH, or AMASS-style .npz with poses, trans and
     mocap_framerate. It is retargeted to our skeleton, its path centred on the origin, its first frames at the scene's
@@ -122,16 +122,18 @@ class SynthVerb:
         """The scene driven by the user's motions, if there are any."""
         if self.motion is None and self.test_motion is None:
             return scene
+        from ash.capture.novelty import novelty_deg
         from synth.capture import make_body
-        from synth.motion.clips import make_motion, pose_novelty
+        from synth.motion.clips import make_motion
         from synth.presets import with_motion
 
         skeleton = make_body(scene).skeleton
         moved = with_motion(scene, skeleton, train=self.motion, test=self.test_motion, take=self.excerpt.take)
-        motion = make_motion(skeleton, moved.train + moved.test, fps=moved.fps, seed=0)
+        motion = make_motion(skeleton, moved.clips, fps=moved.fps, seed=0)
         count = sum(clip.frames for clip in moved.train)
-        novelty = pose_novelty(motion, train=tuple(range(count)), test=tuple(range(count, len(motion.dofs))))
-        print(f"test poses lie {novelty:.1f} degrees from the nearest training pose (rms over joints)", file=sys.stderr)
+        each = novelty_deg(motion, train=range(count), test=range(count, len(motion.dofs)))
+        far = sum(each) / len(each)
+        print(f"test poses lie {far:.1f} degrees from the nearest training pose (mean over joints)", file=sys.stderr)
         return moved
 
 
@@ -189,7 +191,7 @@ class ExportVerb:
     folder: Positional[Path]  # of the capture
     form: Annotated[str, arg(name="format", metavar="FORMAT")]  # ash, nerfstudio, colmap or glb
     out: Folder | None = None  # default: DIR-FORMAT
-    split: str | None = None  # of nerfstudio and colmap: train (default), novel_view or novel_pose
+    split: str | None = None  # of nerfstudio and colmap: train (default), novel_view, near_pose, novel_pose or far_pose
     frame: int | None = None  # of nerfstudio and colmap: only this frame of the split
 
     def __call__(self) -> int:

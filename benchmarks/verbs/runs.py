@@ -322,7 +322,7 @@ def _tell(folder: Path, result: Any) -> int:
         print(f"{result.config.title}: {result.status}: {result.reason}", file=sys.stderr)
         return FAILED
     parts = []
-    for split in ("novel_view", "novel_pose"):
+    for split in ("novel_view", "near_pose", "novel_pose", "far_pose"):
         if (value := result.value(split, "foreground", "psnr")) is not None:
             parts.append(f"{split.replace('_', ' ')} {value:.2f} dB")
     parts.append(f"{result.value('speed', '', 'frame_ms'):.1f} ms per frame")

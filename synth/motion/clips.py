@@ -6,7 +6,7 @@ import numpy as np
 
 from ash.capture.dataset import Motion, Skeleton
 from ash.files import InputError, sha256_of
-from synth.motion.generators import GENERATORS
+from synth.motion.generators import GENERATORS, in_a_manner
 from synth.motion.importing import WHOLE, import_motion
 from synth.motion.plans import continuous, solve
 from synth.posing import rotmat_to_rotvec, rotvec_to_rotmat
@@ -34,7 +34,8 @@ def make_motion(skeleton: Skeleton, clips: tuple[Clip, ...], *, fps: float, seed
             clip_dofs = _from_file(skeleton, clip, fps=fps)
         else:
             rng = np.random.default_rng([seed, index])
-            clip_dofs = solve(skeleton, GENERATORS[clip.generator](np.arange(clip.frames) / fps, rng))
+            plan = GENERATORS[clip.generator](np.arange(clip.frames) / fps, rng)
+            clip_dofs = solve(skeleton, plan if clip.generator == "stand" else in_a_manner(plan, rng))
         clip_dofs = turned(skeleton, clip_dofs, clip.yaw) if clip.yaw else clip_dofs
         clip_dofs[:, [0, 2]] += clip.shift
         dofs.append(clip_dofs)
@@ -73,23 +74,3 @@ def _from_file(skeleton: Skeleton, clip: Clip, *, fps: float) -> np.ndarray:
     if reach > FLOOR:
         raise InputError(f"{path}: the motion goes {reach:.2f} m from its middle, expected at most {FLOOR} m")
     return dofs
-
-
-def pose_novelty(motion: Motion, *, train: tuple[int, ...], test: tuple[int, ...]) -> float:
-    """How far test poses are from the nearest training pose: mean over test frames, degrees rms over joints."""
-    return float(np.mean(pose_distances(motion, train=train, test=test)))
-
-
-def pose_distances(motion: Motion, *, train: tuple[int, ...], test: tuple[int, ...]) -> list[float]:
-    """Distance of each test pose to the nearest training pose, degrees rms over joints.
-
-    The root is left out: heading and place are not pose.
-    """
-    rotations = rotvec_to_rotmat(motion.dofs[:, 6:].reshape(len(motion.dofs), -1, 3))
-    known = rotations[list(train)]
-    nearest = []
-    for frame in test:
-        trace = np.einsum("tjab,jab->tj", known, rotations[frame])
-        angles = np.arccos(np.clip((trace - 1) / 2, -1, 1))
-        nearest.append(float(np.rad2deg(np.sqrt(np.mean(angles**2, axis=1)).min())))
-    return nearest

@@ -8,6 +8,28 @@ from synth.motion.plans import FootStep, Plan, bump, smooth, standing
 from synth.skeleton import SIGNS
 
 
+def in_a_manner(plan: Plan, rng: np.random.Generator) -> Plan:
+    """The plan as it happens to be done this time: how low, how upright, where the arms are held and how they drift.
+
+    What the feet do stays. Without it, two takes of a kind would differ by less than a degree per joint.
+    """
+    x = np.linspace(0, 1, len(plan.times))
+
+    def held(most: float, drift: float) -> np.ndarray:
+        return rng.uniform(-most, most) + drift * np.sin(2 * np.pi * (rng.uniform(0.4, 1.0) * x + rng.uniform()))
+
+    for axis in range(3):
+        plan.bend[:, axis] += held(0.14, 0.08)
+        plan.look[:, axis] += held(0.16, 0.1)
+    for arm in range(2):
+        plan.flexion[:, arm] += held(0.22, 0.1)
+        # Over the head, sideways is across: there the arms are left where they are.
+        plan.abduction[:, arm] += (0.22 + held(0.14, 0.08)) * np.cos(np.clip(plan.flexion[:, arm], 0, np.pi / 2))
+        plan.elbow[:, arm] += 0.35 + held(0.25, 0.1)
+    plan.shift[:, 1] -= rng.uniform(0.0, 0.05)
+    return plan
+
+
 def walk(times: np.ndarray, rng: np.random.Generator) -> Plan:
     """Walk along a straight line through the middle of the floor."""
     plan = standing(times)
@@ -204,6 +226,43 @@ def spin(times: np.ndarray, rng: np.random.Generator) -> Plan:
     return plan
 
 
+def arms_up(times: np.ndarray, rng: np.random.Generator) -> Plan:
+    """Stretch both arms up and apart, on tiptoe, and sway. A pose that no other motion is like."""
+    plan = standing(times)
+    x = (times - times[0]) / (times[-1] - times[0])
+    up, sway = smooth((x + 0.3) / 0.55), np.sin(2 * np.pi * x + rng.uniform(0, 2 * np.pi))
+    plan.abduction += rng.uniform(1.9, 2.1) * up[:, None]
+    plan.bend[:, 0] = -0.12 * up
+    plan.bend[:, 2] = 0.2 * up * sway
+    plan.look[:, 0] = -0.35 * up
+    plan.shift[:, 1] = -0.01 + 0.03 * up
+    plan.yaw += rng.uniform(-0.3, 0.3)
+    _plant(plan, yaw=float(plan.yaw[0]), width=0.12)
+    plan.heel = 0.35 * up[:, None] * np.ones(2)
+    return plan
+
+
+def deep_squat(times: np.ndarray, rng: np.random.Generator) -> Plan:
+    """Sink onto the balls of the feet and stay down, the arms between the knees, looking around."""
+    plan = standing(times)
+    x = (times - times[0]) / (times[-1] - times[0])
+    deep, around = smooth((x + 0.3) / 0.85), np.sin(2 * np.pi * x + rng.uniform(0, 2 * np.pi))
+    plan.shift[:, 1] = -0.01 - rng.uniform(0.32, 0.36) * deep
+    back = -0.1 * deep
+    plan.bend[:, 0] = 0.45 * deep
+    plan.bend[:, 1] = 0.3 * deep * around
+    plan.tilt[:, 0] = 0.15 * deep
+    plan.look[:, 0] = -0.3 * deep
+    plan.look[:, 1] = 0.4 * deep * around
+    plan.flexion += 0.7 * deep[:, None]
+    plan.elbow += 0.8 * deep[:, None]
+    plan.yaw += rng.uniform(-0.4, 0.4)
+    plan.shift[:, [0, 2]] = back[:, None] * np.stack([np.sin(plan.yaw), np.cos(plan.yaw)], axis=1)
+    _plant(plan, yaw=float(plan.yaw[0]), width=0.12, splay=0.12)
+    plan.heel = 0.5 * deep[:, None] * np.ones(2)
+    return plan
+
+
 def _plant(plan: Plan, *, yaw: float, width: float, splay: float = 0.08) -> None:
     side = np.array([np.cos(yaw), -np.sin(yaw)]) * width
     plan.stance = ((side[0], side[1], yaw + splay), (-side[0], -side[1], yaw - splay))
@@ -233,4 +292,6 @@ GENERATORS: dict[str, Callable[[np.ndarray, np.random.Generator], Plan]] = {
     "run": run,
     "jump": jump,
     "spin": spin,
+    "arms_up": arms_up,
+    "deep_squat": deep_squat,
 }

@@ -71,9 +71,10 @@ def _cut(
 
 def open_sides(faces: np.ndarray) -> np.ndarray:
     """Sides that only one face has, as 3 face + corner: from that corner to the next."""
-    sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    _, inverse, uses = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
-    return np.flatnonzero(uses[inverse.reshape(-1)] == 1)
+    sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
+    numbers = sides[:, 0] * (faces.max(initial=0) + 1) + sides[:, 1]  # One number per side: rows sort ten times slower.
+    _, inverse, uses = np.unique(numbers, return_inverse=True, return_counts=True)
+    return np.flatnonzero(uses[inverse] == 1)
 
 
 def open_edges(faces: np.ndarray) -> np.ndarray:

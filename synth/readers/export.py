@@ -22,7 +22,7 @@ def export_nerfstudio(capture: Capture, folder: Path, *, split: str = "train", f
     for index in frames:
         target = folder / f"frame_{index:06d}"
         rows = []
-        for name in chosen.cameras:
+        for name in chosen.seeing(index):
             camera = capture.cameras[name]
             write_image(target / "images" / f"{name}.png", capture.image(name, index))
             rows.append(
@@ -37,7 +37,8 @@ def export_nerfstudio(capture: Capture, folder: Path, *, split: str = "train", f
             )  # fmt: skip
         write_json(target / "transforms.json", {"camera_model": "OPENCV", "frames": rows})
     count = f"{len(frames)} frame{'s' if len(frames) > 1 else ''}"
-    _say(capture, folder, f"{count} of split {split}, a folder each, seen by its {len(chosen.cameras)} cameras")
+    by = f"{len(chosen.seeing(frames[0]))} of its {len(chosen.cameras)} cameras"
+    _say(capture, folder, f"{count} of split {split}, a folder each, seen by {by}")
     return folder
 
 
@@ -46,7 +47,8 @@ def export_colmap(capture: Capture, folder: Path, *, split: str = "train", frame
     chosen = _split(capture, split)
     frame = chosen.frames[0] if frame is None else _frame(chosen, split, frame)
     cameras, images = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS"], ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"]
-    for index, name in enumerate(chosen.cameras, start=1):
+    seeing = chosen.seeing(frame)
+    for index, name in enumerate(seeing, start=1):
         camera = capture.cameras[name]
         K = [float(value) for value in camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]]
         model = "PINHOLE" if camera.is_pinhole else "OPENCV"
@@ -63,7 +65,7 @@ def export_colmap(capture: Capture, folder: Path, *, split: str = "train", frame
     for name, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
         text = "\n".join(lines) + "\n"
         write_atomic(folder / "sparse" / "0" / f"{name}.txt", text.encode())
-    what = f"split {split}, frame {frame}, seen by its {len(chosen.cameras)} cameras"
+    what = f"split {split}, frame {frame}, seen by {len(seeing)} of its {len(chosen.cameras)} cameras"
     _say(capture, folder, f"{what}; the points are the template's vertices, skinned to that frame")
     return folder
 

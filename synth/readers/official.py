@@ -306,6 +306,11 @@ def export_official(capture: Capture, folder: Path, *, subject: str = "Synthetic
     if not all(camera.is_pinhole for camera in cameras):
         raise InputError(f"{capture.folder}: a lens distorts and the release reads pinholes; run ash-bench undistort")
     training = max(capture.splits["train"].frames) + 1
+    if capture.splits["train"].parts:
+        raise InputError(
+            f"{capture.folder}: a part of the cameras saw each frame, and the release reads an image of every camera in"
+            " every frame; make the capture with --rig.part 0"
+        )
     _require_faces_everywhere(capture)
     nodes = graph_nodes(template)
     node_faces = graph_faces(template, nodes)

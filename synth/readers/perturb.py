@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter1d
 
-from ash.capture.dataset import Camera, Capture, Motion, Split, image_path, pixels_path, plate_path
+from ash.capture.dataset import Camera, Capture, Motion, image_path, pixels_path, plate_path
 from ash.capture.formats import load_capture, write_cameras, write_motion
 from ash.files import InputError, hash_of, link_or_copy, read_arrays, read_image, sha256_of, write_image
 from synth.camera.rig import spread
@@ -78,7 +78,7 @@ def _subset(capture: Capture, perturbation: Perturbation) -> Capture:
         if perturbation.first_frames > len(frames):
             raise InputError(f"perturbation: the first {perturbation.first_frames} frames of {len(frames)}")
         frames = frames[: perturbation.first_frames]
-    return replace(capture, splits={**capture.splits, "train": Split(cameras=cameras, frames=frames)})
+    return replace(capture, splits={**capture.splits, "train": train.only(cameras=cameras, frames=frames)})
 
 
 def _kept_files(capture: Capture, perturbation: Perturbation) -> set[str]:

@@ -28,6 +28,8 @@ def scene_of(manifest: Manifest, folder: Path) -> Scene:
                 "rig": Rig(**given["rig"] | {"distortion": tuple(given["rig"]["distortion"])}),
                 "train": tuple(_clip(clip) for clip in given["train"]),
                 "test": tuple(_clip(clip) for clip in given["test"]),
+                "near": tuple(_clip(clip) for clip in given.get("near", ())),
+                "far": tuple(_clip(clip) for clip in given.get("far", ())),
             }
         )
     except (KeyError, TypeError, ValueError) as error:

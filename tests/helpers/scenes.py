@@ -13,6 +13,8 @@ def small_scene(**changes) -> Scene:
         rig=Rig(cameras=4, held_out=1, width=64, height=64),
         train=(Clip(generator="walk", frames=3),),
         test=(Clip(generator="dance", frames=2),),
+        near=(),
+        far=(),
         samples=4,
         texture=256,
         novel_view_stride=2,

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from ash import presets
+from ash.capture.manifest import Split
 from ash.config import TrainingConfig
 from ash.training.batches import reserved_views
 from ash.training.stopping import (
@@ -106,7 +107,8 @@ def test_a_course_survives_a_checkpoint():
     [(12, 40, 24), (4, 16, 8), (12, 4, 6), (4, 4, 2), (12, 1, 1), (2, 40, 0), (3, 2, 0), (120, 2000, 24)],
 )
 def test_reserved_views_are_few_distinct_and_spread(cameras, frames, count):
-    reserved = reserved_views(tuple(f"cam{i}" for i in range(cameras)), tuple(range(frames)))
+    train = Split(cameras=tuple(f"cam{i}" for i in range(cameras)), frames=tuple(range(frames)))
+    reserved = reserved_views(train)
     assert len(set(reserved)) == len(reserved) == count
     assert len({frame for _, frame in reserved}) == min(count, frames)
     assert len({camera for camera, _ in reserved}) == min(count, cameras)

@@ -1,10 +1,8 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from ash.files import InputError
-from synth.motion.clips import make_motion, pose_novelty
+from synth.motion.clips import make_motion
 from synth.motion.generators import GENERATORS
 from synth.motion.plans import FootStep, feet_tracks, solve, standing
 from synth.person.mannequin import heads, mannequin
@@ -105,20 +103,3 @@ def test_the_mannequin_stays_above_the_floor():
 def test_bad_clips_are_refused(name: str, frames: int):
     with pytest.raises(InputError, match=r"moonwalk|1 frames|1000000000 frames"):
         Clip(generator=name, frames=frames)
-
-
-def test_novelty_is_the_distance_to_the_nearest_training_pose():
-    motion = make_motion(
-        SKELETON, (Clip(generator="stand", frames=2), Clip(generator="squat", frames=6)), fps=12.0, seed=0
-    )
-    assert pose_novelty(motion, train=(0, 1), test=(1,)) < 1e-5
-    dofs = motion.dofs.copy()
-    dofs[1, 6:] = dofs[0, 6:]
-    dofs[1, 3:6] += 1.0  # another heading is no other pose
-    j = SKELETON.names.index("forearm_left")
-    dofs[1, 3 + 3 * j : 6 + 3 * j] = 0
-    bend = np.linalg.norm(dofs[0, 3 + 3 * j : 6 + 3 * j])
-    moved = replace(motion, dofs=dofs)
-    expected = np.rad2deg(bend) / np.sqrt(len(SKELETON.names) - 1)
-    np.testing.assert_allclose(pose_novelty(moved, train=(0,), test=(1,)), expected, rtol=1e-6)
-    assert pose_novelty(motion, train=(0, 1), test=(4,)) > 5

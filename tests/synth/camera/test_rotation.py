@@ -1,0 +1,46 @@
+"""Cameras that see the training frames by turns."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from ash.files import InputError
+from synth import presets
+from synth.camera.rig import held_out, place, rotation
+from synth.scene import Rig
+
+
+@pytest.mark.parametrize("rig", [presets.ROTATING, Rig(kind="ring", cameras=20, held_out=4, part=8), Rig(part=1)])
+def test_every_camera_is_used_once_in_every_round(rig):
+    training = set(range(rig.cameras)) - set(held_out(rig))
+    length = len(training) // rig.part
+    parts = rotation(rig, 3 * length + 1)
+    for first in range(0, 3 * length, length):
+        used = [camera for part in parts[first : first + length] for camera in part]
+        assert sorted(used) == sorted(training)
+    assert len(parts[-1]) == rig.part
+
+
+def test_the_cameras_of_a_frame_stand_all_around():
+    rig = presets.ROTATING
+    x, _, z = (place(rig) - place(rig).mean(axis=0)).T
+    for part in rotation(rig, 40):
+        around = np.sort(np.rad2deg(np.arctan2(x, z))[part])
+        gaps = np.diff([*around, around[0] + 360])
+        assert gaps.max() < 175, "somebody's back is seen by nobody"
+
+
+def test_cameras_meet_in_other_parts_from_round_to_round():
+    rig = presets.ROTATING
+    parts = [frozenset(part) for part in rotation(rig, 25)]
+    assert len(set(parts)) == 25
+    pairs = Counter(frozenset((a, b)) for part in parts for a in part for b in part if a < b)
+    assert max(pairs.values()) <= 6  # of 25
+
+
+def test_a_part_that_leaves_cameras_over_is_refused():
+    with pytest.raises(InputError, match="expected a divisor of 12"):
+        Rig(part=5)
+    with pytest.raises(InputError, match="expected a divisor of 12"):
+        Rig(part=16)

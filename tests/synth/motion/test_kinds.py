@@ -1,0 +1,87 @@
+"""Held-out motion that is near, new and far."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.motion_files import amass_file
+
+from ash.capture.novelty import novelty_deg
+from synth import presets
+from synth.cost import estimate
+from synth.motion.clips import make_motion
+from synth.person.mannequin import heads
+from synth.posing import rotvec_to_rotmat
+from synth.scene import Clip
+from synth.skeleton import make_skeleton
+from synth.views import splits, wanted_views
+
+SKELETON = make_skeleton(heads())
+# Soucie et al. 2011 (normal range of motion, adults) and the weight-bearing lunge for the ankle; degrees, rounded up.
+PUBLISHED = {"shin": 145, "forearm": 155, "foot": 58, "spine": 45, "chest": 45, "neck": 50, "head": 50, "thigh": 130}
+
+
+@pytest.mark.parametrize("subject", [0, 1, 2])
+def test_far_is_farther_than_new_and_new_than_near(subject):
+    scene = presets.scene("loose", size="quick", subject=subject)
+    motion = make_motion(SKELETON, scene.clips, fps=scene.fps, seed=subject)
+    parts = splits(scene)
+    near, new, far = (
+        novelty_deg(motion, train=parts["train"].frames, test=parts[name].frames)
+        for name in ("near_pose", "novel_pose", "far_pose")
+    )
+    assert 1 < np.mean(near) < 0.6 * np.mean(new)
+    assert np.mean(new) < np.mean(far) - 1
+    assert np.max(far) > np.max(new) + 2
+    assert novelty_deg(motion, train=parts["train"].frames, test=parts["novel_view"].frames) == [0.0] * 6
+
+
+@pytest.mark.parametrize("name", ["arms_up", "deep_squat", "jump"])
+@pytest.mark.parametrize("seed", range(4))
+def test_far_motion_keeps_joints_in_published_ranges(name, seed):
+    motion = make_motion(SKELETON, (Clip(generator=name, frames=13),), fps=12.0, seed=seed)
+    angles = np.rad2deg(np.linalg.norm(motion.dofs[:, 3:].reshape(13, -1, 3), axis=-1)).max(axis=0)
+    for joint, angle in zip(SKELETON.names, angles, strict=True):
+        assert angle < PUBLISHED.get(joint.split("_")[0], 180), joint
+    shin = rotvec_to_rotmat(motion.dofs[:, 3:].reshape(13, -1, 3)[:, SKELETON.names.index("shin_left")])
+    assert (shin[:, 2, 1] > -0.1).all(), "a knee bends backwards"
+
+
+def test_takes_of_a_kind_differ_but_stand_alike():
+    takes = [make_motion(SKELETON, (Clip(generator="reach", frames=9),), fps=12.0, seed=seed) for seed in (0, 1)]
+    assert np.abs(takes[0].dofs - takes[1].dofs).max() > 0.2
+    still = make_motion(SKELETON, (Clip(generator="stand", frames=3),), fps=12.0, seed=0)
+    np.testing.assert_allclose(still.dofs, still.dofs[[0, 0, 0]], atol=1e-12)
+
+
+def test_quick_has_more_motion_for_less_rendering():
+    scene = presets.scene("loose", size="quick")
+    parts = splits(scene)
+    train = parts["train"]
+    assert len(train.frames) >= 100 and len(train.cameras) == 20 and estimate(scene).images <= 550
+    used = [sum(name == camera for name, _ in train.views) for camera in train.cameras]
+    assert max(used) - min(used) <= 1
+    assert {len(train.seeing(frame)) for frame in train.frames} == {4}
+    assert len(wanted_views(scene)) == sum(split.count for split in parts.values())
+
+
+def test_only_some_frames_of_near_and_far_clips_have_images():
+    scene = presets.scene("loose", size="quick")
+    parts, first = splits(scene), 104 + 10
+    assert parts["near_pose"].frames == tuple(first + 13 * clip + frame for clip in range(4) for frame in (4, 12))
+    assert parts["far_pose"].frames == tuple(first + 52 + 13 * clip + f for clip in range(3) for f in (2, 6, 10))
+    assert parts["near_pose"].cameras == parts["far_pose"].cameras == parts["novel_view"].cameras
+
+
+def test_motion_of_a_user_is_neither_near_nor_far(tmp_path: Path):
+    path = amass_file(tmp_path / "walk.npz", mocap_framerate=np.array(12.0))
+    scene = presets.scene("mannequin", size="ci")
+    for changes in ({"train": path, "test": None}, {"train": None, "test": path}):
+        moved = presets.with_motion(scene, SKELETON, **changes)
+        assert set(splits(moved)) == {"train", "novel_view", "novel_pose"}
+
+
+def test_a_scene_without_parts_and_kinds_is_called_as_before():
+    still = presets.scene("still", size="ci").parameters
+    assert not {"near", "far", "near_stride", "far_stride"} & set(still) and "part" not in still["rig"]
+    assert {"near", "far"} < set(presets.scene("loose", size="quick").parameters)

@@ -1,0 +1,93 @@
+"""A capture whose training frames are seen by turns, with near and far motion: rendered, spoilt, exported."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from helpers.scenes import small_scene
+
+from ash.capture.dataset import Capture, scan_path
+from ash.capture.formats import load_capture, read_scan
+from ash.capture.manifest import verify_capture
+from ash.files import InputError, read_json
+from synth.capture import is_finished, make_capture
+from synth.readers.export import export
+from synth.readers.perturb import Perturbation, perturb
+from synth.readers.retargeting import scene_of
+from synth.scene import Clip, Rig, Scene
+
+
+def rotating_scene() -> Scene:
+    """Four training cameras, of which two see each frame."""
+    return replace(
+        small_scene(),
+        rig=Rig(cameras=5, held_out=1, part=2, width=64, height=64),
+        near=(Clip(generator="walk", frames=4),),
+        near_stride=2,
+        far=(Clip(generator="arms_up", frames=4), Clip(generator="jump", frames=4)),
+        far_stride=4,
+    )
+
+
+@pytest.fixture(scope="module")
+def capture(shared) -> Capture:
+    return load_capture(shared("rotating", lambda folder: make_capture(rotating_scene(), folder, workers=2)))
+
+
+def images_of(folder: Path) -> set[tuple[str, int]]:
+    return {(path.parent.name, int(path.stem)) for path in (folder / "frames").rglob("*.png")}
+
+
+def test_only_what_a_split_names_is_rendered(capture):
+    assert verify_capture(capture.folder) == [] and is_finished(rotating_scene(), capture.folder)
+    assert images_of(capture.folder) == {view for split in capture.splits.values() for view in split.views}
+    counts = {name: split.count for name, split in capture.splits.items()}
+    assert counts == {"train": 6, "novel_view": 1, "near_pose": 2, "novel_pose": 2, "far_pose": 2}
+    assert capture.splits["far_pose"].frames == (5 + 4 + 2, 5 + 4 + 4 + 2)
+    assert len(capture.motion.dofs) == 3 + 2 + 4 + 8
+    assert scene_of(capture.manifest, capture.folder) == rotating_scene()
+
+
+def test_a_lost_image_of_a_part_is_noticed(capture, tmp_path):
+    spoilt = perturb(capture.folder, tmp_path / "same", Perturbation())
+    camera, frame = capture.splits["train"].views[-1]
+    (spoilt / f"frames/{camera}/{frame:06d}.png").unlink()
+    assert verify_capture(spoilt) == [f"frames/{camera}/{frame:06d}.png: missing"]
+
+
+def test_scans_know_only_what_the_part_saw(capture):
+    whole = len(read_scan(capture, 0)[0])
+    assert 0 < whole < 0.8 * len(capture.template.vertices)
+    assert not scan_path(capture.folder, capture.splits["near_pose"].frames[0]).exists()
+
+
+def test_missing_cameras_take_their_pairs_along(capture, tmp_path):
+    fewer = load_capture(perturb(capture.folder, tmp_path / "fewer", Perturbation(cameras=2)))
+    train = fewer.splits["train"]
+    assert set(train.views) == {view for view in capture.splits["train"].views if view[0] in train.cameras}
+    assert images_of(fewer.folder) == {view for split in fewer.splits.values() for view in split.views}
+    assert verify_capture(fewer.folder) == []
+
+
+def test_exports_write_the_cameras_of_the_frame_or_refuse(capture, tmp_path):
+    export(capture, tmp_path / "nerf", form="nerfstudio")
+    for frame in capture.splits["train"].frames:
+        rows = read_json(tmp_path / f"nerf/frame_{frame:06d}/transforms.json")["frames"]
+        assert [row["file_path"] for row in rows] == [f"images/{n}.png" for n in capture.splits["train"].seeing(frame)]
+    export(capture, tmp_path / "colmap", form="colmap", frame=1)
+    assert sorted(path.stem for path in (tmp_path / "colmap/images").iterdir()) == sorted(
+        capture.splits["train"].seeing(1)
+    )
+    assert "seen by 2 of its 4 cameras" in (tmp_path / "colmap/ABOUT.txt").read_text()
+    with pytest.raises(InputError, match=r"--rig\.part 0"):
+        export(capture, tmp_path / "ash", form="ash")
+
+
+def test_clips_draped_side_by_side_are_those_draped_in_a_row(capture, tmp_path):
+    alone = tmp_path / "alone"
+    from synth.capture import describe
+
+    alone.mkdir()
+    describe(rotating_scene(), alone)
+    for name in ("motion.npz", "truth/template.npz", "truth/surface/000007.npz", "truth/clothes.npz", "cameras.json"):
+        assert (alone / name).read_bytes() == (capture.folder / name).read_bytes(), name
