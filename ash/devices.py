@@ -46,6 +46,12 @@ def device_named(name: str) -> torch.device:
     return torch.device(name)
 
 
+def finish(device: torch.device) -> None:
+    """Wait for what was queued on a GPU, so that a clock that is read next has seen it."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
 def moved(value: Moved, device: torch.device) -> Moved:
     """The value with its tensors on a device: a tensor, whatever has `to`, or a dataclass, list or tuple of such."""
     found: Any = value

@@ -25,7 +25,7 @@ def test_the_table_has_every_stage_and_fast_images_agree_with_the_definitions(ca
     monkeypatch.setattr(frames, "captured", lambda folder: capture)
     subject = TimedAvatar(name="ci", config=named("ci"), width=64, height=64, trains=True)
     results = list(frames.speed_frame(capture, timed=(subject,), rounds=2))
-    monkeypatch.setattr(frames, "speed_frame", lambda capture: iter(results))
+    monkeypatch.setattr(frames, "speed_frame", lambda capture, device: iter(results))
     before = torch.get_num_threads()
     assert frames.main(tmp_path / "rows.json") == 0
     assert torch.get_num_threads() == before

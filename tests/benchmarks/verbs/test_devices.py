@@ -1,19 +1,26 @@
 """The flag `--device`: what is refused, what `auto` takes, and that the device is part of a cell's identity."""
 
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from helpers.commands import refused
+from helpers import fakes
+from helpers.cells import cell
+from helpers.commands import refused, refused_last
 
 import ash.devices
 from ash.devices import obstacle
 from ash.files import InputError
-from benchmarks.cell.cells import CellConfig
-from benchmarks.cell.process import _on_the_processor
+from benchmarks import cli
+from benchmarks.cell.cells import CellConfig, read_cell, read_result, write_config, write_result
+from benchmarks.cell.process import placed_on
+from benchmarks.play.actors import open_cast
 from benchmarks.provenance import gpu_name
+from benchmarks.report.sentences import doubts
+from benchmarks.speed import rows
 from benchmarks.suites.files import find_suite
 from benchmarks.verbs import doctor
 from benchmarks.verbs.devices import chosen_device, on_device
@@ -22,7 +29,11 @@ without_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a 
 
 
 @without_cuda
-@pytest.mark.parametrize("verb", [("run", "ci"), ("train", "ash", "a-folder")])
+@pytest.mark.parametrize(
+    "verb",
+    [("run", "ci"), ("train", "ash", "a-folder"), ("eval", "a-run"), ("play", "a-run"), ("speed", "kernels")],
+    ids=lambda verb: verb[0],
+)
 def test_a_gpu_that_is_not_there_is_one_line_and_exit_code_2(verb: tuple[str, ...], capsys) -> None:
     assert refused(capsys, *verb, "--device", "cuda").endswith(f"device cuda: {obstacle()}")
     assert "expected cpu, cuda or cuda:N, got 'gpu'" in refused(capsys, *verb, "--device", "gpu")
@@ -61,18 +72,72 @@ def test_doctor_says_what_the_gpu_can_do(monkeypatch: pytest.MonkeyPatch, tmp_pa
         assert doctor._gpu().found == "none"
 
 
-def test_an_avatar_is_looked_at_without_a_gpu() -> None:
-    config = CellConfig(
+def learned_on_cuda(method: str) -> CellConfig:
+    return CellConfig(
         scene="still",
         size="ci",
         capture_seed=0,
         capture="0" * 64,
-        method="ash",
+        method=method,
         preset="ci",
         seed=0,
         code="0",
         changes={"device": "cuda", "model.texels": 128},
     )
-    here = _on_the_processor(config)
-    assert here.changes == {"model.texels": 128}
-    assert here.key != config.key == replace(config).key
+
+
+def test_an_avatar_is_looked_at_without_a_gpu() -> None:
+    config = learned_on_cuda("ash")
+    here = placed_on(config, "cpu")
+    assert here.changes == {"model.texels": 128} and (config.device, here.device) == ("cuda", "cpu")
+    assert here.key != config.key == placed_on(config, "cuda").key
+    assert placed_on(here, "cuda:1").changes == {"device": "cuda:1", "model.texels": 128}
+
+
+def test_what_has_no_device_or_is_not_ours_stays_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fakes.use(tmp_path / "plugins", monkeypatch)
+    for method in ("nearest", "fake_good"):
+        config = learned_on_cuda(method)
+        assert placed_on(config, "cpu") is config
+
+
+@without_cuda
+def test_a_cell_that_learned_on_a_gpu_is_scored_here_where_the_cpu_is_named(
+    tube_cells: dict[str, Path], tmp_path: Path, capsys
+) -> None:
+    learned = read_cell(tube_cells["ash"])
+    config = replace(learned.config, changes=learned.config.changes | {"device": "cuda"})
+    folder = Path(shutil.copytree(learned.folder, tmp_path / config.key))
+    result = read_result(folder)
+    write_config(replace(learned, config=config, folder=folder))
+    write_result(folder, replace(result, config=config, drawn_on="cuda"))
+    assert f"device cuda: {obstacle()}" in refused_last(capsys, "eval", str(folder))
+    assert read_result(folder).drawn_on == "cuda"
+    assert cli.main(["eval", str(folder), "--device", "cpu"]) == cli.DONE
+    again = read_result(folder)
+    assert (again.drawn_on, again.config.device, result.drawn_on) == ("cpu", "cuda", "cpu")
+    assert [view.prediction for view in again.views] == [view.prediction for view in result.views]
+
+
+@without_cuda
+def test_every_avatar_that_is_played_goes_to_the_device(tube_run: Path) -> None:
+    with open_cast(tube_run, device="cuda") as cast:
+        assert len(cast.titles) == 2
+        for title in cast.titles:
+            with pytest.raises(InputError, match=r"^device cuda: "):
+                cast.actor(title)
+
+
+def test_a_report_says_which_milliseconds_are_those_of_a_gpu() -> None:
+    results = [replace(cell(method, 30.0), drawn_on=device) for method, device in (("ash", "cuda"), ("ddc", "cpu"))]
+    assert doubts(results) == ("ASH: drawn on cuda, so that milliseconds are not those of one core.",)
+
+
+def test_a_timed_call_is_over_when_the_device_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    events = []
+    monkeypatch.setattr(rows, "finish", lambda device: events.append(device.type))
+    candidate = rows.TimedCandidate(name="it", threads=1, call=lambda: events.append("call"))
+    times = rows.time_interleaved([candidate], rounds=2, device=torch.device("cuda"))
+    assert events == ["cuda", "call", "cuda", "call", "cuda"]
+    (row,) = rows.rows_of("splat", "S", "forward", times, torch.device("cuda"))
+    assert row.device == "cuda"
