@@ -30,7 +30,8 @@ from ash.template_learning.learning import template_of, with_template
 from ash.template_learning.refining import refined_template
 from ash.textures import Conditions, TexelLattice, TextureDrawer, build_lattice, unsettled
 from ash.training.adam import Adam
-from ash.training.batches import TrainingImages, draw_batch, load_training_images, over
+from ash.training.batches import draw_batch, over
+from ash.training.images import TrainingImages, load_training_images
 from ash.training.loop import fit, view_loss
 
 RELEASED_OPACITY_WEIGHT = 0.1  # In the release's warm-up.

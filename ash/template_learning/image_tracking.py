@@ -29,7 +29,7 @@ from ash.template.template import Template, vertex_normals
 from ash.template_learning.observing import ObservedView, observe, sample
 from ash.template_learning.tracking import Tracked
 from ash.textures import TexelLattice, build_lattice
-from ash.training.batches import load_training_images
+from ash.training.images import load_training_images
 
 TEXELS = 192  # Points of the surface: the texels of such a lattice.
 BLURS = (1.5, 0.5)  # Pixels, in the first and in the last pass.
@@ -59,10 +59,7 @@ def track_images(capture: Capture, template: Template, graph: EmbeddedGraph, *, 
         blur, reach = (first * (last / first) ** progress for first, last in (BLURS, REACHES))
         paint = _Paint(subject.paint)
         for index, frame in enumerate(images.frames):
-            views = [
-                observe(images.views[name, frame], camera, images.boxes[name, frame], blur=blur)
-                for name, camera in images.cameras.items()
-            ]
+            views = [observe(images.views[name, frame], camera, blur=blur) for name, camera in images.cameras.items()]
             subject.move(index, posed[index], views, paint, reach=reach)
         subject.paint = paint.mean()
     canonical = torch.from_numpy(np.stack([subject.canonical(i) for i in range(len(images.frames))])).float()

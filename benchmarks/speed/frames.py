@@ -24,7 +24,8 @@ from ash.model import AshModel, views_of
 from ash.presets import named
 from ash.protocol import StageClock
 from ash.training.adam import Adam
-from ash.training.batches import Batch, draw_batch, load_training_images
+from ash.training.batches import Batch, draw_batch
+from ash.training.images import load_training_images
 from ash.training.losses import l1_ssim_loss, l1_ssim_loss_naive, ssim_target
 from benchmarks.speed.rows import SpeedRow, as_json, row_of
 

@@ -28,7 +28,8 @@ from ash.devices import CPU, finish
 from ash.files import write_json
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted
-from ash.training.batches import TrainingImages, draw_batch, load_training_images
+from ash.training.batches import draw_batch
+from ash.training.images import TrainingImages, load_training_images
 from baselines.ddc import DdcAvatar, ddc
 from benchmarks.speed.frames import captured
 

@@ -6,7 +6,7 @@ import pytest
 
 from ash import presets
 from ash.config import TrainingConfig
-from ash.training.batches import reserved_views
+from ash.training.images import reserved_views
 from ash.training.stopping import (
     FINAL_LEARNING_RATE,
     LEAST_STEPS,

@@ -11,7 +11,7 @@ from ash.avatar import AshAvatar
 from ash.files import read_json
 from ash.inference import Player
 from ash.presets import named
-from ash.training.batches import load_training_images
+from ash.training.images import load_training_images
 from benchmarks.speed import frames, profile
 from benchmarks.speed.frames import PictureAgreement, TimedAvatar, scaled_camera, subjects
 
