@@ -16,7 +16,7 @@ from ash.capture.dataset import Camera, Capture, Pose, fewer_views
 from ash.checkpoints import contiguous_state, load_module, read_safetensors
 from ash.config import AshConfig, ModelConfig, TrainingConfig
 from ash.decoders import Decoders
-from ash.devices import CPU, device_named, moved
+from ash.devices import device_named
 from ash.files import InputError, write_atomic
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.initialising import blank_gaussians, initial_gaussians, released_gaussians, texel_pitch
@@ -30,7 +30,8 @@ from ash.template_learning.learning import template_of, with_template
 from ash.template_learning.refining import refined_template
 from ash.textures import Conditions, TexelLattice, TextureDrawer, build_lattice, unsettled
 from ash.training.adam import Adam
-from ash.training.batches import TrainingImages, draw_batch, load_training_images, over
+from ash.training.batches import draw_batch, over
+from ash.training.images import TrainingImages, load_training_images
 from ash.training.loop import fit, view_loss
 
 RELEASED_OPACITY_WEIGHT = 0.1  # In the release's warm-up.
@@ -249,12 +250,12 @@ class AshAvatar:
     @torch.no_grad()
     def gaussian_means(self, pose: Pose) -> np.ndarray:
         """Centres of the posed Gaussians, `[n, 3]` metres."""
-        return self.gaussians(pose).means.numpy()
+        return self.gaussians(pose).means.cpu().numpy()
 
     @torch.no_grad()
     def gaussians(self, pose: Pose, *, clock: StageClock | None = None, decoders: Decode | None = None) -> Gaussians:
-        """The posed Gaussians: world, metres, on the CPU; by other `decoders` than the model's own where given."""
-        return moved(self.module.gaussians(pose, clock, decoders=decoders), CPU)
+        """The posed Gaussians: world, metres, on its device; by other `decoders` than the model's own where given."""
+        return self.module.gaussians(pose, clock, decoders=decoders)
 
     @property
     def dilation(self) -> float:

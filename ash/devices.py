@@ -46,6 +46,19 @@ def device_named(name: str) -> torch.device:
     return torch.device(name)
 
 
+def ability(name: str = "cuda") -> str:
+    """What a CUDA device has that a training needs, in a few words."""
+    found = torch.cuda.get_device_properties(torch.device(name))
+    half = "with" if torch.cuda.is_bf16_supported() else "without"
+    return f"{found.total_memory / 2**30:.0f} GB, compute capability {found.major}.{found.minor}, {half} bfloat16"
+
+
+def finish(device: torch.device) -> None:
+    """Wait for what was queued on a GPU, so that a clock that is read next has seen it."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
 def moved(value: Moved, device: torch.device) -> Moved:
     """The value with its tensors on a device: a tensor, whatever has `to`, or a dataclass, list or tuple of such."""
     found: Any = value

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Camera, Motion, Pose
 from ash.decoders import Decoders
+from ash.devices import CPU, finish
 from ash.model import Decode, image_of
 from ash.protocol import StageClock
 from ash.textures import Conditions
@@ -63,7 +64,8 @@ class Player:
             return ()
         conditions = self._model.conditions(Pose(self._motion, 0))
         ways: dict[str, Decode] = {"float32": decoders, "bfloat16": _in_bfloat16(decoders)}
-        if isinstance(decoders, Decoders) and find_spec("openvino") is not None:
+        here = conditions.textures.device == CPU
+        if here and isinstance(decoders, Decoders) and find_spec("openvino") is not None:
             ways["openvino"] = _in_openvino(decoders, conditions)
         images = {
             name: image_of(self._model(Pose(self._motion, 0), camera, decoders=way)) for name, way in ways.items()
@@ -143,6 +145,7 @@ def _fastest_ms(decode: Callable[[Conditions], Tensor], conditions: Conditions) 
     for _ in range(ROUNDS):
         start = time.perf_counter()
         decode(conditions)
+        finish(conditions.textures.device)
         best = min(best, time.perf_counter() - start)
     return best * 1e3
 

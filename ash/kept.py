@@ -1,5 +1,6 @@
 """Values that are made when they are asked for, and kept as far as there is room for them."""
 
+import threading
 from collections.abc import Callable, Hashable
 from dataclasses import fields, is_dataclass
 from typing import Any, Generic, TypeVar
@@ -17,12 +18,15 @@ class Kept(Generic[Key, Value]):
     """Values by key. The first ones stay; from `max_bytes` on a value is made anew each time it is asked for.
 
     Training asks for frames in random order, each as often as the others: to drop one for another would gain nothing.
+    Threads may ask side by side.
     """
 
     def __init__(self, make: Callable[[Key], Value], *, max_bytes: int = MAX_BYTES) -> None:
         self._make, self._max_bytes = make, max_bytes
         self._values: dict[Key, Value] = {}
+        self._adding = threading.Lock()
         self.bytes = 0
+        self.is_full = False  # Something was not kept.
 
     def __getitem__(self, key: Key) -> Value:
         """The value of a key, the same whether it was kept or not."""
@@ -30,9 +34,11 @@ class Kept(Generic[Key, Value]):
             return self._values[key]
         value = self._make(key)
         size = size_of(value)
-        if self.bytes + size <= self._max_bytes:
-            self._values[key] = value
-            self.bytes += size
+        with self._adding:
+            if key not in self._values and self.bytes + size <= self._max_bytes:
+                self._values[key] = value
+                self.bytes += size
+            self.is_full |= key not in self._values
         return value
 
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ash.capture.dataset import Camera, Pose
 from ash.config import ModelConfig
-from ash.devices import MovingModule
+from ash.devices import MovingModule, finish
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted, splat
 from ash.gaussians.texels import LIGHT_COEFFICIENTS, place, pose
@@ -162,5 +162,5 @@ def stage(clock: StageClock | None, name: str, device: torch.device) -> Iterator
     """Time the body, to the end of what it queued on a GPU; without a clock nothing is timed or waited for."""
     with clock.stage(name) if clock is not None else nullcontext():
         yield
-        if clock is not None and device.type == "cuda":
-            torch.cuda.synchronize(device)
+        if clock is not None:
+            finish(device)

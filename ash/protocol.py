@@ -114,7 +114,10 @@ class PosesGaussians(Protocol):
     dilation: float  # px^2 that its pictures add to both axes of every projected Gaussian
 
     def gaussians(self, pose: Pose) -> "Gaussians":
-        """The posed Gaussians in frame `frame` of `motion`: world, metres, colours as seen from anywhere."""
+        """The posed Gaussians in frame `frame` of `motion`: world, metres, colours as seen from anywhere.
+
+        On any device.
+        """
 
 
 @runtime_checkable

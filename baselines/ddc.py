@@ -38,7 +38,8 @@ from ash.template.template import PosedTemplate, Template
 from ash.template_learning.learning import template_of, with_template
 from ash.template_learning.refining import MotionRefinement, Refinement
 from ash.textures import TextureDrawer, build_lattice, unsettled
-from ash.training.batches import load_training_images, over
+from ash.training.batches import over
+from ash.training.images import load_training_images
 from ash.training.loop import fit
 from baselines.display import MeshDisplay
 
@@ -243,8 +244,7 @@ class DdcAvatar:
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Networks, and what is learned directly: texture, light, a displacement of the vertices; as ASH has it."""
-        training = self.config.training
-        module = self.module
+        training, module = self.config.training, self.module
         nets = [*module.network.parameters(), *(module.phi.parameters() if module.phi is not None else ())]
         static = [p for p in (module.texture, module.static_texture, module.light) if p is not None and p.requires_grad]
         if isinstance(module.refinement, MotionRefinement):

@@ -29,7 +29,7 @@ from ash.template.template import Template, vertex_normals
 from ash.template_learning.observing import ObservedView, observe, sample
 from ash.template_learning.tracking import Tracked
 from ash.textures import TexelLattice, build_lattice
-from ash.training.batches import load_training_images
+from ash.training.images import load_training_images
 
 TEXELS = 192  # Points of the surface: the texels of such a lattice.
 BLURS = (1.5, 0.5)  # Pixels, in the first and in the last pass.
@@ -60,8 +60,7 @@ def track_images(capture: Capture, template: Template, graph: EmbeddedGraph, *, 
         paint = _Paint(subject.paint)
         for index, frame in enumerate(images.frames):
             views = [
-                observe(images.views[name, frame], images.cameras[name], images.boxes[name, frame], blur=blur)
-                for name in images.seeing(frame)
+                observe(images.views[name, frame], images.cameras[name], blur=blur) for name in images.seeing(frame)
             ]
             subject.move(index, posed[index], views, paint, reach=reach)
         subject.paint = paint.mean()

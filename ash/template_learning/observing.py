@@ -3,11 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from scipy.ndimage import gaussian_filter, minimum_filter
 
 from ash.capture.dataset import Camera
 from ash.training.batches import crop_camera
+from ash.training.images import Cutout
 
 MARGIN = 14  # Pixels around the subject, so that a template that sticks out is still seen whole.
 OPAQUE = 0.98  # Colours count where the subject fills a pixel and its neighbours at least so much.
@@ -24,13 +25,12 @@ class ObservedView:
     outward: Float[np.ndarray, "o 2"]  # unit normals there
 
 
-def observe(
-    rgba: UInt8[np.ndarray, "h w 4"], camera: Camera, box: tuple[int, int, int, int], *, blur: float
-) -> ObservedView:
-    """Prepare a view. `box`: x0, y0, x1, y1 of the subject in pixels, half open; `blur`: standard deviation, pixels."""
+def observe(cutout: Cutout, camera: Camera, *, blur: float) -> ObservedView:
+    """Prepare a view. `blur`: standard deviation, pixels."""
+    box = cutout.box
     x0, y0 = max(0, box[0] - MARGIN), max(0, box[1] - MARGIN)
     x1, y1 = min(camera.width, box[2] + MARGIN), min(camera.height, box[3] + MARGIN)
-    window = rgba[y0:y1, x0:x1].astype(np.float32) / 255
+    window = cutout.window(x0, y0, x1 - x0, y1 - y0).numpy().astype(np.float32) / 255
     alpha = window[..., 3]
     weight = gaussian_filter(alpha, blur)
     colours = gaussian_filter(window[..., :3] * alpha[..., None], (blur, blur, 0)) / np.maximum(weight, 1e-3)[..., None]

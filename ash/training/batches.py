@@ -1,42 +1,20 @@
-"""What one step of training sees: the images of a capture in memory, and a few of them cut out as a batch."""
+"""What one step of training sees: a few of a capture's images, cut out as a batch."""
 
-from dataclasses import dataclass, field, replace
-from math import gcd
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from ash.capture.dataset import Camera, Capture
-from ash.capture.manifest import Split
+from ash.capture.dataset import Camera
 from ash.config import TrainingConfig
-from ash.devices import CPU
 from ash.files import InputError
-from ash.kept import Kept
 from ash.native.library import address, float32_on_cpu, load
+from ash.training.images import ReadAhead, TrainingImages, View
 
 CROP_MARGIN = 12  # Pixels around the subject, so that a Gaussian that strays outside the mask is still seen.
-RESERVED_VIEWS = 24  # Training views that no step sees, where there are enough: they tell when training may end.
-RESERVED_SHARE = 8  # No more than an eighth of the training views are reserved,
-RESERVED_OF_FRAME = 3  # and no more than a third of a frame's, where all cameras saw it.
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class TrainingImages:
-    """All training images, decoded anew from where they no longer fit, with the box that the subject fills in each."""
-
-    views: Kept[tuple[str, int], UInt8[np.ndarray, "h w 4"]]
-    boxes: dict[tuple[str, int], tuple[int, int, int, int]]  # x0, y0, x1, y1 in pixels, half open
-    cameras: dict[str, Camera]
-    frames: tuple[int, ...]
-    reserved: tuple[tuple[str, int], ...] = ()  # views that no batch holds
-    device: torch.device = CPU  # where batches are made; the images stay in the processor's memory
-    plates: dict[str, UInt8[np.ndarray, "h w 3"]] = field(default_factory=dict)  # the empty studio, where it is known
-
-    def seeing(self, frame: int) -> list[str]:
-        """The cameras that saw a frame."""
-        return [name for name in self.cameras if (name, frame) in self.boxes]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -50,68 +28,48 @@ class Batch:
     background: Float[Tensor, " 3"] | Float[Tensor, "c h w 3"]  # a colour, or one for every pixel
 
 
-def load_training_images(capture: Capture, device: torch.device = CPU) -> TrainingImages:
-    """Look at every training image once, and keep those for which there is room; batches go to the device.
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Sampled:
+    """What a step shows."""
 
-    Raises:
-        InputError: an image is damaged, or shows nobody.
-    """
-    boxes = {}
-    views: Kept[tuple[str, int], np.ndarray] = Kept(lambda view: capture.image(*view))
-    train = capture.splits["train"]  # An oracle's capture holds the held-out cameras too.
-    for camera, frame in train.views:
-        image = views[camera, frame]
-        rows, columns = np.nonzero(image[..., 3].any(1))[0], np.nonzero(image[..., 3].any(0))[0]
-        if len(rows) == 0:
-            raise InputError(f"{capture.folder}: nobody is seen by camera {camera} in frame {frame}")
-        boxes[camera, frame] = (int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
-    return TrainingImages(
-        views=views,
-        boxes=boxes,
-        cameras={name: capture.cameras[name] for name in train.cameras},
-        frames=tuple(train.frames),
-        reserved=reserved_views(train),
-        plates={name: plate for name in train.cameras if (plate := capture.plate(name)) is not None},
-        device=device,
-    )
+    frame: int
+    cameras: tuple[str, ...]
+    colour: Float[Tensor, " 3"]  # behind the subject
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """The images that it needs."""
+        return tuple((camera, self.frame) for camera in self.cameras)
 
 
-def reserved_views(train: Split) -> tuple[tuple[str, int], ...]:
-    """24 views, spread over frames and cameras; fewer of a small capture, none where a step would then lack cameras.
-
-    At most an eighth of all views, and at most a third of the cameras in a frame; of frames that a part of the cameras
-    saw, one of two.
-    """
-    parts = dict(zip(train.frames, train.cameras_per_frame, strict=True))
-    room = {f: len(part) // RESERVED_OF_FRAME or int(bool(train.parts) and len(part) > 1) for f, part in parts.items()}
-    frames = [frame for frame, some in room.items() if some]
-    if not frames:
-        return ()
-    count = min(RESERVED_VIEWS, train.count // RESERVED_SHARE, len(frames) * min(room[frame] for frame in frames))
-    cameras = len(train.cameras)
-    # A stride without a common divisor comes to every camera before it comes back to one.
-    stride = next(s for s in range(max(1, round(0.4 * cameras)), cameras + 1) if gcd(s, cameras) == 1)
-    chosen: list[tuple[str, int]] = []
-    for i in range(count):
-        frame, wanted = frames[i * len(frames) // count], i * stride % cameras
-        free = [name for name in parts[frame] if (name, frame) not in chosen]
-        # The camera whose turn it is, or the next one that saw the frame.
-        chosen.append((min(free, key=lambda name: (train.cameras.index(name) - wanted) % cameras), frame))
-    return tuple(chosen)
-
-
-def draw_batch(images: TrainingImages, config: TrainingConfig, seed: int, step: int) -> Batch:
-    """The batch of a step: frames in a new random order every epoch, cameras at random."""
+def sampled(images: TrainingImages, config: TrainingConfig, seed: int, step: int) -> Sampled:
+    """What a step shows: frames in a new random order every epoch, cameras at random."""
     epoch, position = divmod(step, len(images.frames))
-    order = np.random.default_rng([seed, 1, epoch]).permutation(len(images.frames))
-    frame = images.frames[order[position]]
+    frame = images.frames[_order(seed, epoch, len(images.frames))[position]]
     rng = np.random.default_rng([seed, 2, step])
     cameras = [name for name in images.seeing(frame) if (name, frame) not in images.reserved]
     count = min(config.views_per_step, len(cameras))
-    names = [cameras[i] for i in rng.choice(len(cameras), count, replace=False)]
+    names = tuple(cameras[i] for i in rng.choice(len(cameras), count, replace=False))
     colour = np.zeros(3) if config.background == "black" else rng.random(3)
-    batch = cut_batch(images, frame, names, torch.from_numpy(colour).float())
+    return Sampled(frame=frame, cameras=names, colour=torch.from_numpy(colour).float())
+
+
+@lru_cache(maxsize=2)  # Of a capture of 20,000 frames it takes longer than a GPU's step.
+def _order(seed: int, epoch: int, frames: int) -> np.ndarray:
+    return np.random.default_rng([seed, 1, epoch]).permutation(frames)
+
+
+def draw_batch(images: TrainingImages, config: TrainingConfig, seed: int, step: int) -> Batch:
+    """The batch of a step."""
+    shown = sampled(images, config, seed, step)
+    batch = cut_batch(images, shown.frame, list(shown.cameras), shown.colour)
     return in_studio(batch, images) if config.background == "studio" else batch
+
+
+def draw_ahead(ahead: ReadAhead, images: TrainingImages, config: TrainingConfig, seed: int, step: int) -> Batch:
+    """`draw_batch`, while the images of the next steps are read."""
+    views = ahead.of_step(step, lambda later: sampled(images, config, seed, later).views)
+    return draw_batch(replace(images, views=views), config, seed, step)
 
 
 def in_studio(batch: Batch, images: TrainingImages) -> Batch:
@@ -142,7 +100,7 @@ def over(rgb: Float[Tensor, "c h w 3"], alpha: Float[Tensor, "c h w"], backgroun
 
 def cut_batch(images: TrainingImages, frame: int, names: list[str], background: Tensor) -> Batch:
     """Crop views of one frame to boxes of one size, and move the principal points along."""
-    boxes = [images.boxes[name, frame] for name in names]
+    boxes = [images.box((name, frame)) for name in names]
     full = images.cameras[names[0]]
     width = min(full.width, max(x1 - x0 for x0, _, x1, _ in boxes) + 2 * CROP_MARGIN)
     height = min(full.height, max(y1 - y0 for _, y0, _, y1 in boxes) + 2 * CROP_MARGIN)
@@ -152,8 +110,7 @@ def cut_batch(images: TrainingImages, frame: int, names: list[str], background: 
         left = min(max(0, (x0 + x1 - width) // 2), full.width - width)
         top = min(max(0, (y0 + y1 - height) // 2), full.height - height)
         cameras.append(crop_camera(images.cameras[name], left, top, width, height))
-        window = images.views[name, frame][top : top + height, left : left + width]
-        target, mask = composite(window, background)
+        target, mask = composite(images.views[name, frame].window(left, top, width, height), background)
         targets.append(target)
         masks.append(mask)
     return Batch(
@@ -165,16 +122,13 @@ def cut_batch(images: TrainingImages, frame: int, names: list[str], background: 
     )
 
 
-def composite_naive(rgba: UInt8[np.ndarray, "h w 4"], background: Float[Tensor, " 3"]) -> tuple[Tensor, Tensor]:
-    """Straight RGBA over a background, `[h, w, 3]`, and its alpha, `[h, w]`, both in 0..1: the definition.
-
-    It is composited where the background lies; the bytes are moved there.
-    """
-    image = torch.from_numpy(rgba).to(background.device).float() / 255
+def composite_naive(rgba: UInt8[Tensor, "h w 4"], background: Float[Tensor, " 3"]) -> tuple[Tensor, Tensor]:
+    """Straight RGBA over a background, `[h, w, 3]`, and its alpha, `[h, w]`, both in 0..1: the definition."""
+    image = rgba.float() / 255
     return image[..., :3] * image[..., 3:] + (1 - image[..., 3:]) * background, image[..., 3]
 
 
-def composite(rgba: UInt8[np.ndarray, "h w 4"], background: Float[Tensor, " 3"]) -> tuple[Tensor, Tensor]:
+def composite(rgba: UInt8[Tensor, "h w 4"], background: Float[Tensor, " 3"]) -> tuple[Tensor, Tensor]:
     """`composite_naive` in one native pass over the window, whose pixels must lie side by side in their rows.
 
     On other devices than the CPU the definition itself runs.
@@ -182,10 +136,10 @@ def composite(rgba: UInt8[np.ndarray, "h w 4"], background: Float[Tensor, " 3"])
     if background.device.type != "cpu":
         return composite_naive(rgba, background)
     height, width = rgba.shape[:2]
-    assert rgba.strides[1:] == (4, 1)
+    assert rgba.stride()[1:] == (4, 1)
     rgb, alpha = torch.empty(height, width, 3, device="cpu"), torch.empty(height, width, device="cpu")
     outputs = address(float32_on_cpu("background", background)), address(rgb), address(alpha)
-    load().ash_composite(rgba.ctypes.data, rgba.strides[0], width, height, *outputs)
+    load().ash_composite(rgba.data_ptr(), rgba.stride(0), width, height, *outputs)
     return rgb, alpha
 
 

@@ -9,7 +9,7 @@ import math
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -23,10 +23,12 @@ from torch import Tensor
 from ash.capture.dataset import Camera
 from ash.checkpoints import contiguous_state, load_module, read_safetensors
 from ash.config import TrainingConfig
+from ash.devices import CPU
 from ash.files import InputError, write_atomic
 from ash.protocol import TrainingOutcome
 from ash.training.adam import Adam
-from ash.training.batches import Batch, TrainingImages, cut_batch, draw_batch
+from ash.training.batches import Batch, cut_batch, draw_ahead
+from ash.training.images import READERS, ReadAhead, TrainingImages
 from ash.training.losses import exact_target, l1_ssim_loss
 from ash.training.stopping import (
     ReservedScore,
@@ -97,21 +99,18 @@ def fit(
         Diverged: a loss, gradient or weight was not finite, again after one roll-back with half the learning rate.
         Interrupted: SIGTERM came; the checkpoint holds everything up to the last whole step.
     """
-    if not config.crop:
-        whole = {
-            (name, frame): (0, 0, images.cameras[name].width, images.cameras[name].height)
-            for name, frame in images.boxes
-        }
-        images = replace(images, boxes=whole)
+    images = replace(images, whole=not config.crop)
     run = _Run(learner, config, images, folder)
     if not run.resume():
         before_start()
         run.average_afresh()
         if not run.save():
             raise Diverged("the warm-up left weights that are not finite")
-    with _sigterm() as asked_to_stop:
+    # A thread beside the one core that a cell has on the CPU would gain nothing.
+    ahead = ReadAhead(images.views, readers=0 if images.device == CPU else READERS)
+    with closing(ahead), _sigterm() as asked_to_stop:
         while not run.has_ended or not run.save():  # What cannot be saved was rolled back: on from there.
-            batch = draw_batch(images, config, seed, run.step)
+            batch = draw_ahead(ahead, images, config, seed, run.step)
             run.advance(batch)
             if asked_to_stop():
                 run.save()

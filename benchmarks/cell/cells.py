@@ -63,6 +63,11 @@ class CellConfig:
         return self.factory or self.method
 
     @property
+    def device(self) -> str:
+        """Where the method learns: the CPU, where it has no choice or none was made."""
+        return str(self.changes.get("device", "cpu"))
+
+    @property
     def place(self) -> str:
         """The scene, and how its capture is spoilt."""
         return f"{self.scene} {self.axis}={self.severity:g}" if self.axis else self.scene
@@ -151,6 +156,7 @@ class CellResult:
     training: TrainingOutcome | None = None  # as the method tells it
     snapshots: tuple[Snapshot, ...] = ()
     provenance: Provenance | None = None
+    drawn_on: str = ""  # device of its pictures: `eval` may take another than the one that learned; empty: unknown
     isolated: bool | None = None  # whether the method had a room of its own; None: an oracle, a failure, an old result
 
     def value(self, split: str, region: str, metric: str) -> float | None:

@@ -107,6 +107,7 @@ def judge(
         curve=curve,
         training=training,
         snapshots=drawn.snapshots,
+        drawn_on=cell.config.device,
         isolated=drawn.isolated,
     )
 

@@ -40,7 +40,7 @@ from benchmarks.cell.children import adopt_orphans
 from benchmarks.cell.evaluation import _flicker_summary, _gap_summary, _image_summary, draw_all, judge, scored_views
 from benchmarks.cell.failing import Killed, MethodFailed, Spoilt
 from benchmarks.cell.host import WORK, Host, give_files, hosted, take_files
-from benchmarks.cell.methods import ORACLES, configured, find_method
+from benchmarks.cell.methods import ORACLES, configured, find_method, offered
 from benchmarks.cell.sealing import seen_by_method, watched
 from benchmarks.cell.timing import Spent
 from benchmarks.cell.views import View
@@ -110,8 +110,10 @@ def run_cell(cell: Cell) -> CellResult:
     return result
 
 
-def evaluate_cell(cell: Cell) -> CellResult:
+def evaluate_cell(cell: Cell, *, device: str | None = None) -> CellResult:
     """Load a cell's checkpoint, render and score again, and write the result anew; training is not repeated.
+
+    It is drawn on `device`, which the result names, or where it learned.
 
     Raises:
         InputError: the cell is unfinished, or its method does not load or draw any more.
@@ -120,9 +122,11 @@ def evaluate_cell(cell: Cell) -> CellResult:
     capture = _capture_of(cell)
     spent = _spent_before(before)
     try:
-        with trained_host(cell, capture) as host:
+        there = cell if device is None else replace(cell, config=placed_on(cell.config, device))
+        with trained_host(there, capture) as host:
             drawn = draw_all(cell, capture, host)
-        result = replace(judge(cell, capture, drawn, spent, before.training), provenance=before.provenance)
+        judged = judge(cell, capture, drawn, spent, before.training)
+        result = replace(judged, provenance=before.provenance, drawn_on=there.config.device)
     except (MethodFailed, Killed) as error:
         raise InputError(f"{cell.folder}: {error or 'its process was killed'}; the result stays as it was") from error
     write_result(cell.folder, result)
@@ -130,8 +134,10 @@ def evaluate_cell(cell: Cell) -> CellResult:
 
 
 @contextmanager
-def load_avatar(cell: Cell, capture: Capture, *, trust: bool = False) -> Iterator[tuple[Avatar, Capture]]:
-    """A cell's trained avatar in this process, on the CPU, and the capture as it sees it, as long as the body runs.
+def load_avatar(
+    cell: Cell, capture: Capture, *, device: str = "cpu", trust: bool = False
+) -> Iterator[tuple[Avatar, Capture]]:
+    """A cell's trained avatar in this process, on a device, and the capture as it sees it, as long as the body runs.
 
     Code that is loaded here can do what the user can: a method of others is refused unless it is trusted.
 
@@ -147,7 +153,7 @@ def load_avatar(cell: Cell, capture: Capture, *, trust: bool = False) -> Iterato
     factory = method.load()
     with _seen(cell, capture) as seen:
         with watched(capture, seen):
-            avatar = _make(_on_the_processor(cell.config) if method.is_ours else cell.config, seen, factory)
+            avatar = _make(placed_on(cell.config, device), seen, factory)
             avatar.load(cell.folder / CHECKPOINT)
         yield avatar, seen
 
@@ -234,9 +240,15 @@ def _has_left(cell: Cell) -> bool:
     return work.is_dir() and any(work.iterdir())
 
 
-def _on_the_processor(config: CellConfig) -> CellConfig:
-    """The same avatar wherever it was trained: who looks at one needs no GPU."""
-    return replace(config, changes={key: value for key, value in config.changes.items() if key != "device"})
+def placed_on(config: CellConfig, device: str) -> CellConfig:
+    """The same avatar on a device, wherever it was trained: who looks at one needs no GPU.
+
+    As it is where its method is of others, or has no device to choose.
+    """
+    if not find_method(config.source).is_ours or not hasattr(offered(config.source, config.preset), "device"):
+        return config
+    elsewhere = {} if device == "cpu" else {"device": device}
+    return replace(config, changes={k: v for k, v in config.changes.items() if k != "device"} | elsewhere)
 
 
 def _make(config: CellConfig, capture: Capture, factory: Callable[..., Avatar]) -> Avatar:

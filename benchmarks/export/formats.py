@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ash.capture.dataset import Pose
+from ash.devices import CPU, moved
 from ash.files import InputError
 from ash.gaussians.gaussians import Gaussians
 from ash.protocol import Avatar, DressesMesh, PosesGaussians
@@ -54,4 +55,4 @@ def frame_bytes(avatar: Avatar, pose: Pose, *, form: str, title: str) -> bytes:
         return mesh_glb(avatar.dressed_mesh(pose))
     if not isinstance(avatar, PosesGaussians):
         raise InputError(f"{title}: has no Gaussians; expected an avatar made of them for the format {form}")
-    return GAUSSIAN_FORMATS[form].write(avatar.gaussians(pose))
+    return GAUSSIAN_FORMATS[form].write(moved(avatar.gaussians(pose), CPU))

@@ -102,7 +102,7 @@ class Actor:
         rgb = self._splat(gaussians, camera, torch.tensor(behind) / 255).rgb[0]
         if not math.isfinite(float(rgb.sum())):
             raise FloatingPointError(NOT_FINITE)
-        return rgb.mul_(255).add_(0.5).clamp_(0, 255).to(torch.uint8).numpy()
+        return rgb.mul_(255).add_(0.5).clamp_(0, 255).to(torch.uint8).cpu().numpy()
 
     def _splat(self, gaussians: Gaussians, camera: Camera, behind: torch.Tensor | None) -> Splatted:
         assert isinstance(self.avatar, PosesGaussians)
@@ -126,8 +126,10 @@ def on_colour(premultiplied: np.ndarray, colour: tuple[int, int, int]) -> np.nda
 class Cast:
     """The trained avatars of one capture; each is loaded when it is first wanted, and stays."""
 
-    def __init__(self, capture: Capture, cells: Sequence[Cell], exit_stack: ExitStack, *, trust: bool) -> None:
-        self.capture, self.trust = capture, trust
+    def __init__(
+        self, capture: Capture, cells: Sequence[Cell], exit_stack: ExitStack, *, device: str, trust: bool
+    ) -> None:
+        self.capture, self.device, self.trust = capture, device, trust
         self.cells = dict(zip(_titles(cells), cells, strict=True))
         self._stack = exit_stack
         self._actors: dict[str, Actor] = {}
@@ -141,7 +143,7 @@ class Cast:
         """The avatar of that name, loaded now if it was not before."""
         if title not in self._actors:
             cell = self.cells[title]
-            avatar = self._stack.enter_context(_loaded(cell, self.capture, trust=self.trust))
+            avatar = self._stack.enter_context(_loaded(cell, self.capture, device=self.device, trust=self.trust))
             self._actors[title] = Actor(cell, title, avatar, self.capture)
         return self._actors[title]
 
@@ -158,9 +160,9 @@ class Cast:
 
 @contextmanager
 def open_cast(
-    folder: Path, *, scene: str | None = None, methods: Sequence[str] = (), trust: bool = False
+    folder: Path, *, scene: str | None = None, methods: Sequence[str] = (), device: str = "cpu", trust: bool = False
 ) -> Iterator[Cast]:
-    """The trained avatars of a run or of a single cell, as long as the body runs.
+    """The trained avatars of a run or of a single cell on a device, as long as the body runs.
 
     Oracles are left out: they know their capture's motion only. Of a run with several captures, the first is taken,
     or that of `scene`. Avatars are loaded in this process: methods of others only where they are trusted.
@@ -182,15 +184,16 @@ def open_cast(
         raise InputError(f"method: expected one of {', '.join(known)}, got {unknown[0]!r}")
     here = [cell for cell in here if not methods or cell.config.method in methods]
     with ExitStack() as stack:
-        yield Cast(load_capture(here[0].capture_folder), here, stack, trust=trust)
+        yield Cast(load_capture(here[0].capture_folder), here, stack, device=device, trust=trust)
 
 
 @contextmanager
-def _loaded(cell: Cell, capture: Capture, *, trust: bool) -> Iterator[Avatar]:
+def _loaded(cell: Cell, capture: Capture, *, device: str, trust: bool) -> Iterator[Avatar]:
     """A cell's avatar, loaded in a folder of its own: others may look at the same cell at the same time."""
     with tempfile.TemporaryDirectory(dir=cell.folder, prefix=".shown-") as scratch:
         link_or_copy(cell.folder / CHECKPOINT, Path(scratch) / CHECKPOINT)
-        with load_avatar(replace(cell, folder=Path(scratch)), capture, trust=trust) as (avatar, _):
+        shown = replace(cell, folder=Path(scratch))
+        with load_avatar(shown, capture, device=device, trust=trust) as (avatar, _):
             yield avatar
 
 

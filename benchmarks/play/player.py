@@ -111,9 +111,10 @@ def playing(
     scene: str | None = None,
     methods: Sequence[str] = (),
     doors: DoorOptions | None = None,
+    device: str = "cpu",
     trust: bool = False,
 ) -> Iterator[PlayServer]:
-    """A player for as long as the body runs; methods of others are loaded only where they are trusted.
+    """A player for as long as the body runs; avatars draw on `device`, methods of others only where they are trusted.
 
     Raises:
         InputError: nothing to play, a motion that cannot be read, or an address that is not safe.
@@ -121,7 +122,7 @@ def playing(
     before = torch.get_num_threads()
     torch.set_num_threads(cores())
     try:
-        with open_cast(run, scene=scene, methods=methods, trust=trust) as cast:
+        with open_cast(run, scene=scene, methods=methods, device=device, trust=trust) as cast:
             cast.actor(cast.titles[0])  # A run that cannot be played says so before a browser opens.
             player = PlayServer(cast, motions, doors or DoorOptions())
             try:

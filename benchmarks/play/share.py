@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from ash.capture.dataset import Pose
+from ash.devices import CPU, moved
 from ash.files import InputError
 from ash.gaussians.gaussians import Gaussians
 from ash.harmonics import SH_C0
@@ -63,7 +64,7 @@ def clip_of(cast: Cast, act: Act, frames: Sequence[int]) -> SharedClip:
         raise InputError(f"{actor.title}: has no Gaussians; expected an avatar made of them")
     x, y, z = middle_of(cast.capture).tolist()
     return SharedClip(
-        frames=tuple(actor.avatar.gaussians(Pose(act.motion, frame)) for frame in frames),
+        frames=tuple(moved(actor.avatar.gaussians(Pose(act.motion, frame)), CPU) for frame in frames),
         fps=act.motion.fps,
         title=f"{actor.title}: {act.title}",
         dilation=actor.avatar.dilation,

@@ -72,6 +72,9 @@ def doubts(results: Sequence[CellResult]) -> tuple[str, ...]:
         timed = (r.config.method for r in results if r.timing is not None and r.timing.drawn_by == kind)
         if names := [look_of(method).title for method in dict.fromkeys(timed)]:
             found.append(f"{', '.join(names)}: {words}.")
+    for device in sorted({r.drawn_on for r in results} - {"", "cpu"}):
+        names = list(dict.fromkeys(look_of(r.config.method).title for r in results if r.drawn_on == device))
+        found.append(f"{', '.join(names)}: drawn on {device}, so that milliseconds are not those of one core.")
     for result in results:
         wall, cpu = (result.value("speed", "", f"train_{clock}_s") for clock in ("wall", "cpu"))
         if wall is None or cpu is None or abs(wall - cpu) < CLOCKS_APART_S + CLOCKS_APART * min(wall, cpu):

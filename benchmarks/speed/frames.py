@@ -5,6 +5,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -14,6 +15,7 @@ from ash.avatar import AshAvatar
 from ash.capture.dataset import Camera, Capture, Pose
 from ash.capture.formats import load_capture
 from ash.config import AshConfig
+from ash.devices import CPU, finish, moved
 from ash.files import write_json
 from ash.gaussians.splatting import Splatted, splat_naive
 from ash.gaussians.texels import place_naive, pose_naive
@@ -22,7 +24,8 @@ from ash.model import AshModel, views_of
 from ash.presets import named
 from ash.protocol import StageClock
 from ash.training.adam import Adam
-from ash.training.batches import Batch, draw_batch, load_training_images
+from ash.training.batches import Batch, draw_batch
+from ash.training.images import load_training_images
 from ash.training.losses import l1_ssim_loss, l1_ssim_loss_naive, ssim_target
 from benchmarks.speed.rows import SpeedRow, as_json, row_of
 
@@ -77,6 +80,7 @@ def speed_frame(
     timed: tuple[TimedAvatar, ...] | None = None,
     threads: tuple[int, ...] = (1, 2),
     rounds: int = 15,
+    device: torch.device = CPU,
 ) -> Iterator[list[SpeedRow] | PictureAgreement]:
     """Time frames and steps on a capture; yields results as they come. `timed`: all `subjects()` where none are given.
 
@@ -85,9 +89,10 @@ def speed_frame(
     Frames follow each other as in playback. Large presets are timed a tenth as often.
     """
     before = torch.get_num_threads()
+    threads = threads if device == CPU else (1,)  # A GPU is fed by one.
     try:
         for subject in timed or subjects():
-            config = subject.config
+            config = replace(subject.config, device=str(device))
             few = max(2, rounds // 10) if config.model.width >= 64 else rounds
             avatar = AshAvatar(replace(config, template=replace(config.template, steps=1)), capture)
             _wake(avatar)
@@ -120,7 +125,7 @@ def _wake(avatar: AshAvatar) -> None:
     assert decoders is not None
     for name, parameter in decoders.named_parameters():
         if "head" in name or name == "shapes":
-            parameter.data.copy_(0.01 * torch.randn(parameter.shape, generator=generator))
+            parameter.data.copy_(0.01 * torch.randn(parameter.shape, generator=generator, device=CPU))
 
 
 @torch.no_grad()
@@ -138,14 +143,15 @@ def _splatted_by_definition(
     model: AshModel, raw: Tensor, conditions: object, cameras: list[Camera], background: Tensor | None
 ) -> Splatted:
     gaussians = pose_naive(raw, conditions, model.config, model.light)  # type: ignore[arg-type]
-    return splat_naive(gaussians, **views_of(cameras), background=background, dilation=model.config.dilation)
+    views = {name: moved(value, gaussians.means.device) for name, value in views_of(cameras).items()}
+    return splat_naive(gaussians, **views, background=background, dilation=model.config.dilation)
 
 
 def agreement(avatar: AshAvatar, player: Player, preset: str, capture: Capture, camera: Camera) -> PictureAgreement:
     """Foreground PSNR between the image of a frame as it is played and the one by the definitions."""
     frame = capture.splits["train"].frames[-1]
     drawn = player.draw(frame, camera)
-    truth = frame_by_definition(avatar.module, capture, frame, camera).clamp(0, 1).numpy()
+    truth = frame_by_definition(avatar.module, capture, frame, camera).clamp(0, 1).cpu().numpy()
     engine = player.engine.name if player.engine else "none"
     agrees = psnr(drawn[..., :3], truth, drawn[..., 3])
     return PictureAgreement(preset=preset, gaussians=avatar.gaussian_count(), psnr_db=agrees, engine=engine)
@@ -160,6 +166,7 @@ def _time_frames(
     start = time.perf_counter()
     torch.set_num_threads(1)
     frame_by_definition(avatar.module, capture, frames[0], camera)
+    finish(avatar.device)
     naive_ms = (time.perf_counter() - start) * 1e3
     samples: dict[tuple[str, int], list[float]] = defaultdict(list)
     for number in range(rounds + 1):
@@ -175,16 +182,17 @@ def _time_frames(
                     samples[stage, count].append(clock.ms[stage])
                 samples["frame", count].append(elapsed)
     size = f"{camera.width}x{camera.height}"
-    rows = [row_of("frame", size, "forward", 1, f"{preset}-naive", [naive_ms], naive_ms)]
+    row = partial(row_of, device=avatar.device)
+    rows = [row("frame", size, "forward", 1, f"{preset}-naive", [naive_ms], naive_ms)]
     for (what, count), taken in samples.items():
-        rows.append(row_of(what, size, "forward", count, preset, taken, naive_ms if what == "frame" else math.nan))
+        rows.append(row(what, size, "forward", count, preset, taken, naive_ms if what == "frame" else math.nan))
     return rows
 
 
 def _time_steps(avatar: AshAvatar, preset: str, capture: Capture, *, rounds: int) -> list[SpeedRow]:
     """A step of training on the capture's images, with the definitions in torch and with the kernels, by turns."""
     torch.set_num_threads(1)
-    images = load_training_images(capture)
+    images = load_training_images(capture, avatar.device)
     groups = avatar.parameter_groups()
     optimisers = {name: Adam([group | {"lr": 0.0} for group in groups]) for name in ("naive", "native")}
     samples: dict[str, list[float]] = {"naive": [], "native": []}
@@ -192,8 +200,10 @@ def _time_steps(avatar: AshAvatar, preset: str, capture: Capture, *, rounds: int
         for name in ("naive", *["native"] * 5):
             batch = draw_batch(images, avatar.config.training, 0, number)
             avatar._conditions_of(batch.frame)
+            finish(avatar.device)
             start = time.perf_counter()
             _step(avatar, batch, optimisers[name], naive=name == "naive")
+            finish(avatar.device)
             if number:
                 samples[name].append((time.perf_counter() - start) * 1e3)
     camera = next(iter(images.cameras.values()))
@@ -208,6 +218,7 @@ def _time_steps(avatar: AshAvatar, preset: str, capture: Capture, *, rounds: int
             preset if name == "native" else f"{preset}-naive",
             taken,
             reference,
+            avatar.device,
         )
         for name, taken in samples.items()
     ]
@@ -243,13 +254,14 @@ def captured(folder: Path | None) -> Capture:
     return replace(load_capture(folder), store=folder.parent / "templates")
 
 
-def main(json_path: Path | None, folder: Path | None = None) -> int:
+def main(json_path: Path | None, folder: Path | None = None, device: torch.device = CPU) -> int:
     """Print the table of a capture, and write it to `json_path`; returns the exit code."""
     capture = captured(folder)
+    print(f"device {device}")
     print(f"{'what':10} {'size':9} {'pass':17} th {'by':12} {'min ms':>9} {'median ms':>9} {'naive/min':>9} {'1/s':>6}")
     rows: list[SpeedRow] = []
     agreements: list[PictureAgreement] = []
-    for result in speed_frame(capture):
+    for result in speed_frame(capture, device=device):
         if isinstance(result, PictureAgreement):
             agreements.append(result)
             about = f"{result.gaussians:,} Gaussians, decoders in {result.engine}"

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 import ash.gaussians.splatting
+from ash.devices import CPU, moved
 from ash.files import write_json
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import splat, splat_naive
@@ -57,22 +58,28 @@ class Mixture:
 
 
 def speed_kernels(
-    *, rounds: int = 3, threads: tuple[int, ...] = (1, 2)
+    *, rounds: int = 3, threads: tuple[int, ...] = (1, 2), device: torch.device = CPU
 ) -> Iterator[list[SpeedRow] | SplatDetail | Mixture]:
-    """Time splatting, loss and rasteriser, naive and native by turns; yields results as they come."""
+    """Time splatting, loss and rasteriser, naive and native by turns; yields results as they come.
+
+    On a GPU threads are of no account, and the loss is the definition.
+    """
+    threads = threads if device == CPU else (1,)
     for scene in (splat_scene("S"), splat_scene("P")):
-        yield from time_splat(scene, rounds=rounds, threads=threads)
+        yield from time_splat(moved(scene, device), rounds=rounds, threads=threads)
     for size, (height, width) in LOSS_SIZES.items():
-        yield _time_loss(size, height, width, rounds=rounds, threads=threads)
+        yield _time_loss(size, height, width, rounds=rounds, threads=threads, device=device)
     for size, pixels in (("256", 256), ("512", 512)):
-        yield _time_rasterizer(size, pixels, rounds=rounds, threads=threads)
-    yield time_mixture(rounds=10 * rounds)
+        yield _time_rasterizer(size, pixels, rounds=rounds, threads=threads, device=device)
+    if device == CPU:
+        yield time_mixture(rounds=10 * rounds)
 
 
 def time_splat(scene: SplatScene, *, rounds: int, threads: tuple[int, ...]) -> Iterator[list[SpeedRow] | SplatDetail]:
-    """Rows of forward and of forward with backward, naive and native by turns, then a detail per number of threads."""
+    """Rows of forward and of forward with backward, naive and native by turns; of the CPU a detail per thread count."""
+    device = scene.gaussians.means.device
     leaves = {name: getattr(scene.gaussians, name).clone().requires_grad_() for name in Gaussians.__slots__}
-    gradient = torch.randn(1, scene.height, scene.width, 3, generator=torch.Generator().manual_seed(1))
+    gradient = torch.randn(1, scene.height, scene.width, 3, generator=torch.Generator().manual_seed(1)).to(device)
     stages: dict[int, list[dict[str, float]]] = {count: [] for count in threads}
 
     def forward(draw: Callable[..., ash.gaussians.splatting.Splatted], **more: int) -> None:
@@ -83,12 +90,14 @@ def time_splat(scene: SplatScene, *, rounds: int, threads: tuple[int, ...]) -> I
         for leaf in leaves.values():
             leaf.grad = None
         torch.autograd.backward(draw(Gaussians(**leaves), **scene.cameras, **more).rgb, gradient)
-        if more:
+        if more and device == CPU:
             stages[more["threads"]].append(stage_ms())
 
     for pass_, run in (("forward", forward), ("forward+backward", both)):
         candidates = in_turns(partial(run, splat_naive), partial(run, splat), threads)
-        yield rows_of("splat", scene.name, pass_, time_interleaved(candidates, rounds=rounds))
+        yield rows_of("splat", scene.name, pass_, time_interleaved(candidates, rounds=rounds, device=device), device)
+    if device != CPU:
+        return
     covered, pairs = count_pairs(scene)
     for count in threads:
         minima = {stage: min(sample[stage] for sample in stages[count]) for stage in stages[count][0]}
@@ -164,10 +173,13 @@ def count_pairs(scene: SplatScene) -> tuple[float, int]:
     return covered / (scene.width * scene.height), counted
 
 
-def _time_loss(size: str, height: int, width: int, *, rounds: int, threads: tuple[int, ...]) -> list[SpeedRow]:
+def _time_loss(
+    size: str, height: int, width: int, *, rounds: int, threads: tuple[int, ...], device: torch.device
+) -> list[SpeedRow]:
     generator = torch.Generator().manual_seed(0)
     target = torch.rand(height, width, 3, generator=generator)
-    image = (target + 0.1 * torch.randn(height, width, 3, generator=generator)).requires_grad_()
+    image = (target + 0.1 * torch.randn(height, width, 3, generator=generator)).to(device).requires_grad_()
+    target = target.to(device)
     cached = ssim_target(target)
 
     def run(loss: Callable[..., Tensor], **more: int) -> None:
@@ -175,16 +187,20 @@ def _time_loss(size: str, height: int, width: int, *, rounds: int, threads: tupl
         loss(image, cached, l1_weight=0.9, ssim_weight=0.1, **more).backward()
 
     candidates = in_turns(partial(run, l1_ssim_loss_naive), partial(run, l1_ssim_loss), threads)
-    return rows_of("l1_ssim", size, "forward+backward", time_interleaved(candidates, rounds=2 * rounds))
+    times = time_interleaved(candidates, rounds=2 * rounds, device=device)
+    return rows_of("l1_ssim", size, "forward+backward", times, device)
 
 
-def _time_rasterizer(size: str, pixels: int, *, rounds: int, threads: tuple[int, ...]) -> list[SpeedRow]:
-    vertices, faces = body_mesh(pixels)
+def _time_rasterizer(
+    size: str, pixels: int, *, rounds: int, threads: tuple[int, ...], device: torch.device
+) -> list[SpeedRow]:
+    vertices, faces = moved(body_mesh(pixels), device)
     naive, native = (
         partial(draw, vertices, faces, width=pixels, height=pixels) for draw in (rasterize_mesh_naive, rasterize_mesh)
     )
     candidates = in_turns(naive, native, threads)
-    return rows_of("rasterize_mesh", size, "forward", time_interleaved(candidates, rounds=max(1, rounds // 3)))
+    times = time_interleaved(candidates, rounds=max(1, rounds // 3), device=device)
+    return rows_of("rasterize_mesh", size, "forward", times, device)
 
 
 def _print_detail(detail: SplatDetail) -> None:
@@ -199,15 +215,16 @@ def _print_detail(detail: SplatDetail) -> None:
     )
 
 
-def main(json_path: Path | None) -> int:
+def main(json_path: Path | None, device: torch.device = CPU) -> int:
     """Print the table, and write it to `json_path`; returns the exit code."""
+    print(f"device {device}")
     print(f"instruction set {instruction_set()}, FMA peak {1e-9 * fma_peak(1):.0f} GFLOP/s on one thread", end="")
     print(f" and {1e-9 * fma_peak(2):.0f} on two; torch {torch.__version__}, {torch.get_num_threads()} thread(s)")
     print(f"{'what':15} {'size':9} {'pass':17} th {'by':7} {'min ms':>10} {'median ms':>10} {'ratio':>8}")
     rows: list[SpeedRow] = []
     details: list[SplatDetail] = []
     mixtures: list[Mixture] = []
-    for result in speed_kernels():
+    for result in speed_kernels(device=device):
         if isinstance(result, SplatDetail):
             details.append(result)
             _print_detail(result)
@@ -231,6 +248,7 @@ def main(json_path: Path | None) -> int:
                 "mixtures": [vars(mixture) | {"ratio": mixture.ratio} for mixture in mixtures],
                 "peak_rss_mb": peak_mb,
                 "instruction_set": instruction_set(),
+                "device": str(device),
             },
         )
     return 0

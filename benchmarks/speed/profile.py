@@ -24,10 +24,12 @@ from ash import presets
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture
 from ash.config import TrainingConfig
+from ash.devices import CPU, finish
 from ash.files import write_json
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted
-from ash.training.batches import TrainingImages, draw_batch, load_training_images
+from ash.training.batches import draw_batch
+from ash.training.images import TrainingImages, load_training_images
 from baselines.ddc import DdcAvatar, ddc
 from benchmarks.speed.frames import captured
 
@@ -50,24 +52,30 @@ class PartTime:
 
 
 class _Parts:
-    """Seconds of the parts of the step in progress."""
+    """Seconds of the parts of the step in progress on a device."""
 
-    def __init__(self) -> None:
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
         self.spent: dict[str, float] = defaultdict(float)
         self.gradients_at: dict[str, float] = {}  # when the last gradient of what a part returned was there
         self.span: dict[str, tuple[float, float]] = {}  # of the last call
+
+    def now(self) -> float:
+        """The clock, once all that was queued is done."""
+        finish(self.device)
+        return time.perf_counter()
 
     def timed(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
         """The same function, with its time counted for the part, and the moment of its results' gradients noted."""
 
         def run(*arguments: Any, **options: Any) -> Any:
-            start = time.perf_counter()
+            start = self.now()
             result = call(*arguments, **options)
-            self.span[name] = start, time.perf_counter()
+            self.span[name] = start, self.now()
             self.spent[name] += self.span[name][1] - start
             for tensor in _tensors_in(result):
                 if tensor.requires_grad and not tensor.is_leaf:
-                    tensor.register_hook(lambda _: self.gradients_at.__setitem__(name, time.perf_counter()))
+                    tensor.register_hook(lambda _: self.gradients_at.__setitem__(name, self.now()))
             return result
 
         return run
@@ -117,11 +125,11 @@ def _profiled_steps(
         run = ash.training.loop._Run(learner, config, images, Path(folder))
         for number in range(rounds + warm):
             run.step = first + number
-            parts = _Parts()
-            start = time.perf_counter()
+            parts = _Parts(learner.device)
+            start = parts.now()
             with _watched(parts, learner, run):
                 run.advance(parts.timed("batch", draw_batch)(images, config, 0, run.step))
-            whole = time.perf_counter() - start
+            whole = parts.now() - start
             parts.split_backward()
             if number >= warm:
                 yield parts.spent | {"rest": whole - sum(parts.spent.values()), "step": whole}
@@ -145,15 +153,16 @@ def _watched(parts: _Parts, learner: AshAvatar | DdcAvatar, run: ash.training.lo
         yield
 
 
-def profiles(capture: Capture) -> Iterator[list[PartTime]]:
-    """The subjects' steps on one thread, as they learn from a capture."""
+def profiles(capture: Capture, device: torch.device = CPU) -> Iterator[list[PartTime]]:
+    """The subjects' steps on one thread and a device, as they learn from a capture."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        images = load_training_images(capture)
+        images = load_training_images(capture, device)
         for method, preset in SUBJECTS:
-            make = presets.ash if method == "ash" else ddc
-            learner: AshAvatar | DdcAvatar = make(capture, seed=0, preset=preset)
+            recipe: presets.Recipe[Any] = presets.ash if method == "ash" else ddc
+            config = replace(recipe.config(preset), device=str(device))
+            learner: AshAvatar | DdcAvatar = recipe(capture, seed=0, preset=preset, config=config)
             yield profile_step(method, learner, images, preset, rounds=ROUNDS)
     finally:
         torch.set_num_threads(before)
@@ -166,12 +175,13 @@ def print_profile(profile: list[PartTime]) -> None:
         print(f"  {row.part:16} {row.min_ms:8.2f} {row.median_ms:8.2f}", flush=True)
 
 
-def main(json_path: Path | None, folder: Path | None) -> int:
+def main(json_path: Path | None, folder: Path | None, device: torch.device = CPU) -> int:
     """Print the profiles on a capture, and write them to `json_path`; returns the exit code."""
     found = []
-    for profile in profiles(captured(folder)):
+    print(f"device {device}")
+    for profile in profiles(captured(folder), device):
         print_profile(profile)
         found += profile
     if json_path is not None:
-        write_json(json_path, {"parts": [vars(part) for part in found]})
+        write_json(json_path, {"parts": [vars(part) for part in found], "device": str(device)})
     return 0

@@ -9,6 +9,8 @@ from functools import partial
 
 import torch
 
+from ash.devices import CPU, finish
+
 
 @dataclass(frozen=True, kw_only=True)
 class SpeedRow:
@@ -45,35 +47,54 @@ def in_turns(
     ]
 
 
-def time_interleaved(candidates: list[TimedCandidate], *, rounds: int) -> dict[tuple[str, int], list[float]]:
-    """Milliseconds of every call, in rounds over all candidates: they share the machine's good and bad moments."""
+def time_interleaved(
+    candidates: list[TimedCandidate], *, rounds: int, device: torch.device = CPU
+) -> dict[tuple[str, int], list[float]]:
+    """Milliseconds of every call, in rounds over all candidates: they share the machine's good and bad moments.
+
+    A call is over when what it queued on `device` is done.
+    """
     times: dict[tuple[str, int], list[float]] = {(c.name, c.threads): [] for c in candidates}
     for candidate in candidates[1:]:
         candidate.call()
+    finish(device)
     for _ in range(rounds):
         for candidate in candidates:
             for _ in range(candidate.repeats):
                 start = time.perf_counter()
                 candidate.call()
+                finish(device)
                 times[candidate.name, candidate.threads].append(1e3 * (time.perf_counter() - start))
     return times
 
 
-def rows_of(what: str, size: str, pass_: str, times: dict[tuple[str, int], list[float]]) -> list[SpeedRow]:
+def rows_of(
+    what: str, size: str, pass_: str, times: dict[tuple[str, int], list[float]], device: torch.device = CPU
+) -> list[SpeedRow]:
     """The candidates' rows; the first candidate is the one that the ratios refer to."""
     reference = min(next(iter(times.values())))
-    return [row_of(what, size, pass_, threads, name, samples, reference) for (name, threads), samples in times.items()]
+    return [
+        row_of(what, size, pass_, threads, name, samples, reference, device)
+        for (name, threads), samples in times.items()
+    ]
 
 
 def row_of(
-    what: str, size: str, pass_: str, threads: int, candidate: str, samples: list[float], reference_ms: float
+    what: str,
+    size: str,
+    pass_: str,
+    threads: int,
+    candidate: str,
+    samples: list[float],
+    reference_ms: float,
+    device: torch.device = CPU,
 ) -> SpeedRow:
     """One candidate's row; its ratio is `reference_ms` over its minimum."""
     return SpeedRow(
         what=what,
         size=size,
         pass_=pass_,
-        device="cpu",
+        device=str(device),
         threads=threads,
         candidate=candidate,
         min_ms=min(samples),

@@ -31,6 +31,7 @@ def estimate(suite: Suite, options: RunOptions) -> str:
         lines.append(f"capture {spec.name}: {estimate_capture(described(spec)).text}")
     lines += [f"cell {cell.capture.name} · {cell.method}:{cell.preset} · seed {cell.seed}" for cell in cells]
     hours = len(cells) * suite.cell_minutes / 60
-    wall = hours / min(options.workers, max(1, len(cells)))
-    lines += ["", f"{len(cells)} cells, about {hours:.2f} core-hours, {wall:.2f} hours with {options.workers} workers"]
+    beside = options.side_by_side
+    wall = hours / min(beside, max(1, len(cells)))
+    lines += ["", f"{len(cells)} cells, about {hours:.2f} core-hours, {wall:.2f} hours with {beside} workers"]
     return "\n".join(lines)

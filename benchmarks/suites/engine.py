@@ -8,11 +8,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TypeVar
+from types import MappingProxyType
+from typing import Any, TypeVar
 
 import psutil
 
@@ -29,6 +30,7 @@ from benchmarks.cell.cells import (
     write_result,
 )
 from benchmarks.cell.process import KILLED
+from benchmarks.suites.gpus import lent_gpu
 from benchmarks.suites.progress import Progress
 
 AnyCell = TypeVar("AnyCell")
@@ -37,6 +39,8 @@ POLL_S = 0.2
 ATTEMPTS = 2  # at a cell that is killed from outside
 TAIL = 1 << 16  # bytes of a log that are looked at
 WRONG_INPUT = 2
+GPU = "GPU"  # a resource of Dask's workers
+NOTHING: Mapping[str, str] = MappingProxyType({})
 INTERRUPTIONS = (130, -signal.SIGINT, -signal.SIGTERM)  # A scheduler's wish: no result, resumed later.
 
 _children: set[subprocess.Popen[bytes]] = set()
@@ -110,8 +114,13 @@ def shard_of(cells: Sequence[AnyCell], shard: str) -> tuple[AnyCell, ...]:
     return tuple(cells[index - 1 :: count])
 
 
-def run_cells(plan: CellPlan, executor: Executor, limits: Limits, progress: Progress) -> None:
+def run_cells(
+    plan: CellPlan, executor: Executor, limits: Limits, progress: Progress, *, gpus: tuple[str, ...] = ()
+) -> None:
     """Run the plan's cells. A failed cell leaves a result that says so; the others go on.
+
+    Those that learn on CUDA each see one of `gpus`, as CUDA_VISIBLE_DEVICES names them; where none are given, what the
+    environment shows them.
 
     Raises:
         InputError: a cell found its input wrong; cells that wait are given up, results that are there stay.
@@ -123,7 +132,7 @@ def run_cells(plan: CellPlan, executor: Executor, limits: Limits, progress: Prog
     futures: dict[Future[str], Cell] = {}
     try:
         for cell in plan.todo:
-            futures[executor.submit(run_in_process, str(cell.folder), limits)] = cell
+            futures[executor.submit(run_in_process, str(cell.folder), limits, gpus)] = cell
         pending = set(futures)
         while pending:
             finished, pending = wait(pending, timeout=POLL_S, return_when=FIRST_COMPLETED)
@@ -138,7 +147,7 @@ def run_cells(plan: CellPlan, executor: Executor, limits: Limits, progress: Prog
         raise
 
 
-def run_in_process(folder: str, limits: Limits) -> str:
+def run_in_process(folder: str, limits: Limits, gpus: tuple[str, ...] = ()) -> str:
     """Run one cell in its own process, watched for time and memory. Returns the status of its result.
 
     Self-contained, so that an executor may carry it to another machine that sees the same folder.
@@ -148,7 +157,8 @@ def run_in_process(folder: str, limits: Limits) -> str:
         path.unlink(missing_ok=True)
     command = [sys.executable, "-m", "benchmarks.cell.process", str(cell.folder), "--follow-parent"]
     for _ in range(ATTEMPTS):
-        ending = watched_process(command, cell.folder / "output.log", limits)
+        with lent_gpu(gpus, cell.config) as environment:
+            ending = watched_process(command, cell.folder / "output.log", limits, environment)
         for left in ("input", "exam", "room"):  # By a method that was ended.
             shutil.rmtree(cell.folder / left, ignore_errors=True)
         if ending.interrupted:
@@ -158,14 +168,24 @@ def run_in_process(folder: str, limits: Limits) -> str:
     return _outcome(cell, ending, limits).status
 
 
-def watched_process(command: Sequence[str], log: Path, limits: Limits) -> Ending:
-    """Run a command, its output appended to `log`, until it ends or exceeds its time or memory."""
+def watched_process(
+    command: Sequence[str], log: Path, limits: Limits, environment: Mapping[str, str] = NOTHING
+) -> Ending:
+    """Run a command, its output appended to `log`, until it ends or exceeds its time or memory.
+
+    `environment`: variables besides ours.
+    """
     start = time.monotonic()
     with log.open("ab") as output, _starting:
         if _stopping.is_set():
             return Ending(exit_code=INTERRUPTIONS[0], interrupted=True)
         child = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=output, stderr=output, env=_environment(), start_new_session=True
+            command,
+            stdin=subprocess.PIPE,
+            stdout=output,
+            stderr=output,
+            env={**_environment(), **environment},
+            start_new_session=True,
         )
         _children.add(child)
     try:
@@ -186,10 +206,11 @@ def stop_children() -> None:
 
 
 @contextlib.contextmanager
-def make_executor(spec: str, *, workers: int) -> Iterator[Executor]:
+def make_executor(spec: str, *, workers: int, gpu: bool = False) -> Iterator[Executor]:
     """An executor: `local`, or a Dask scheduler's address such as `dask://host:8786`.
 
-    Locally, threads suffice, for each only waits for the process of its cell.
+    Locally, threads suffice, for each only waits for the process of its cell. `gpu`: on Dask each job takes one of the
+    resource GPU, which workers offer that were started with `--resources GPU=1`.
     """
     if spec == "local":
         executor = ThreadPoolExecutor(workers)
@@ -212,7 +233,19 @@ def make_executor(spec: str, *, workers: int) -> Iterator[Executor]:
     except (OSError, TimeoutError) as error:
         raise InputError(f"no Dask scheduler answers at {spec} ({error})") from error
     with client:
-        yield client.get_executor(retries=2, pure=False)
+        yield client.get_executor(retries=2, pure=False, **_gpu_on(client, spec) if gpu else {})
+
+
+def _gpu_on(client: Any, spec: str) -> dict[str, Any]:
+    """What a job asks of a Dask cluster to have a GPU.
+
+    Raises:
+        InputError: there are workers, and none of them has one: the job would wait for ever.
+    """
+    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    if workers and not any(worker["resources"].get(GPU) for worker in workers):
+        raise InputError(f"{spec}: expected a worker with a GPU; each is one started with --resources {GPU}=1")
+    return {"resources": {GPU: 1}}
 
 
 def _watch(child: subprocess.Popen[bytes], limits: Limits, start: float) -> Failure | None:

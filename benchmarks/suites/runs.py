@@ -47,11 +47,18 @@ class RunOptions:
 
     out: Path
     data: Path
-    workers: int
+    workers: int  # processes that make a capture
+    cells: int | None = None  # side by side; None: as many as workers
+    gpus: tuple[str, ...] = ()  # as CUDA_VISIBLE_DEVICES names them: each cell that learns on CUDA sees one
     executor: str = "local"
     shard: str | None = None
     retry_failed: bool = False
     command: str = ""
+
+    @property
+    def side_by_side(self) -> int:
+        """Cells at a time."""
+        return self.cells or self.workers
 
 
 def run_suite(suite: Suite, options: RunOptions) -> Run:
@@ -78,13 +85,14 @@ def run_missing(cells: Sequence[Cell], suite: Suite, options: RunOptions) -> Non
     """Run the cells that have no result, within the suite's limits, and show how far they are."""
     plan = plan_cells(cells, retry_failed=options.retry_failed)
     limits = Limits(seconds=suite.limit_minutes * 60, memory_mb=suite.limit_mb)
-    progress = Progress("cells", len(plan.todo), expected_s=suite.cell_minutes * 60, workers=options.workers)
+    progress = Progress("cells", len(plan.todo), expected_s=suite.cell_minutes * 60, workers=options.side_by_side)
     for reason in plan.reasons:
         progress.say(reason)
     if plan.done:
         progress.say(f"{len(plan.done)} of {len(plan.done) + len(plan.todo)} cells are there already")
-    with make_executor(options.executor, workers=options.workers) as executor:
-        run_cells(plan, executor, limits, progress)
+    gpu = any(cell.config.device != "cpu" for cell in plan.todo)
+    with make_executor(options.executor, workers=options.side_by_side, gpu=gpu) as executor:
+        run_cells(plan, executor, limits, progress, gpus=options.gpus)
     progress.close()
 
 

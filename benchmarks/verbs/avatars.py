@@ -11,6 +11,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 from ash.capture.dataset import Pose
 from ash.files import InputError, write_atomic
 from benchmarks.verbs.arguments import DONE, Count, CountIfAny, File, Names, Natural, Trust
+from benchmarks.verbs.devices import CPU, DeviceName, chosen_device
 
 Stretch = Annotated[str | None, arg(metavar="A:B")]
 
@@ -23,6 +24,7 @@ class PlayVerb:
     motion: UseAppendAction[tuple[str, ...]] = ()  # besides the capture's: walk, dance, a BVH or AMASS file; repeatable
     methods: Names = ()  # only these; default: all of the run
     scene: str | None = None  # of a run with several; default: its first
+    device: DeviceName = CPU  # where avatars draw that have a choice: cpu, cuda, cuda:1, or auto
     host: str = "127.0.0.1"  # address to listen on
     port: Natural = 0  # default: a free one
     clients: Count = 8  # browsers at a time
@@ -44,7 +46,13 @@ class PlayVerb:
         )
         require_safe(doors)
         with playing(
-            self.run, motions=self.motion, scene=self.scene, methods=self.methods, doors=doors, trust=self.trust
+            self.run,
+            motions=self.motion,
+            scene=self.scene,
+            methods=self.methods,
+            doors=doors,
+            device=chosen_device(self.device),
+            trust=self.trust,
         ) as player:
             print(f"{player.url}\nopen this address in a browser; Ctrl-C ends the player", flush=True)
             if self.expose:

@@ -13,6 +13,7 @@ from tyro.conf import FlagCreatePairsOff, Positional
 
 from ash.files import InputError
 from benchmarks.verbs.arguments import DONE, FAILED, File, Folder
+from benchmarks.verbs.devices import CPU, DeviceName, DeviceNameIfAny, chosen_device
 
 PUBLIC = (
     "ash.capture",
@@ -33,34 +34,40 @@ class SpeedVerb:
     what: Positional[Literal["kernels", "frame"]]  # kernels or frame
     profile: FlagCreatePairsOff[bool] = False  # frame: the parts of a training step, of ASH and the mesh
     capture: Folder | None = None  # frame: on this capture; default: the mannequin of the suite ci
+    device: DeviceName = CPU  # what is timed: cpu, cuda, cuda:1, or auto
     json: File | None = None  # write the rows there as well
 
     def __call__(self) -> int:
         """Measure and print."""
         if (self.profile or self.capture) and self.what != "frame":
             raise InputError(f"speed: --profile and --capture go with frame, got {self.what}")
+        from ash.devices import device_named
+
+        device = device_named(chosen_device(self.device))
         if self.profile:
             from benchmarks.speed.profile import main as profile
 
-            return profile(self.json, self.capture)
+            return profile(self.json, self.capture, device)
         if self.what == "frame":
             from benchmarks.speed.frames import main as measure_frames
 
-            return measure_frames(self.json, self.capture)
+            return measure_frames(self.json, self.capture, device)
         from benchmarks.speed.kernels import main as measure
 
-        return measure(self.json)
+        return measure(self.json, device)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorVerb:
     """What this machine has, and what follows from it."""
 
+    device: DeviceNameIfAny = None  # where training steps are timed, for five seconds; default: on a GPU that works
+
     def __call__(self) -> int:
         """Look and print."""
         from benchmarks.verbs.doctor import examine, table
 
-        findings = examine(Path())
+        findings = examine(Path(), None if self.device is None else chosen_device(self.device))
         print(table(findings))
         return DONE if all(finding.good for finding in findings) else FAILED
 

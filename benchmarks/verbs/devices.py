@@ -1,4 +1,4 @@
-"""The flag `--device` of verbs that train: which device is meant, and which rows of a suite can take it."""
+"""The flag `--device` of verbs that train or draw: which device is meant, and which rows of a suite can take it."""
 
 import sys
 from dataclasses import replace
@@ -11,23 +11,36 @@ if TYPE_CHECKING:
 
 CPU = "cpu"
 DeviceName = Annotated[str, arg(metavar="DEVICE")]
+DeviceNameIfAny = Annotated[str | None, arg(metavar="DEVICE")]
 
 
-def chosen_device(wanted: str) -> str:
+def chosen_device(wanted: str, *, here: bool = True) -> str:
     """The device that is meant: `auto` takes CUDA where everything works there, and says why where it does not.
 
+    `here`: cells run on this machine, so that it must have the device.
+
     Raises:
-        InputError: there is no such device here; says why.
+        InputError: there is no such device; says why.
     """
+    from ash.config import check_device
     from ash.devices import device_named, obstacle
 
     if wanted != "auto":
-        device_named(wanted)
+        device_named(wanted) if here else check_device(wanted)
         return wanted
     why = obstacle()
     if why:
         print(f"device: {CPU}, because {why}", file=sys.stderr)
     return CPU if why else "cuda"
+
+
+def gpus_for(device: str) -> tuple[str, ...]:
+    """The GPUs that cells on this device share out: all for `cuda`, the one that is named for `cuda:1`."""
+    from benchmarks.suites.gpus import ANY, visible_gpus
+
+    if device == CPU:
+        return ()
+    return visible_gpus() if device == ANY else (device,)
 
 
 def on_device(suite: "Suite", device: str) -> "Suite":

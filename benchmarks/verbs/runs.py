@@ -4,6 +4,7 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,13 +22,14 @@ from benchmarks.verbs.arguments import (
     changes_of,
     typed,
 )
-from benchmarks.verbs.devices import CPU, DeviceName, chosen_device, on_device
+from benchmarks.verbs.devices import CPU, DeviceName, DeviceNameIfAny, chosen_device, gpus_for, on_device
 
 if TYPE_CHECKING:
     from benchmarks.suites.runs import Run as RunOnDisk
     from benchmarks.suites.runs import RunOptions
     from benchmarks.suites.suites import SceneSpec, Suite
 
+LOCAL = "local"
 LpipsWeights = Annotated[Path | None, arg(metavar="FILE")]
 
 
@@ -41,7 +43,8 @@ class RunVerb:
     resumes if started again: `ash-bench synth tight`, `ash-bench synth loose` once, then `sbatch --array=1-20 --wrap
     'ash-bench run table --out runs/table --workers 1 --shard $SLURM_ARRAY_TASK_ID/20'`, then `ash-bench report
     runs/table`. Without a shared disk give each shard its own --out and put them together with `ash-bench merge`. On a
-    Dask cluster, `ash-bench run table --executor dask://HOST:8786`.
+    Dask cluster, `ash-bench run table --executor dask://HOST:8786`; with --device cuda, on the workers that were
+    started with `--resources GPU=1`.
     """
 
     suite: Positional[str] = "quick"  # quick, ci, table, ... or FILE.toml
@@ -55,8 +58,8 @@ class RunVerb:
     subjects: CountIfAny = None  # on captures of so many people, from subject 0 on
     out: Folder | None = None  # where results go; default: runs/SUITE
     data: Folder = Path("data")  # where captures are kept
-    workers: CountIfAny = None  # cells side by side; default: all cores
-    executor: str = "local"  # or dask://HOST:PORT, for a cluster
+    workers: CountIfAny = None  # cells side by side; default: all cores, on CUDA all GPUs
+    executor: str = LOCAL  # or dask://HOST:PORT, for a cluster
     shard: Annotated[str | None, arg(metavar="i/n")] = None  # do every n-th cell only, from the i-th; for job arrays
     lpips_weights: LpipsWeights = None  # AlexNet's, of torchvision; default: torch's cache; without them LPIPS is n/a
     retry_failed: FlagCreatePairsOff[bool] = False  # run cells again that failed before
@@ -68,13 +71,18 @@ class RunVerb:
         from benchmarks.suites.captures import require_published
         from benchmarks.suites.runs import RunOptions
 
-        suite = on_device(self._chosen(), chosen_device(self.device))
+        local = self.executor == LOCAL
+        device = chosen_device(self.device, here=local)
+        gpus = gpus_for(device) if local else ()
+        suite = on_device(self._chosen(), device)
         require_published(suite)
         _use_lpips(self.lpips_weights)
         options = RunOptions(
             out=self.out or Path("runs") / suite.name,
             data=self.data,
             workers=self.workers or cores(),
+            cells=self.workers or len(gpus) or None,
+            gpus=gpus,
             executor=self.executor,
             shard=self.shard,
             retry_failed=self.retry_failed,
@@ -258,12 +266,14 @@ class EvalVerb:
     """Render and score a run's cells again from their checkpoints."""
 
     run: Positional[Path]  # a run's folder or a cell's
+    device: DeviceNameIfAny = None  # where avatars draw that have a choice: cpu, cuda, ...; default: as they learned
 
     def __call__(self) -> int:
         """Render and score."""
         from benchmarks.cell.process import evaluate_cell
 
-        return _again(self.run, evaluate_cell)
+        device = None if self.device is None else chosen_device(self.device)
+        return _again(self.run, partial(evaluate_cell, device=device))
 
 
 @dataclass(frozen=True, kw_only=True)

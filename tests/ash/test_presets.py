@@ -16,7 +16,8 @@ from ash.presets import CHOSEN_ON, PRESETS, named
 from ash.rotations import rotate, unitquat_to_rotmat
 from ash.textures import smooth_noise
 from ash.training.adam import Adam
-from ash.training.batches import draw_batch, load_training_images
+from ash.training.batches import draw_batch
+from ash.training.images import load_training_images
 from ash.training.loop import fit, view_loss
 
 

@@ -23,7 +23,8 @@ from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.texels import pose
 from ash.rotations import RigidTransforms
 from ash.textures import Conditions
-from ash.training.batches import TrainingImages, draw_batch, load_training_images
+from ash.training.batches import draw_batch
+from ash.training.images import TrainingImages, load_training_images
 from ash.training.loop import _Run, view_loss
 from benchmarks.cell.methods import configured, find_method
 from benchmarks.suites.files import find_suite

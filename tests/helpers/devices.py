@@ -27,7 +27,8 @@ from ash.mesh.drawing import SUPERSAMPLING, Topology, _MeshView, _weights_of
 from ash.mesh.rasterizing import project_vertices
 from ash.template.graph import NeighbourMean
 from ash.training.adam import Adam
-from ash.training.batches import draw_batch, load_training_images
+from ash.training.batches import draw_batch
+from ash.training.images import load_training_images
 from ash.training.loop import view_loss
 
 META = torch.device("meta")

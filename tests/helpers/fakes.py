@@ -265,6 +265,28 @@ def stripes_of(preset: str) -> Stripes:
 tuned.config = stripes_of
 
 
+@dataclass(frozen=True, kw_only=True)
+class Placed:
+    """What a fake method offers that can choose its device."""
+
+    device: str = "cpu"
+
+
+class TellsGpus(FakeAvatar):
+    """Prints which GPUs it sees."""
+
+    def fit(self, capture: Capture, *, folder: Path) -> None:
+        super().fit(capture, folder=folder)
+        print("sees", os.environ.get("CUDA_VISIBLE_DEVICES"), flush=True)
+
+
+def placed(capture: Capture, *, seed: int, preset: str, config: Placed | None = None) -> FakeAvatar:
+    return TellsGpus(capture, detail=0.9, seed=seed)
+
+
+placed.config = lambda preset: Placed()
+
+
 def broken(failure: str):
     def make(capture: Capture, *, seed: int, preset: str) -> Broken:
         avatar = Broken(capture, detail=0.5, seed=seed)
@@ -276,7 +298,7 @@ def broken(failure: str):
 
 nan, raising, dying, sleeping, growing = (broken(failure) for failure in ("nan", "raise", "die", "sleep", "grow"))
 
-METHODS = ("good", "tuned", "bad", "nan", "raising", "dying", "sleeping", "growing")
+METHODS = ("good", "tuned", "placed", "bad", "nan", "raising", "dying", "sleeping", "growing")
 
 
 def install(folder: Path) -> Path:

@@ -7,8 +7,10 @@ from helpers.captures import write_tube_capture
 from ash.capture.dataset import fewer_views
 from ash.capture.formats import load_capture
 from ash.capture.manifest import Manifest, Split, read_manifest
+from ash.config import TrainingConfig
 from ash.files import InputError, read_json, write_json
-from ash.training.batches import load_training_images, reserved_views
+from ash.training.batches import sampled
+from ash.training.images import load_training_images, reserved_views
 
 WHOLE = Split(cameras=("a", "b"), frames=(3, 4))
 PARTS = Split(cameras=("a", "b", "c"), frames=(3, 4, 7), parts=(("a", "c"), ("b",), ("b", "c")))
@@ -74,8 +76,12 @@ def capture(tmp_path):
 
 def test_training_sees_the_pairs_and_nothing_else(capture):
     images = load_training_images(capture)
-    assert set(images.boxes) == set(capture.splits["train"].views)
-    assert images.seeing(1) == list(capture.splits["train"].seeing(1))
+    assert {(name, frame) for frame in images.frames for name in images.seeing(frame)} == set(
+        capture.splits["train"].views
+    )
+    for step in range(20):
+        drawn = sampled(images, TrainingConfig(steps=20), 0, step)
+        assert set(drawn.views) <= set(capture.splits["train"].views) - set(images.reserved)
 
 
 def test_fewer_cameras_use_their_own_pairs(capture):

@@ -16,6 +16,7 @@ from ash.template.graph import build_graph
 from ash.template.template import skinned_template
 from ash.template_learning.image_tracking import track_images
 from ash.template_learning.observing import observe, sample
+from ash.training.images import Cutout
 
 SIZE, FRAMES = 96, 6
 
@@ -97,7 +98,8 @@ def test_a_view_is_cut_out_around_the_subject_with_its_outline() -> None:
     rgba = np.zeros((64, 64, 4), np.uint8)
     rgba[..., 0], rgba[..., 3] = 200, np.round(255 * alpha)
     camera = ring_cameras(1, 64)[0]
-    view = observe(rgba, camera, (19, 23, 41, 45), blur=0.5)
+    cutout = Cutout(pixels=torch.from_numpy(rgba[23:45, 19:41].copy()), left=19, top=23)
+    view = observe(cutout, camera, blur=0.5)
     shift = camera.K[:2, 2] - view.camera.K[:2, 2]
     outline = view.outline + shift
     assert len(outline) > 60

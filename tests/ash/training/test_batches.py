@@ -10,7 +10,8 @@ from helpers.captures import tiny_preset, write_tube_capture
 
 from ash import presets
 from ash.files import InputError
-from ash.training.batches import draw_batch, load_training_images, over
+from ash.training.batches import draw_batch, over
+from ash.training.images import load_training_images
 from ash.training.loop import view_loss
 from benchmarks.cell.methods import find_method
 
@@ -22,8 +23,9 @@ def capture(tmp_path_factory):
 
 def test_where_a_mask_is_too_large_the_studio_explains_what_it_shows(capture):
     images = load_training_images(capture)
-    name, frame = capture.splits["train"].views[0]
-    plate = np.random.default_rng(0).integers(0, 255, (*images.views[name, frame].shape[:2], 3), np.uint8)
+    name, _ = capture.splits["train"].views[0]
+    size = capture.cameras[name].height, capture.cameras[name].width
+    plate = np.random.default_rng(0).integers(0, 255, (*size, 3), np.uint8)
     training = replace(presets.ci().training, background="studio", views_per_step=1)
     with pytest.raises(InputError, match="pictures of the empty studio"):
         draw_batch(images, training, 0, 0)

@@ -20,7 +20,8 @@ from ash.files import InputError
 from ash.protocol import StageClock
 from ash.training import loop, stopping
 from ash.training.adam import Adam
-from ash.training.batches import composite, composite_naive, cut_batch, draw_batch, load_training_images
+from ash.training.batches import composite, composite_naive, cut_batch, draw_batch
+from ash.training.images import load_training_images
 from ash.training.loop import Diverged, Interrupted
 
 
@@ -213,7 +214,7 @@ def test_reserved_views_are_never_trained_on(capture):
 def test_a_window_over_a_background_is_its_definition():
     rgba = np.random.default_rng(0).integers(0, 256, (30, 40, 4), np.uint8)
     rgba[:4, :, 3], rgba[4:8, :, 3] = 0, 255
-    for window in (rgba, rgba[3:20, 5:38]):
+    for window in map(torch.from_numpy, (rgba, rgba[3:20, 5:38])):
         for background in (torch.zeros(3), torch.tensor([0.2, 0.5, 0.9])):
             rgb, alpha = composite(window, background)
             expected_rgb, expected_alpha = composite_naive(window, background)

@@ -7,7 +7,7 @@ import pytest
 from ash import presets
 from ash.capture.manifest import Split
 from ash.config import TrainingConfig
-from ash.training.batches import reserved_views
+from ash.training.images import reserved_views
 from ash.training.stopping import (
     FINAL_LEARNING_RATE,
     LEAST_STEPS,

@@ -11,7 +11,7 @@ from ash.avatar import AshAvatar
 from ash.files import read_json
 from ash.inference import Player
 from ash.presets import named
-from ash.training.batches import load_training_images
+from ash.training.images import load_training_images
 from benchmarks.speed import frames, profile
 from benchmarks.speed.frames import PictureAgreement, TimedAvatar, scaled_camera, subjects
 
@@ -25,7 +25,7 @@ def test_the_table_has_every_stage_and_fast_images_agree_with_the_definitions(ca
     monkeypatch.setattr(frames, "captured", lambda folder: capture)
     subject = TimedAvatar(name="ci", config=named("ci"), width=64, height=64, trains=True)
     results = list(frames.speed_frame(capture, timed=(subject,), rounds=2))
-    monkeypatch.setattr(frames, "speed_frame", lambda capture: iter(results))
+    monkeypatch.setattr(frames, "speed_frame", lambda capture, device: iter(results))
     before = torch.get_num_threads()
     assert frames.main(tmp_path / "rows.json") == 0
     assert torch.get_num_threads() == before

@@ -53,7 +53,7 @@ def test_the_table_and_its_json_say_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     results = list(benchmarks.speed.kernels.time_splat(splat_scene("S"), rounds=1, threads=(1,)))
-    monkeypatch.setattr(benchmarks.speed.kernels, "speed_kernels", lambda: iter(results))
+    monkeypatch.setattr(benchmarks.speed.kernels, "speed_kernels", lambda device: iter(results))
     assert main(tmp_path / "speed.json") == 0
     written = read_json(tmp_path / "speed.json")
     rows = [row for result in results if isinstance(result, list) for row in result]

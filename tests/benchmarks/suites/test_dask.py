@@ -1,18 +1,23 @@
 """A real scheduler with real workers on this machine, one of which is killed in the middle of a run."""
 
 import io
+import os
 import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from helpers import fakes
+from helpers.waiting import wait_for
 
+from ash.files import InputError
 from benchmarks.cell.cells import read_result
 from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells
+from benchmarks.suites.gpus import VISIBLE
 from benchmarks.suites.progress import Progress
 from benchmarks.suites.runs import cell_for
 from benchmarks.suites.suites import CaptureSpec, CellSpec
@@ -32,7 +37,12 @@ def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[s
     processes = [subprocess.Popen([*dask, "--no-dashboard"], stdout=log, stderr=log, cwd=tmp_path)]
     worker = [sys.executable, "-m", "distributed.cli.dask_worker", f"tcp://127.0.0.1:{port}", "--nthreads", "1"]
     options = ["--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path)]
-    processes += [subprocess.Popen([*worker, *options], stdout=log, stderr=log, cwd=tmp_path) for _ in range(2)]
+    gpu = {**os.environ, VISIBLE: "7"}  # One of the two has a GPU.
+    started = [(options, None), ([*options, "--resources", "GPU=1"], gpu)]
+    processes += [
+        subprocess.Popen([*worker, *more], stdout=log, stderr=log, cwd=tmp_path, env=environment)
+        for more, environment in started
+    ]
     try:
         yield f"dask://127.0.0.1:{port}", processes[1:]
     finally:
@@ -58,6 +68,35 @@ def test_a_killed_worker_loses_no_cell(cluster, tmp_path: Path) -> None:
     assert workers[0].poll() == -signal.SIGKILL, "the worker was killed while a cell ran on it"
     assert [read_result(cell.folder).status for cell in cells] == ["done"] * 4
     assert len({read_result(cell.folder).views[0].prediction for cell in cells}) == 4, "every seed has its own result"
+
+
+def test_cells_that_learn_on_cuda_go_where_a_gpu_is(cluster, tmp_path: Path) -> None:
+    address, workers = cluster
+    capture = fakes.write_capture(tmp_path / "capture")
+    spec = CellSpec(
+        capture=CaptureSpec(scene="boxes", size="ci"),
+        method="fake_placed",
+        preset="ci",
+        seed=0,
+        changes=(("device", "cuda"),),
+    )
+    cells = [cell_for(replace(spec, seed=seed), capture, tmp_path / "run") for seed in range(2)]
+    progress = Progress("cells", 2, expected_s=1.0, workers=2, stream=io.StringIO())
+    with make_executor(address, workers=2, gpu=True) as executor:
+        run_cells(plan_cells(cells), executor, Limits(seconds=60.0, memory_mb=4096), progress)
+        for cell in cells:
+            assert "sees 7\n" in (cell.folder / "output.log").read_text()
+        workers[1].kill()
+        workers[1].wait()
+
+        def refused() -> bool:
+            try:
+                with make_executor(address, workers=2, gpu=True):
+                    return False
+            except InputError as error:
+                return "--resources GPU=1" in str(error)
+
+        wait_for(refused)
 
 
 KILL_WHEN_BUSY = """

@@ -1,19 +1,28 @@
 """The flag `--device`: what is refused, what `auto` takes, and that the device is part of a cell's identity."""
 
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
-from helpers.commands import refused
+from helpers import fakes
+from helpers.cells import cell
+from helpers.commands import refused, refused_last
 
 import ash.devices
 from ash.devices import obstacle
 from ash.files import InputError
-from benchmarks.cell.cells import CellConfig
-from benchmarks.cell.process import _on_the_processor
+from benchmarks import cli
+from benchmarks.cell.cells import CellConfig, read_cell, read_result, write_config, write_result
+from benchmarks.cell.process import placed_on
+from benchmarks.play.actors import open_cast
 from benchmarks.provenance import gpu_name
+from benchmarks.report.sentences import doubts
+from benchmarks.speed import pace, rows
 from benchmarks.suites.files import find_suite
 from benchmarks.verbs import doctor
 from benchmarks.verbs.devices import chosen_device, on_device
@@ -22,7 +31,11 @@ without_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a 
 
 
 @without_cuda
-@pytest.mark.parametrize("verb", [("run", "ci"), ("train", "ash", "a-folder")])
+@pytest.mark.parametrize(
+    "verb",
+    [("run", "ci"), ("train", "ash", "a-folder"), ("eval", "a-run"), ("play", "a-run"), ("speed", "kernels")],
+    ids=lambda verb: verb[0],
+)
 def test_a_gpu_that_is_not_there_is_one_line_and_exit_code_2(verb: tuple[str, ...], capsys) -> None:
     assert refused(capsys, *verb, "--device", "cuda").endswith(f"device cuda: {obstacle()}")
     assert "expected cpu, cuda or cuda:N, got 'gpu'" in refused(capsys, *verb, "--device", "gpu")
@@ -55,24 +68,104 @@ def test_doctor_says_what_the_gpu_can_do(monkeypatch: pytest.MonkeyPatch, tmp_pa
     finding = doctor._gpu()
     assert finding.found == "a GPU, but torch is built without CUDA" and "processor" in finding.consequence
     monkeypatch.setattr(ash.devices, "obstacle", lambda name="cuda": "")
-    assert "not measured: no GPU was at hand" in doctor._gpu().consequence
+    properties = SimpleNamespace(total_memory=24 << 30, major=8, minor=9)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: properties)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda: True)
+    assert doctor._gpu().found == "a GPU, 24 GB, compute capability 8.9, with bfloat16"
+    timed = []
+    monkeypatch.setattr(pace, "steps_per_second", lambda preset, device, seconds: timed.append((preset, device)) or 8.0)
+    training = next(finding for finding in doctor.examine(tmp_path) if finding.what == "training on cuda")
+    assert [(preset.name, str(device)) for preset, device in timed] == [("cpu", "cuda"), ("paper", "cuda")]
+    assert "paper at 1285x940 makes 8 steps per second" in training.found
+    assert training.consequence == (
+        "cpu trains for at most 1,600 steps, 0.056 hours; paper trains for at most 2,000,000 steps, 69 hours"
+    )
     monkeypatch.setattr(doctor.provenance, "gpu_name", gpu_name)
     if gpu_name() is None:
         assert doctor._gpu().found == "none"
 
 
-def test_an_avatar_is_looked_at_without_a_gpu() -> None:
-    config = CellConfig(
+def test_steps_are_timed_by_the_function_that_a_gpu_is_timed_by(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, advance = [100.0], pace.ash.training.loop._Run.advance
+
+    def counted(run: Any, batch: Any) -> None:
+        assert float(batch.foreground.mean()) > 0.1, "somebody is seen"
+        advance(run, batch)
+        now[0] += 5.0 if run.step <= pace.FIRST_STEPS else 0.25  # The first steps compile.
+
+    monkeypatch.setattr(pace, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(pace.ash.training.loop._Run, "advance", counted)
+    small = pace.PacedPreset(name="ci", width=64, height=48)
+    assert pace.steps_per_second(small, torch.device("cpu"), seconds=1.0) == pytest.approx(4.0)
+    assert now[0] == pytest.approx(100 + 3 * 5 + 4 * 0.25)
+
+
+def learned_on_cuda(method: str) -> CellConfig:
+    return CellConfig(
         scene="still",
         size="ci",
         capture_seed=0,
         capture="0" * 64,
-        method="ash",
+        method=method,
         preset="ci",
         seed=0,
         code="0",
         changes={"device": "cuda", "model.texels": 128},
     )
-    here = _on_the_processor(config)
-    assert here.changes == {"model.texels": 128}
-    assert here.key != config.key == replace(config).key
+
+
+def test_an_avatar_is_looked_at_without_a_gpu() -> None:
+    config = learned_on_cuda("ash")
+    here = placed_on(config, "cpu")
+    assert here.changes == {"model.texels": 128} and (config.device, here.device) == ("cuda", "cpu")
+    assert here.key != config.key == placed_on(config, "cuda").key
+    assert placed_on(here, "cuda:1").changes == {"device": "cuda:1", "model.texels": 128}
+
+
+def test_what_has_no_device_or_is_not_ours_stays_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fakes.use(tmp_path / "plugins", monkeypatch)
+    for method in ("nearest", "fake_good"):
+        config = learned_on_cuda(method)
+        assert placed_on(config, "cpu") is config
+
+
+@without_cuda
+def test_a_cell_that_learned_on_a_gpu_is_scored_here_where_the_cpu_is_named(
+    tube_cells: dict[str, Path], tmp_path: Path, capsys
+) -> None:
+    learned = read_cell(tube_cells["ash"])
+    config = replace(learned.config, changes=learned.config.changes | {"device": "cuda"})
+    folder = Path(shutil.copytree(learned.folder, tmp_path / config.key))
+    result = read_result(folder)
+    write_config(replace(learned, config=config, folder=folder))
+    write_result(folder, replace(result, config=config, drawn_on="cuda"))
+    assert f"device cuda: {obstacle()}" in refused_last(capsys, "eval", str(folder))
+    assert read_result(folder).drawn_on == "cuda"
+    assert cli.main(["eval", str(folder), "--device", "cpu"]) == cli.DONE
+    again = read_result(folder)
+    assert (again.drawn_on, again.config.device, result.drawn_on) == ("cpu", "cuda", "cpu")
+    assert [view.prediction for view in again.views] == [view.prediction for view in result.views]
+
+
+@without_cuda
+def test_every_avatar_that_is_played_goes_to_the_device(tube_run: Path) -> None:
+    with open_cast(tube_run, device="cuda") as cast:
+        assert len(cast.titles) == 2
+        for title in cast.titles:
+            with pytest.raises(InputError, match=r"^device cuda: "):
+                cast.actor(title)
+
+
+def test_a_report_says_which_milliseconds_are_those_of_a_gpu() -> None:
+    results = [replace(cell(method, 30.0), drawn_on=device) for method, device in (("ash", "cuda"), ("ddc", "cpu"))]
+    assert doubts(results) == ("ASH: drawn on cuda, so that milliseconds are not those of one core.",)
+
+
+def test_a_timed_call_is_over_when_the_device_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    events = []
+    monkeypatch.setattr(rows, "finish", lambda device: events.append(device.type))
+    candidate = rows.TimedCandidate(name="it", threads=1, call=lambda: events.append("call"))
+    times = rows.time_interleaved([candidate], rounds=2, device=torch.device("cuda"))
+    assert events == ["cuda", "call", "cuda", "call", "cuda"]
+    (row,) = rows.rows_of("splat", "S", "forward", times, torch.device("cuda"))
+    assert row.device == "cuda"
