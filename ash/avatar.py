@@ -1,7 +1,6 @@
 """ASH as a method of the suite: builds the model from a capture, warms it up, trains it, renders with it."""
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from ash.blendshapes import LocalBlendshapes
 from ash.capture.dataset import Camera, Capture, Pose, fewer_views
 from ash.checkpoints import contiguous_state, load_module, read_safetensors
 from ash.config import AshConfig, ModelConfig, TrainingConfig
-from ash.decoders import Decoders
+from ash.decoders import Decoders, decoding_in, decoding_precision
 from ash.devices import device_named
 from ash.files import InputError, write_atomic
 from ash.gaussians.gaussians import Gaussians
@@ -111,7 +110,7 @@ class AshAvatar:
         images = load_training_images(_seen(capture, self.config.training), self.device)
         if self.choice is not None:
             write_choice(self.choice, folder / "log.jsonl")
-        self._outcome = fit(
+        outcome = fit(
             self,
             images,
             self.config.training,
@@ -119,6 +118,7 @@ class AshAvatar:
             folder=folder,
             before_start=lambda: self._warm_up(images),
         )
+        self._outcome = replace(outcome, precision=self._precision)
         self.template.forget()
 
     def parameter_groups(self) -> list[dict[str, Any]]:
@@ -169,9 +169,12 @@ class AshAvatar:
 
     def _decode(self, conditions: Conditions) -> Tensor:
         """Stage 3 as it learns, in the precision of the configuration."""
-        half = self.config.training.precision == "bfloat16"
-        with torch.autocast(self.device.type, torch.bfloat16) if half else nullcontext():
+        with decoding_in(self._precision, self.device):
             return self.module.decode(conditions).float()
+
+    @property
+    def _precision(self) -> str:
+        return decoding_precision(self.config.training.precision, self.device, self.config.model.width)
 
     def _conditions_of(self, frame: int) -> Conditions:
         if self.module.refinement is None:

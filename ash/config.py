@@ -114,7 +114,8 @@ class TrainingConfig:
     background: str = "random"
     schedule: str = "open"  # learning rates fall once a plateau or a limit is near; "constant": never, as released
     crop: bool = True  # draw only around the subject; the release draws whole frames
-    precision: str = "float32"  # of the decoders while they learn; "bfloat16": autocast
+    # of the decoders while they learn; "bfloat16": autocast on a GPU, convolutions on a CPU that has tiles for it (AMX)
+    precision: str = "float32"
     ema: float = 0.0  # decay of an average of the weights, which is then the result; 0: none
     texture_noise: float = 0.0  # in the standardised motion-aware textures while decoders learn; not in the paper
     camera_share: float = 1.0  # of the training cameras, evenly spread

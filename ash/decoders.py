@@ -1,6 +1,7 @@
 """Stg.3: from motion-aware textures to the canonical texel Gaussians' raw parameters (ASH Eq. 6 and 7)."""
 
 from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
 from itertools import pairwise
 from typing import cast
 
@@ -8,6 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+import ash.native.library
 import ash.native.unet
 from ash.config import ModelConfig
 from ash.gaussians.gaussians import GEOMETRY_CHANNELS, raw_channels
@@ -15,6 +17,7 @@ from ash.textures import Conditions, TexelLattice
 
 GLOBAL_FEATURES = 16
 OCTAVES = 6
+TILED_CHANNELS = 16  # of which the native bfloat16 kernels take whole multiples
 NATIVE_CHANNELS = 256  # at the bottleneck: beyond, a layer's weights no longer fit the caches, and torch is faster
 
 
@@ -63,7 +66,8 @@ class UNet(nn.Module):
     ) -> Float[Tensor, "b o h w"]:
         """Map a texture to a texture; `features` are broadcast over the bottleneck.
 
-        `forward_naive` is the definition; a single float32 image on the CPU goes through native kernels.
+        `forward_naive` is the definition; a single float32 image on the CPU goes through native kernels. Under torch's
+        autocast these round the factors of their 3x3 convolutions to bfloat16, where the machine has tiles for it.
         """
         if not self._takes_natively(texture):
             return self.forward_naive(texture, features)
@@ -94,7 +98,9 @@ class UNet(nn.Module):
             self.head.in_channels,
             len(self.down),
             self.bottleneck_features,
+            torch.is_autocast_enabled("cpu"),
         )
+        features = None if features is None else features.float()
         return ash.native.unet.unet(shape, texture[0], features, self._layers(), torch.get_num_threads(), picks)
 
     def _takes_natively(self, texture: Tensor) -> bool:
@@ -102,8 +108,12 @@ class UNet(nn.Module):
         whole = len(texture) == 1 and levels > 0 and not any(size % 2**levels for size in texture.shape[2:])
         small = self.head.in_channels * 2**levels <= NATIVE_CHANNELS
         of_its_kind = texture.dtype == self.head.weight.dtype == torch.float32 and texture.device.type == "cpu"
-        as_it_is = not (texture.requires_grad or torch.jit.is_tracing() or torch.is_autocast_enabled("cpu"))
-        return self.plain and whole and small and of_its_kind and as_it_is
+        as_it_is = not (texture.requires_grad or torch.jit.is_tracing())
+        known = not torch.is_autocast_enabled("cpu") or self._takes_tiles()
+        return self.plain and whole and small and of_its_kind and as_it_is and known
+
+    def _takes_tiles(self) -> bool:
+        return self.head.in_channels % TILED_CHANNELS == 0 and ash.native.library.has_tiles()
 
     def _layers(self) -> list[tuple[Tensor, Tensor]]:
         """Weights and bias of every layer: the blocks down, then each way up and its block, then the head."""
@@ -140,6 +150,20 @@ def _keep_variance(layer: nn.Module) -> None:
         nn.init.normal_(layer.weight, std=layer.in_channels**-0.5)
     if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d) and layer.bias is not None:
         nn.init.zeros_(layer.bias)
+
+
+def decoding_precision(wanted: str, device: torch.device, width: int) -> str:
+    """The precision in which U-Nets of a width decode: bfloat16 if it is wanted, and pays here.
+
+    On the CPU it pays where the processor has tiles for it (AMX); elsewhere it would be slower than float32.
+    """
+    pays = device.type != "cpu" or (width % TILED_CHANNELS == 0 and ash.native.library.has_tiles())
+    return wanted if pays else "float32"
+
+
+def decoding_in(precision: str, device: torch.device) -> AbstractContextManager[object]:
+    """The context in which U-Nets decode in a precision of `decoding_precision`."""
+    return torch.autocast(device.type, torch.bfloat16) if precision == "bfloat16" else nullcontext()
 
 
 class GlobalFeatures(nn.Module):

@@ -151,6 +151,7 @@ class TrainingOutcome:
     correction_spread: float | None = None  # of what decoders add, between frames, rms; None: there are no decoders
     cameras: int = 0  # that training saw; 0: unknown
     frames: int = 0
+    precision: str = "float32"  # in which the decoders learned, whatever was wished for
 
     @property
     def carries_nothing(self) -> bool:

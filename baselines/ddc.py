@@ -21,7 +21,7 @@ import ash.native.shading
 from ash.capture.dataset import Camera, Capture, Pose, TemplateMesh
 from ash.checkpoints import contiguous_state, load_module, read_safetensors
 from ash.config import AshConfig, AtlasConfig, TemplateConfig, TrainingConfig, check_device, one_of
-from ash.decoders import GLOBAL_FEATURES, GlobalFeatures, UNet
+from ash.decoders import GLOBAL_FEATURES, GlobalFeatures, UNet, decoding_in, decoding_precision
 from ash.devices import CPU, MovingModule, device_named, moved
 from ash.files import InputError, write_atomic
 from ash.gaussians.initialising import initial_texture
@@ -240,7 +240,8 @@ class DdcAvatar:
         images = load_training_images(capture, self.device)
         if self.choice is not None:
             write_choice(self.choice, folder / "log.jsonl")
-        self._outcome = fit(self, images, self.config.training, seed=self.config.seed, folder=folder)
+        outcome = fit(self, images, self.config.training, seed=self.config.seed, folder=folder)
+        self._outcome = replace(outcome, precision=self._precision)
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Networks, and what is learned directly: texture, light, a displacement of the vertices; as ASH has it."""
@@ -295,7 +296,12 @@ class DdcAvatar:
             return self.module.texture
         conditions = self._conditions[frame]
         noisy = unsettled(conditions.textures, training.texture_noise, seed=self.config.seed, step=step)
-        return self.module.corrected_texture(replace(conditions, textures=noisy))
+        with decoding_in(self._precision, self.device):
+            return self.module.corrected_texture(replace(conditions, textures=noisy)).float()
+
+    @property
+    def _precision(self) -> str:
+        return decoding_precision(self.config.training.precision, self.device, self.config.model.width)
 
     @torch.no_grad()
     def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:

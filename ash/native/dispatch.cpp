@@ -10,7 +10,14 @@
 
 #include <pthread.h>
 
+#if defined(ASH_TILES) && defined(__linux__)
+#include <cpuid.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+#endif
+
 #include "team.h"
+#include "tiles.h"
 
 namespace ash {
 
@@ -40,12 +47,30 @@ const Kernels& kernels() {
     return *now;
 }
 
+#if defined(ASH_TILES) && defined(__linux__)
+// Tiles are state that Linux hands out to those who ask.
+static bool grants_tiles() {
+    constexpr unsigned BF16_VECTORS = 1u << 5, BF16_TILES = 1u << 22, TILES = 1u << 24;
+    constexpr long REQUEST = 0x1023, TILE_DATA = 18;
+    unsigned a, b, c, d;
+    if (!runs(&avx512_kernels) || !__get_cpuid_count(7, 0, &a, &b, &c, &d) || (~d & (BF16_TILES | TILES))) return false;
+    if (!__get_cpuid_count(7, 1, &a, &b, &c, &d) || !(a & BF16_VECTORS)) return false;
+    return syscall(SYS_arch_prctl, REQUEST, TILE_DATA) == 0;
+}
+const TileKernels* tiles() {
+    static const TileKernels* const found = grants_tiles() ? &amx_kernels : nullptr;
+    return found;
+}
+#else
+const TileKernels* tiles() { return nullptr; }
+#endif
+
 }  // namespace ash
 
 extern "C" {
 
 // Changes whenever a function below or its arguments change; ash/native/library.py holds the same number.
-int ash_abi_version() { return 7; }
+int ash_abi_version() { return 8; }
 
 // The address of GOMP_parallel in the OpenMP runtime whose threads all calls shall use; null: threads of their own.
 void ash_use_team(void* parallel) {
@@ -54,6 +79,9 @@ void ash_use_team(void* parallel) {
     (void)once;
     ash::parallel_of_torch.store(reinterpret_cast<ash::Parallel>(parallel));
 }
+
+// Whether convolutions can be done in bfloat16, see tiles.h.
+int ash_has_tiles() { return ash::tiles() != nullptr; }
 
 const char* ash_instruction_set() { return ash::kernels().name; }
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ash.files import InputError
 
-ABI_VERSION = 7  # of ash/native/dispatch.cpp
+ABI_VERSION = 8  # of ash/native/dispatch.cpp
 LIBRARY_NAME = "libash_native" + (".dylib" if sys.platform == "darwin" else ".so")
 
 _P = c_void_p  # the address of a tensor's numbers
@@ -23,6 +23,7 @@ _SHADE = [_P, c_int, c_int, _P, _P, _P, c_int64, _P, _P, _P, _P]
 _SIGNATURES: dict[str, tuple[type | None, list[type]]] = {
     "ash_abi_version": (c_int, []),
     "ash_use_team": (None, [_P]),
+    "ash_has_tiles": (c_int, []),
     "ash_instruction_set": (c_char_p, []),
     "ash_use_instruction_set": (c_int, [c_char_p]),
     "ash_fma_peak": (c_double, [c_int]),
@@ -124,6 +125,11 @@ def check_memory(status: int) -> None:
 def instruction_set() -> str:
     """The instruction set in use: avx512, avx2 or plain."""
     return load().ash_instruction_set().decode()
+
+
+def has_tiles() -> bool:
+    """Whether this machine convolves in bfloat16 (AMX): much faster than in float32."""
+    return bool(load().ash_has_tiles())
 
 
 def use_instruction_set(name: str) -> bool:

@@ -16,7 +16,7 @@ namespace {
 // Planes one after the other; measured first, then given memory.
 struct Arena {
     std::unique_ptr<float[]> memory;
-    int64_t used = 0;
+    int64_t used = 0;  // floats
     Plane plane(int height, int width, int channels) {
         const int64_t before = used;
         used += (int64_t(height + 2) * (width + 2) * channels + 15) / 16 * 16;
@@ -32,7 +32,7 @@ struct Arena {
 };
 
 struct Shape {  // of the network; as the caller gives it
-    int height, width, inputs, outputs, channels, levels, features;
+    int height, width, inputs, outputs, channels, levels, features, halves;
     bool operator==(const Shape& o) const { return !std::memcmp(this, &o, sizeof o); }
 };
 
@@ -47,7 +47,7 @@ struct Network {
     Arena arena;
     Plane input;
     std::vector<Level> levels;
-    float* packed = nullptr;
+    Room room;
 
     explicit Network(const Shape& s) : shape(s), levels(s.levels + 1) {
         lay_out();
@@ -58,6 +58,23 @@ struct Network {
     }
 
     int channels(int level) const { return shape.channels << level; }
+
+    // Room for the halves of every 3x3 convolution.
+    void lay_out_halves() {
+        int64_t plane = 0, weights = 0, turned = 0, pairs = 0;
+        auto convolution = [&](int level, int from, int to) {
+            const int h = shape.height >> level, w = shape.width >> level;
+            plane = std::max({plane, tiles()->plane_size(h, w, from), tiles()->plane_size(h, w, to)});
+            weights = std::max(weights, tiles()->weights_size(to, from));
+            turned = std::max(turned, tiles()->turned_size(h, w, to)), pairs = std::max(pairs, tiles()->pairs_size(h, w, from));
+        };
+        for (int l = 0; l <= shape.levels; ++l) {
+            convolution(l, l ? channels(l - 1) : shape.inputs, channels(l));
+            convolution(l, 2 * channels(l), channels(l));
+        }
+        auto halves = [&](int64_t count) { return reinterpret_cast<Half*>(arena.numbers((count + 1) / 2)); };
+        room.plane = halves(plane), room.weights = halves(weights), room.turned = halves(turned), room.pairs = halves(pairs);
+    }
 
     void lay_out() {
         input = arena.plane(shape.height, shape.width, shape.inputs);
@@ -74,16 +91,18 @@ struct Network {
             widest = std::max(widest, int64_t(9) * (joined + 16) * (c + 16) * 2);
         }
         widest = std::max(widest, int64_t(9) * (shape.inputs + 16) * (shape.channels + 16));
-        packed = arena.numbers(widest);
+        room.packed = arena.numbers(widest);
+        room.halves = shape.halves != 0;
+        if (room.halves) lay_out_halves();
     }
 };
 
 // Two convolutions, the gradient of whose result is in `at.grad`; that of the input goes to `to`, if it is wanted.
-void backward_block(const Layer* layers, const Level& at, const Plane& in, const Plane& middle, const Plane* to, float* packed, int threads) {
-    backward_weights(layers[1], at.grad, middle, threads);
-    backward_input(layers[1], at.grad, at.grad_middle, &middle, packed, threads);
-    backward_weights(layers[0], at.grad_middle, in, threads);
-    if (to) backward_input(layers[0], at.grad_middle, *to, nullptr, packed, threads);
+void backward_block(const Layer* layers, const Level& at, const Plane& in, const Plane& middle, const Plane* to, const Room& room, int threads) {
+    backward_weights(layers[1], at.grad, middle, room, threads);
+    backward_input(layers[1], at.grad, at.grad_middle, &middle, room, threads);
+    backward_weights(layers[0], at.grad_middle, in, room, threads);
+    if (to) backward_input(layers[0], at.grad_middle, *to, nullptr, room, threads);
 }
 
 std::mutex free_mutex;
@@ -141,7 +160,7 @@ void backward_head(const Network& n, const Layer& head, const Plane& last, const
     const int lines = picked.picks ? std::max(1, std::min(height, 256 / width)) : height;  // as many as `correlate` takes at once
     std::vector<float> spread(picked.picks ? lines * line : 0), sums(outputs);
     const Plane& to = n.levels[0].grad;
-    kernels().pack({head.weights, last.channels, 1, outputs, 1, 0, last.channels, n.packed});
+    kernels().pack({head.weights, last.channels, 1, outputs, 1, 0, last.channels, n.room.packed});
     std::fill(head.grad_bias, head.grad_bias + outputs, 0.0f);
     for (int y = 0; y < height; y += lines) {
         const int count = std::min(lines, height - y);
@@ -156,7 +175,7 @@ void backward_head(const Network& n, const Layer& head, const Plane& last, const
         sum_pixels(here, line, outputs, count, width, outputs, sums.data());
         for (int c = 0; c < outputs; ++c) head.grad_bias[c] += sums[c];
         Product product{};
-        product.a_step = outputs, product.b = n.packed, product.c_step = to.step;
+        product.a_step = outputs, product.b = n.room.packed, product.c_step = to.step;
         product.active = last.at(y), product.active_step = last.step;
         const Plane part_of_it{to.at(y), count, width, to.channels, to.step};
         convolve(product, {1, {0}}, outputs, part_of_it, threads, [&](int i) { return here + i * line; });
@@ -167,7 +186,8 @@ void backward_head(const Network& n, const Layer& head, const Plane& last, const
 
 extern "C" {
 
-// shape: height, width, inputs, outputs, channels of the first level, levels, features at the bottleneck. texture: [inputs, h, w] with
+// shape: height, width, inputs, outputs, channels of the first level, levels, features at the bottleneck, and whether 3x3 convolutions
+// are done in bfloat16 on tiles, which takes widths of whole 16s. texture: [inputs, h, w] with
 // the given strides. weights: of every layer, in the order of `Layers`, weights and bias. out: [h, w, outputs], or, where `picks` are
 // given, only the picked of its parts. Returns what ash_unet_backward needs, or null if memory is short.
 void* ash_unet(const int* numbers, const float* texture, const int64_t* strides, const float* features, const float* const* weights,
@@ -185,8 +205,8 @@ void* ash_unet(const int* numbers, const float* texture, const int64_t* strides,
     for (int l = 0; l <= bottom; ++l) {
         Level& at = n.levels[l];
         if (l) pool(n.levels[l - 1].skip, at.pooled, threads);
-        forward(layers.down(l)[0], l ? at.pooled : n.input, at.middle, n.packed, threads);
-        forward(layers.down(l)[1], at.middle, at.skip, n.packed, threads);
+        forward(layers.down(l)[0], l ? at.pooled : n.input, at.middle, n.room, threads);
+        forward(layers.down(l)[1], at.middle, at.skip, n.room, threads);
     }
     const Level& lowest = n.levels[bottom];
     for (int y = 0; y < lowest.joined.height && shape.features; ++y)
@@ -194,18 +214,18 @@ void* ash_unet(const int* numbers, const float* texture, const int64_t* strides,
             std::copy(features, features + shape.features, lowest.joined.at(y, x) + n.channels(bottom));
     for (int l = bottom - 1; l >= 0; --l) {
         Level& at = n.levels[l];
-        forward_up(layers.up(l), l + 1 == bottom ? lowest.joined : n.levels[l + 1].merged, at.up, n.packed, threads);
-        forward(layers.merge(l)[0], at.joined, at.merged_middle, n.packed, threads);
-        forward(layers.merge(l)[1], at.merged_middle, at.merged, n.packed, threads);
+        forward_up(layers.up(l), l + 1 == bottom ? lowest.joined : n.levels[l + 1].merged, at.up, n.room.packed, threads);
+        forward(layers.merge(l)[0], at.joined, at.merged_middle, n.room, threads);
+        forward(layers.merge(l)[1], at.merged_middle, at.merged, n.room, threads);
     }
     const Plane& last = bottom ? n.levels[0].merged : n.levels[0].joined;
     const int64_t zero[1] = {0};
-    kernels().pack({layers.head().weights, shape.outputs, 1, last.channels, last.channels, 0, 1, n.packed});
+    kernels().pack({layers.head().weights, shape.outputs, 1, last.channels, last.channels, 0, 1, n.room.packed});
     const Picks picked{picks, lines, part};
     in_bands(threads, shape.height, [&](int y) {
         Product product{};
         product.a = last.at(y), product.a_step = last.step, product.a_inner = 1;
-        product.b = n.packed, product.b_inner = PRODUCT_COLUMNS, product.b_block = int64_t(last.channels) * PRODUCT_COLUMNS;
+        product.b = n.room.packed, product.b_inner = PRODUCT_COLUMNS, product.b_block = int64_t(last.channels) * PRODUCT_COLUMNS;
         product.a_at = product.b_at = zero, product.segments = 1, product.steps = last.channels;
         product.rows = shape.width, product.columns = shape.outputs, product.start = layers.head().bias;
         std::vector<float> line(picks ? shape.width * shape.outputs : 0);
@@ -231,26 +251,26 @@ int ash_unet_backward(void* handle, const float* grad, const float* const* weigh
     backward_head(n, head, last, grad, {picks, lines, part}, threads);
     for (int l = 0; l < bottom; ++l) {
         Level &at = n.levels[l], &below = n.levels[l + 1];
-        backward_block(layers.merge(l), at, at.joined, at.merged_middle, &at.grad_joined, n.packed, threads);
+        backward_block(layers.merge(l), at, at.joined, at.merged_middle, &at.grad_joined, n.room, threads);
         const Plane grad_up = at.grad_joined.part(0, n.channels(l));
         const bool lowest = l + 1 == bottom;
         const Plane& in = lowest ? below.joined : below.merged;
         backward_up_weights(layers.up(l), grad_up, in, threads);
         const Plane active = lowest ? below.skip : below.merged;
-        backward_up_input(layers.up(l), grad_up, 0, below.grad, &active, n.packed, threads);
+        backward_up_input(layers.up(l), grad_up, 0, below.grad, &active, n.room.packed, threads);
         if (!lowest || !shape.features) continue;
         const Plane of_features = below.grad_joined.part(0, shape.features);  // that gradient is needed nowhere else
-        backward_up_input(layers.up(l), grad_up, n.channels(bottom), of_features, nullptr, n.packed, threads);
+        backward_up_input(layers.up(l), grad_up, n.channels(bottom), of_features, nullptr, n.room.packed, threads);
         sum_pixels(of_features.first, of_features.row(), of_features.step, of_features.height, of_features.width, shape.features,
                    grad_features);
     }
     for (int l = bottom; l > 0; --l) {
         Level &at = n.levels[l], &above = n.levels[l - 1];
-        backward_block(layers.down(l), at, at.pooled, at.middle, &at.grad_pooled, n.packed, threads);
+        backward_block(layers.down(l), at, at.pooled, at.middle, &at.grad_pooled, n.room, threads);
         backward_pool(above.skip, at.pooled, at.grad_pooled, above.grad_joined.part(n.channels(l - 1), n.channels(l - 1)), above.grad,
                       threads);
     }
-    backward_block(layers.down(0), n.levels[0], n.input, n.levels[0].middle, nullptr, n.packed, threads);
+    backward_block(layers.down(0), n.levels[0], n.input, n.levels[0].middle, nullptr, n.room, threads);
     return 0;
 } catch (const std::bad_alloc&) {
     return 1;

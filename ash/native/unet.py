@@ -22,6 +22,7 @@ class UNetShape(NamedTuple):
     channels: int  # of the first level
     levels: int
     features: int  # beside the bottleneck
+    bfloat16: bool = False  # in the factors of 3x3 convolutions; needs tiles, and channels in whole 16s
 
 
 class Picks(NamedTuple):
