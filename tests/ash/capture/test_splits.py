@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from helpers.captures import write_tube_capture
 
+from ash import presets
 from ash.capture.dataset import fewer_views
 from ash.capture.formats import load_capture
 from ash.capture.manifest import Manifest, Split, read_manifest
-from ash.config import TrainingConfig
 from ash.files import InputError, read_json, write_json
 from ash.training.batches import sampled
 from ash.training.images import load_training_images, reserved_views
@@ -80,7 +80,7 @@ def test_training_sees_the_pairs_and_nothing_else(capture):
         capture.splits["train"].views
     )
     for step in range(20):
-        drawn = sampled(images, TrainingConfig(steps=20), 0, step)
+        drawn = sampled(images, presets.ci().training, 0, step)
         assert set(drawn.views) <= set(capture.splits["train"].views) - set(images.reserved)
 
 
