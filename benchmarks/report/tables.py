@@ -77,6 +77,10 @@ def plain(table: Table) -> str:
     units = ["", *(f"{column.unit} {column.arrow}".strip() for column in table.columns)]
     rows = [[row.name, *(e.whole + ("*" if e.mark == "best" else " ") for e in row.entries)] for row in table.rows]
     widths = [max(len(line[i]) for line in (heads, units, *rows)) for i in range(len(heads))]
+    first = 1
+    for group, span in table.groups:  # A group's title may be wider than its columns.
+        widths[first] += max(0, len(group) - sum(widths[first : first + span]) - 2 * (span - 1))
+        first += span
     lines = [
         "  ".join([line[0].ljust(widths[0]), *(text.rjust(w) for text, w in zip(line[1:], widths[1:], strict=True))])
         for line in (heads, units, *rows)
