@@ -328,8 +328,7 @@ class DdcAvatar:
     def dressed_mesh(self, pose: Pose) -> DressedMesh:
         """The posed mesh with the texture of the frame, lit as at the texels' normals."""
         posed, texture = moved(self.dress(pose, StageClock()), CPU)
-        lit = texture * self._gain(posed)
-        mesh = self.template.mesh
+        lit, mesh = texture * self._gain(posed), self.template.mesh
         return DressedMesh(
             vertices=posed.vertices.numpy(),
             normals=posed.normals.numpy(),

@@ -8,6 +8,9 @@ from ash.files import InputError
 from synth.scene import Scene
 from synth.views import splits
 
+VERTICES = {"anny": 28_043, "mannequin": 9_140}  # of the surface, dressed with a skirt
+LEAST_MEMORY = 10**9  # of the renderer, the body and its texture
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Estimate:
@@ -15,14 +18,16 @@ class Estimate:
 
     images: int
     core_seconds: float
-    bytes: int
+    bytes: int  # on disk
+    memory: int  # bytes, at its largest: while the surface of every frame is there
 
     @property
     def text(self) -> str:
         """One line for the user."""
         hours = self.core_seconds / 3600
         time = f"{hours:.1f} core-hours" if hours >= 1 else f"{self.core_seconds / 60:.1f} core-minutes"
-        return f"{self.images} images, about {time}, {self.bytes / 1e9:.2f} GB"
+        room = f"{self.bytes / 1e9:.2f} GB on disk, {self.memory / 1e9:.1f} GB of memory"
+        return f"{self.images} images, about {time}, {room}"
 
 
 def estimate(scene: Scene) -> Estimate:
@@ -34,7 +39,9 @@ def estimate(scene: Scene) -> Estimate:
     per_image = 0.07 + 1.6e-7 * pixels * scene.samples * longer
     fixed = (40.0 if scene.body == "anny" else 6.0) + 0.25 * scene.frames + 0.5 * training * (scene.scanner.rms_mm > 0)
     size = int(images * pixels * 1.1 + scene.frames * 1.2e6 + 3 * scene.texture**2)
-    return Estimate(images=images, core_seconds=fixed + images * per_image, bytes=size)
+    # Of each vertex the simulated place, the stored one, and the one that cameras are aimed at: 24, 12 and 24 bytes.
+    memory = LEAST_MEMORY + 60 * VERTICES[scene.body] * scene.frames
+    return Estimate(images=images, core_seconds=fixed + images * per_image, bytes=size, memory=memory)
 
 
 def require_space(scene: Scene, folder: Path) -> None:

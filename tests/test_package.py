@@ -139,6 +139,15 @@ def test_constraints_hold_every_package_to_one_version() -> None:
     assert all(re.fullmatch(r"[0-9][0-9A-Za-z.]*", version) for version in pinned.values()), "expected plain versions"
 
 
+def test_the_constraints_for_cuda_hold_the_same_torch_and_name_no_place() -> None:
+    lines = (ROOT / "constraints-cuda.txt").read_text().splitlines()
+    pinned = dict(line.split("==") for line in lines if not line.startswith("#"))
+    common = pinned.keys() & constraints().keys()
+    assert {name: pinned[name] for name in common} == {name: constraints()[name] for name in common}
+    assert "torch" in common and {"triton", "nvidia-cudnn-cu13", "cuda-toolkit"} <= pinned.keys()
+    assert not [line for line in lines if "://" in line or line.startswith("-")]
+
+
 def test_the_hashed_constraints_hold_the_same_versions() -> None:
     text = (ROOT / "constraints-linux-x86_64-cp311.txt").read_text()
     found = re.findall(r"^(\S+)==(\S+) \\\n((?:    --hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)", text, re.MULTILINE)

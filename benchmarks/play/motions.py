@@ -90,10 +90,14 @@ def _made(capture: Capture, name: str) -> Act:
     clip = Clip(generator=name, frames=frames)
     motion = make_motion(capture.skeleton, (clip,), fps=capture.motion.fps, seed=MADE_SEED)
 <<<<<<< ours
+<<<<<<< ours
     return Act(name=name, title=name.capitalize(), motion=motion, frames=tuple(range(frames)), captured=False)
 =======
     title = name.replace("_", " ").capitalize()
     return Act(name=name, title=title, motion=motion, frames=tuple(range(frames)), captured=False)
+>>>>>>> theirs
+=======
+    return Act(name=name, title=name.capitalize(), motion=motion, frames=tuple(range(frames)), captured=False)
 >>>>>>> theirs
 
 

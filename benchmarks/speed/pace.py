@@ -23,7 +23,7 @@ from ash.devices import finish
 from ash.files import write_image
 from ash.mesh.rasterizing import project_vertices, rasterize_mesh
 from ash.presets import named
-from ash.template.template import skinned_template
+from ash.template.template import RestDeformation, Template
 from ash.training.batches import draw_batch
 from ash.training.images import load_training_images
 from synth.camera.rig import make_cameras
@@ -72,22 +72,22 @@ def steps_per_second(preset: PacedPreset, device: torch.device, *, seconds: floa
 def stand_in(folder: Path, width: int, height: int) -> Capture:
     """A capture of a walking mannequin whose images are flat silhouettes."""
     body = mannequin(skirt=True)
+    mesh = body.template()
     motion = make_motion(body.skeleton, (Clip(generator="walk", frames=FRAMES),), fps=FPS, seed=0)
+    template = Template(mesh, body.skeleton, RestDeformation(mesh))
+    posed = [template.pose(Pose(motion, frame)).vertices for frame in range(FRAMES)]
     write_skeleton(folder / "skeleton.json", body.skeleton)
-    write_template(folder / "template.npz", body.template())
+    write_template(folder / "template.npz", mesh)
     write_motion(folder / "motion.npz", motion)
     rig = Rig(cameras=CAMERAS, held_out=1, width=width, height=height)
-    cameras = make_cameras(rig, body.surface.vertices)
+    cameras = make_cameras(rig, torch.cat(posed).double().numpy())
     write_cameras(folder / "cameras.json", cameras)
     split = Split(cameras=tuple(camera.name for camera in cameras), frames=tuple(range(FRAMES)))
     Manifest(scene="mannequin", seed=0, splits={"train": split}, files={}).write(folder)
-    capture = load_capture(folder)
-    template = skinned_template(capture)
-    for frame in split.frames:
-        posed = template.pose(Pose(motion, frame)).vertices
+    for frame, vertices in enumerate(posed):
         for camera in cameras:
-            write_image(image_path(folder, camera.name, frame), _silhouette(posed, template.faces, camera))
-    return capture
+            write_image(image_path(folder, camera.name, frame), _silhouette(vertices, template.faces, camera))
+    return load_capture(folder)
 
 
 def _silhouette(vertices: torch.Tensor, faces: torch.Tensor, camera: Camera) -> np.ndarray:

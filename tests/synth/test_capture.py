@@ -21,7 +21,7 @@ from ash.files import InputError, read_arrays, sha256_of
 from synth import cost, presets
 from synth.camera import render
 from synth.camera.render import find_libllvm, llvm_version, probe
-from synth.capture import _begin, is_finished, make_capture, why_stale
+from synth.capture import _begin, is_finished, make_body, make_capture, why_stale
 from synth.posing import dual_quaternion_skinning, skinning_transforms
 from synth.scene import Clip, Outfit, Rig
 from synth.shooting import render_views, studio_of
@@ -270,6 +270,13 @@ def test_the_estimate_counts_what_is_made(name: str):
     scene = presets.scene("mannequin", size=name)
     assert cost.estimate(scene).images == len(wanted_views(scene))
     assert len(splits(scene)["novel_view"].views) > 0
+    assert cost.VERTICES["mannequin"] == len(make_body(scene).surface.vertices)
+
+
+def test_a_capture_of_the_papers_size_says_what_it_needs():
+    needed = cost.estimate(presets.scene("loose", size="paper"))
+    assert needed.memory > 60 * 27_000 * 28_000
+    assert needed.text.endswith(f"{needed.bytes / 1e9:.2f} GB on disk, {needed.memory / 1e9:.1f} GB of memory")
 
 
 def test_a_library_that_aborts_the_process_is_never_chosen(monkeypatch: pytest.MonkeyPatch):
