@@ -89,16 +89,8 @@ def _made(capture: Capture, name: str) -> Act:
         raise InputError(f"motion: {name} is made for a person's skeleton, which {capture.folder} has not")
     clip = Clip(generator=name, frames=frames)
     motion = make_motion(capture.skeleton, (clip,), fps=capture.motion.fps, seed=MADE_SEED)
-<<<<<<< ours
-<<<<<<< ours
-    return Act(name=name, title=name.capitalize(), motion=motion, frames=tuple(range(frames)), captured=False)
-=======
     title = name.replace("_", " ").capitalize()
     return Act(name=name, title=title, motion=motion, frames=tuple(range(frames)), captured=False)
->>>>>>> theirs
-=======
-    return Act(name=name, title=name.capitalize(), motion=motion, frames=tuple(range(frames)), captured=False)
->>>>>>> theirs
 
 
 def frames_in(act: Act, text: str | None) -> tuple[int, ...]:
