@@ -201,7 +201,7 @@ class AshAvatar:
 
     def _fit_frame(self, images: TrainingImages, frame: int) -> Tensor:
         """Pseudo ground truth of one frame: positions stay on the template, everything else is fitted to its views."""
-        alone = replace(images, frames=(frame,))
+        alone = replace(images, split=images.split.only(frames=(frame,)))
         raw = self.analytic.clone().requires_grad_()
         optimiser = Adam([{"params": [raw], "lr": self.config.training.base_learning_rate}])
         with torch.no_grad():

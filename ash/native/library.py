@@ -17,6 +17,8 @@ from ash.files import InputError
 ABI_VERSION = 8  # of ash/native/dispatch.cpp
 LIBRARY_NAME = "libash_native" + (".dylib" if sys.platform == "darwin" else ".so")
 
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h; the latter takes 32 MiB at most
+
 _P = c_void_p  # the address of a tensor's numbers
 _GAUSSIANS = [_P] * 7 + [c_int64] + [c_int] * 5 + [c_float] * 2 + [c_int]
 _SHADE = [_P, c_int, c_int, _P, _P, _P, c_int64, _P, _P, _P, _P]
@@ -106,6 +108,19 @@ def _parallel_of_torch() -> int | None:
 def use_team(*, of_torch: bool) -> None:
     """Whether calls on several threads use those of torch, as they do by default, or start their own."""
     load().ash_use_team(_parallel_of_torch() if of_torch else None)
+
+
+def keep_freed_memory() -> bool:
+    """Let the C library keep what is freed for the next allocation; False: it is not glibc, and nothing changes.
+
+    By default large arrays go back to the system as they are freed, and come anew page fault by page fault: 2,000 in
+    every step of the mesh, a sixth of its time.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError, TypeError):
+        return False
+    return bool(mallopt(_M_MMAP_THRESHOLD, 1 << 25) and mallopt(_M_TRIM_THRESHOLD, (1 << 31) - 1))
 
 
 def address(tensor: Tensor | None) -> int | None:

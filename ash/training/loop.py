@@ -25,6 +25,7 @@ from ash.checkpoints import contiguous_state, load_module, read_safetensors
 from ash.config import TrainingConfig
 from ash.devices import CPU
 from ash.files import InputError, write_atomic
+from ash.native.library import keep_freed_memory
 from ash.protocol import TrainingOutcome
 from ash.training.adam import Adam
 from ash.training.batches import Batch, cut_batch, draw_ahead
@@ -132,6 +133,7 @@ class _Run:
     """The state of one training: model, optimiser, step, CPU seconds, and what was decided so far."""
 
     def __init__(self, learner: Trainable, config: TrainingConfig, images: TrainingImages, folder: Path) -> None:
+        keep_freed_memory()
         self.learner, self.config, self.images = learner, config, images
         groups = learner.parameter_groups()
         self.optimiser = Adam(groups, eps=1e-15)

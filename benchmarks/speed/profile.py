@@ -1,7 +1,9 @@
 """Where a step of training spends its time, part by part: `ash-bench speed frame --profile`.
 
 The step is the loop's own. Its parts are timed from outside: a part's forward pass as it is called, its backward pass
-from the moment when the gradients of all that it returned are there until those of the part before it are.
+from the moment when the gradients of all that it returned are there until those of the part before it are. Time is the
+thread's CPU time, in which waiting for a core does not count. Every fourth step draws static views or learns vertices
+besides; it is timed as a whole, and its parts are not.
 """
 
 import statistics
@@ -28,16 +30,25 @@ from ash.devices import CPU, finish
 from ash.files import write_json
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted
+from ash.native.library import has_tiles
 from ash.training.batches import draw_batch
 from ash.training.images import TrainingImages, load_training_images
+from ash.training.loop import STATIC_EVERY
 from baselines.ddc import DdcAvatar, ddc
 from benchmarks.speed.frames import captured
 
+FOURTH = "fourth step"
 FORWARD = ("batch", "decode", "pose", "draw", "loss")
 BACKWARD = ("loss backward", "draw backward", "pose backward", "decode backward")
-PARTS = (*FORWARD, *BACKWARD, "adam", "rest", "step")  # "step": the whole; "rest": what no other part holds
-ROUNDS = 60
-SUBJECTS = (("ash", "cpu"), ("ash", "frugal"), ("ddc", "cpu"))
+PARTS = (*FORWARD, *BACKWARD, "adam", "rest", "step", FOURTH)  # "step": the whole; "rest": what no other part holds
+ROUNDS = 20  # of four steps
+SUBJECTS = (
+    ("ash", "cpu", "float32"),
+    ("ash", "cpu", "bfloat16"),
+    ("ash", "frugal", "float32"),
+    ("ddc", "cpu", "float32"),
+    ("ddc", "cpu", "bfloat16"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +57,7 @@ class PartTime:
 
     method: str
     preset: str
+    precision: str  # of the decoders
     part: str
     min_ms: float
     median_ms: float
@@ -61,7 +73,9 @@ class _Parts:
         self.span: dict[str, tuple[float, float]] = {}  # of the last call
 
     def now(self) -> float:
-        """The clock, once all that was queued is done."""
+        """The CPU time of this thread; on a GPU the clock, once all that was queued is done."""
+        if self.device.type == "cpu":
+            return time.thread_time()
         finish(self.device)
         return time.perf_counter()
 
@@ -101,16 +115,17 @@ def _tensors_in(result: Any) -> list[Tensor]:
 def profile_step(
     method: str, learner: AshAvatar | DdcAvatar, images: TrainingImages, preset: str, *, rounds: int
 ) -> list[PartTime]:
-    """The parts of `rounds` steps of the loop, after an epoch that is not counted. The learner learns meanwhile."""
+    """The parts of `rounds` times four steps, after an epoch that is not counted. The learner learns meanwhile."""
     config = replace(learner.config.training, warmup="none", warmup_steps=0, steps=10**9)
     samples = list(_profiled_steps(learner, images, config, rounds))
     return [
         PartTime(
             method=method,
             preset=preset,
+            precision=config.precision,
             part=part,
-            min_ms=1e3 * min(sample[part] for sample in samples),
-            median_ms=1e3 * statistics.median(sample[part] for sample in samples),
+            min_ms=1e3 * min(sample[part] for sample in samples if part in sample),
+            median_ms=1e3 * statistics.median(sample[part] for sample in samples if part in sample),
         )
         for part in PARTS
     ]
@@ -123,15 +138,19 @@ def _profiled_steps(
     warm = len(images.frames)  # An epoch: each frame's template is posed once.
     with tempfile.TemporaryDirectory() as folder:
         run = ash.training.loop._Run(learner, config, images, Path(folder))
-        for number in range(rounds + warm):
+        for number in range(STATIC_EVERY * rounds + warm):
             run.step = first + number
             parts = _Parts(learner.device)
             start = parts.now()
             with _watched(parts, learner, run):
                 run.advance(parts.timed("batch", draw_batch)(images, config, 0, run.step))
             whole = parts.now() - start
-            parts.split_backward()
-            if number >= warm:
+            if number < warm:
+                continue
+            if (first + number) % STATIC_EVERY == 0:
+                yield {FOURTH: whole}
+            else:
+                parts.split_backward()
                 yield parts.spent | {"rest": whole - sum(parts.spent.values()), "step": whole}
 
 
@@ -159,10 +178,12 @@ def profiles(capture: Capture, device: torch.device = CPU) -> Iterator[list[Part
     torch.set_num_threads(1)
     try:
         images = load_training_images(capture, device)
-        for method, preset in SUBJECTS:
+        for method, preset, precision in SUBJECTS:
+            if precision == "bfloat16" and not (device.type != "cpu" or has_tiles()):
+                continue
             recipe: presets.Recipe[Any] = presets.ash if method == "ash" else ddc
-            config = replace(recipe.config(preset), device=str(device))
-            learner: AshAvatar | DdcAvatar = recipe(capture, seed=0, preset=preset, config=config)
+            make = recipe.but({"training.precision": precision, "device": str(device)})
+            learner: AshAvatar | DdcAvatar = make(capture, seed=0, preset=preset)
             yield profile_step(method, learner, images, preset, rounds=ROUNDS)
     finally:
         torch.set_num_threads(before)
@@ -170,18 +191,24 @@ def profiles(capture: Capture, device: torch.device = CPU) -> Iterator[list[Part
 
 def print_profile(profile: list[PartTime]) -> None:
     """A line per part: least and median milliseconds."""
-    print(f"{profile[0].method}, {profile[0].preset}: milliseconds of a training step on one thread, least and median")
+    name = f"{profile[0].method}, {profile[0].preset}, {profile[0].precision}"
+    print(f"{name}: milliseconds of a training step on one thread, least and median")
     for row in profile:
         print(f"  {row.part:16} {row.min_ms:8.2f} {row.median_ms:8.2f}", flush=True)
 
 
 def main(json_path: Path | None, folder: Path | None, device: torch.device = CPU) -> int:
     """Print the profiles on a capture, and write them to `json_path`; returns the exit code."""
-    found = []
+    found: list[PartTime] = []
     print(f"device {device}")
     for profile in profiles(captured(folder), device):
         print_profile(profile)
         found += profile
+    for method, preset in sorted({(row.method, row.preset) for row in found if row.precision == "bfloat16"}):
+        took = {
+            row.precision: row.min_ms for row in found if (row.method, row.preset, row.part) == (method, preset, "step")
+        }
+        print(f"{method}, {preset}: a step is {took['float32'] / took['bfloat16']:.2f} times as fast in bfloat16")
     if json_path is not None:
         write_json(json_path, {"parts": [vars(part) for part in found], "device": str(device)})
     return 0

@@ -72,7 +72,7 @@ def test_the_papers_resolutions_are_timed():
 
 def test_the_parts_of_a_step_are_timed_and_make_up_the_whole(capture, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(profile, "captured", lambda folder: capture)
-    monkeypatch.setattr(profile, "SUBJECTS", (("ash", "ci"), ("ddc", "ci")))
+    monkeypatch.setattr(profile, "SUBJECTS", (("ash", "ci", "float32"), ("ddc", "ci", "float32")))
     monkeypatch.setattr(profile, "ROUNDS", 3)
     assert profile.main(tmp_path / "parts.json", None) == 0
     rows = read_json(tmp_path / "parts.json")["parts"]
@@ -81,14 +81,21 @@ def test_the_parts_of_a_step_are_timed_and_make_up_the_whole(capture, tmp_path, 
         still = {"pose backward"} if method == "ddc" else set()  # most of its steps have no gradient in the vertices
         assert set(ms) == set(profile.PARTS)
         assert all(value > 0 for part, value in ms.items() if part not in still)
-        assert sum(ms.values()) == pytest.approx(2 * ms["step"], rel=0.3)
+        assert sum(ms.values()) - ms["fourth step"] == pytest.approx(2 * ms["step"], rel=0.3)
     printed = capsys.readouterr().out
-    assert "ash, ci: milliseconds of a training step on one thread" in printed and "decode backward" in printed
+    assert "ash, ci, float32: milliseconds of a training step on one thread" in printed and "decode backward" in printed
+
+
+def work(seconds: float) -> None:
+    until = time.thread_time() + seconds
+    while time.thread_time() < until:
+        pass
 
 
 def test_a_part_that_takes_longer_is_seen(capture):
     avatar = AshAvatar(named("ci"), capture)
     decode, images = avatar._decode, load_training_images(capture)
-    avatar._decode = lambda *a, **k: (time.sleep(0.5), decode(*a, **k))[1]
-    parts = {row.part: row.min_ms for row in profile.profile_step("ash", avatar, images, "ci", rounds=2)}
-    assert parts["decode"] > 500 and max(ms for part, ms in parts.items() if part not in ("decode", "step")) < 500
+    avatar._decode = lambda *a, **k: (work(0.5), decode(*a, **k))[1]
+    parts = {row.part: row.min_ms for row in profile.profile_step("ash", avatar, images, "ci", rounds=1)}
+    held = ("decode", "step", "fourth step")
+    assert parts["decode"] > 500 and max(ms for part, ms in parts.items() if part not in held) < 500
