@@ -14,7 +14,6 @@ import numpy as np
 import safetensors.torch
 import torch
 from jaxtyping import Float
-from scipy import ndimage
 from torch import Tensor, nn
 
 import ash.native.shading
@@ -26,7 +25,6 @@ from ash.devices import CPU, MovingModule, device_named, moved
 from ash.files import InputError, write_atomic
 from ash.gaussians.initialising import initial_texture
 from ash.gaussians.texels import LIGHT_COEFFICIENTS
-from ash.harmonics import sh_basis
 from ash.kept import Kept
 from ash.mesh.drawing import draw_mesh_views, textured, topology_of
 from ash.model import stage
@@ -41,7 +39,7 @@ from ash.textures import TextureDrawer, build_lattice, unsettled
 from ash.training.batches import over
 from ash.training.images import load_training_images
 from ash.training.loop import fit
-from baselines.display import MeshDisplay
+from baselines.display import MeshDisplay, texture_gain
 
 # Texture pixels per Gaussian of ASH's lattice, per side: the mesh must not be starved. At 256x256 a body's pixel is
 # 9 mm wide, twice 256 texels are 3 mm apart and more shows nothing; at full size pixels of 2.5 mm ask for four times.
@@ -328,7 +326,8 @@ class DdcAvatar:
     def dressed_mesh(self, pose: Pose) -> DressedMesh:
         """The posed mesh with the texture of the frame, lit as at the texels' normals."""
         posed, texture = moved(self.dress(pose, StageClock()), CPU)
-        lit, mesh = texture * self._gain(posed), self.template.mesh
+        mesh, light = self.template.mesh, moved(self.module.light, CPU)
+        lit = texture * texture_gain(light, posed.normals, mesh, self.config.texture)
         return DressedMesh(
             vertices=posed.vertices.numpy(),
             normals=posed.normals.numpy(),
@@ -337,19 +336,6 @@ class DdcAvatar:
             uv_faces=mesh.uv_faces,
             texture=(255 * lit.clamp(0, 1)).round().byte().permute(1, 2, 0).numpy(),
         )
-
-    def _gain(self, posed: PosedTemplate) -> Float[Tensor, "3 t t"]:
-        """What the light multiplies every texel by; beside the charts, as at the nearest texel of one."""
-        light, size = moved(self.module.light, CPU), self.config.texture
-        if light is None:
-            return torch.ones(3, size, size)
-        lattice = build_lattice(self.template.mesh, size)
-        normals = torch.nn.functional.normalize(lattice.interpolate(posed.normals), dim=-1)
-        beside = np.ones((size, size), dtype=bool)
-        beside.reshape(-1)[lattice.texels.numpy()] = False
-        nearest = ndimage.distance_transform_edt(beside, return_distances=False, return_indices=True).astype(np.int64)
-        gain = lattice.to_texture((sh_basis(normals, 2) @ light).exp())
-        return gain[:, torch.from_numpy(nearest[0]), torch.from_numpy(nearest[1])]
 
     def open_display(self) -> Display:
         """OpenGL's picture of the avatar, as it would be shown."""

@@ -11,15 +11,17 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy import ndimage
 from torch import Tensor
 
-from ash.capture.dataset import Camera, Pose
+from ash.capture.dataset import Camera, Pose, TemplateMesh
 from ash.devices import CPU, moved
 from ash.files import InputError
 from ash.harmonics import sh_basis
 from ash.mesh.drawing import SUPERSAMPLING
 from ash.protocol import StageClock
 from ash.template.template import PosedTemplate
+from ash.textures import build_lattice
 
 NEAR, FAR = 0.1, 50.0  # metres
 TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # Our cameras look along +z with y down, OpenGL's along -z with y up.
@@ -148,3 +150,18 @@ class MeshDisplay:
         sampler = self.pyrender.Sampler(magFilter=LINEAR, minFilter=LINEAR, wrapS=CLAMP_TO_EDGE, wrapT=CLAMP_TO_EDGE)
         image = self.pyrender.Texture(sampler=sampler, source=pixels, source_channels="RGB")
         return self.pyrender.MetallicRoughnessMaterial(baseColorTexture=image, baseColorFactor=np.ones(4))
+
+
+def texture_gain(
+    light: Float[Tensor, "9 3"] | None, normals: Float[Tensor, "v 3"], mesh: TemplateMesh, size: int
+) -> Float[Tensor, "3 t t"]:
+    """What the light multiplies every texel by; beside the charts, as at the nearest texel of one."""
+    if light is None:
+        return torch.ones(3, size, size)
+    lattice = build_lattice(mesh, size)
+    unit = torch.nn.functional.normalize(lattice.interpolate(normals), dim=-1)
+    beside = np.ones((size, size), dtype=bool)
+    beside.reshape(-1)[lattice.texels.numpy()] = False
+    nearest = ndimage.distance_transform_edt(beside, return_distances=False, return_indices=True).astype(np.int64)
+    gain = lattice.to_texture((sh_basis(unit, 2) @ light).exp())
+    return gain[:, torch.from_numpy(nearest[0]), torch.from_numpy(nearest[1])]
