@@ -9,7 +9,7 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from multiprocessing.connection import wait as wait_for_end
 from pathlib import Path
@@ -30,9 +30,9 @@ from ash.capture.manifest import Manifest, hash_files, is_capture, read_manifest
 from ash.capture.novelty import novelty_deg
 from ash.files import InputError, write_arrays, write_image
 from synth.camera.render import Renderer, probe
-from synth.camera.rig import make_cameras
+from synth.camera.rig import hull_of, make_cameras
 from synth.cloth import surface
-from synth.cloth.checks import penetrations, stretch
+from synth.cloth.checks import Penetrations, penetrations, stretch
 from synth.code import code_version, source_version
 from synth.cost import require_space
 from synth.motion.clips import make_motion
@@ -199,7 +199,7 @@ def make_body(scene: Scene) -> Body:
 def describe(scene: Scene, folder: Path, executor: Executor | None = None) -> None:
     """Write everything but images: motion, surface of every frame, template, cameras, texture. Kept where complete.
 
-    The `executor` paints the texture and moves the cloth, clip by clip.
+    The `executor` paints the texture and moves the cloth, clip by clip: no clip knows of another.
     """
     last = folder / "cameras.json"
     if last.is_file():
@@ -207,24 +207,20 @@ def describe(scene: Scene, folder: Path, executor: Executor | None = None) -> No
     body = make_body(scene)
     painted = executor.submit(paint, scene, folder) if executor else None
     motion = make_motion(body.skeleton, scene.clips, fps=scene.fps, seed=stream(scene, "motion"))
-    moved = _moved(scene, body, motion, executor)
+    clips = [np.flatnonzero(motion.sequence == index) for index in np.unique(motion.sequence)]
+    draped = list((executor.map if executor else map)(partial(drape, scene, folder, motion), clips))
     write_skeleton(folder / "skeleton.json", body.skeleton)
     write_motion(folder / "motion.npz", motion)
     offset = surface.scan_error(body, scene.outfit, seed=stream(scene, "scan"))
     write_template(folder / "template.npz", body.template(offset))
     write_template(folder / "body.npz", bare_template(scene))
-    write_arrays(folder / "truth" / "template.npz", vertices=moved[:, body.kept])
-    poking = penetrations(body, moved)
+    write_arrays(folder / "truth" / "template.npz", vertices=np.concatenate([clip.template for clip in draped]))
     write_arrays(
         folder / "truth" / "clothes.npz",
-        penetrating=poking.share,
-        penetration_mm=1000 * poking.deepest,
-        stretch=stretch(body, moved, "skirt" if scene.outfit.skirt else "shirt"),
+        penetrating=np.concatenate([clip.poking.share for clip in draped]),
+        penetration_mm=1000 * np.concatenate([clip.poking.deepest for clip in draped]),
+        stretch=np.concatenate([clip.stretch for clip in draped]),
     )
-    # The picture is made of float32 vertices, so these are the exact ones.
-    stored = moved.astype(np.float32)
-    for frame, vertices in enumerate(stored):
-        write_arrays(surface_path(folder, frame), vertices=vertices)
     rest = body.surface
     write_arrays(
         folder / "truth" / "surface.npz",
@@ -234,23 +230,37 @@ def describe(scene: Scene, folder: Path, executor: Executor | None = None) -> No
         uv_faces=rest.uv_faces.astype(np.int32),
         part=rest.part.astype(np.int32),
     )
-    cameras = make_cameras(scene.rig, stored.reshape(-1, 3).astype(np.float64))
+    cameras = make_cameras(scene.rig, np.concatenate([clip.corners for clip in draped]))
     painted.result() if painted else paint(scene, folder)
     write_cameras(last, cameras)
 
 
-def _moved(scene: Scene, body: Body, motion: Motion, executor: Executor | None) -> np.ndarray:
-    """The surface of every frame, `[t, s, 3]` metres. No clip knows of another: an `executor` shares them out."""
-    clips = [np.flatnonzero(motion.sequence == index) for index in np.unique(motion.sequence)]
-    parts = [replace(motion, dofs=motion.dofs[clip], sequence=motion.sequence[clip]) for clip in clips]
-    if executor is None or len(parts) == 1:
-        return surface.true_surface(body, motion, scene.outfit, seed=stream(scene, "folds"))
-    return np.concatenate(list(executor.map(partial(drape, scene), parts)))
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Draped:
+    """What is kept in memory of a clip whose surfaces are on the disk."""
+
+    template: np.ndarray  # [t, v, 3] metres, where the template's vertices are
+    poking: Penetrations
+    stretch: np.ndarray  # [t], see `synth.cloth.checks.stretch`
+    corners: np.ndarray  # [c, 3] metres, of the hull of all that is seen
 
 
-def drape(scene: Scene, motion: Motion) -> np.ndarray:
-    """The surface of every frame of a clip, `[t, s, 3]` metres."""
-    return surface.true_surface(_body(scene), motion, scene.outfit, seed=stream(scene, "folds"))
+def drape(scene: Scene, folder: Path, motion: Motion, clip: np.ndarray) -> Draped:
+    """Write the surface of every frame of a clip, given the clip's frames in the whole motion, and measure it."""
+    body, part = _body(scene), replace(motion, dofs=motion.dofs[clip], sequence=motion.sequence[clip])
+    moved = surface.true_surface(body, part, scene.outfit, seed=stream(scene, "folds"))
+    corners = []
+    for frame, vertices in zip(clip, moved, strict=True):
+        # The picture is made of float32 vertices, so these are the exact ones.
+        stored = vertices.astype(np.float32)
+        write_arrays(surface_path(folder, int(frame)), vertices=stored)
+        corners.append(hull_of(stored.astype(np.float64)))
+    return Draped(
+        template=moved[:, body.kept],
+        poking=penetrations(body, moved),
+        stretch=stretch(body, moved, "skirt" if scene.outfit.skirt else "shirt"),
+        corners=hull_of(np.concatenate(corners)),
+    )
 
 
 @lru_cache(maxsize=1)

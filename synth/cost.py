@@ -19,7 +19,7 @@ class Estimate:
     images: int
     core_seconds: float
     bytes: int  # on disk
-    memory: int  # bytes, at its largest: while the surface of every frame is there
+    memory: int  # bytes, at its largest: while the longest clip is draped
 
     @property
     def text(self) -> str:
@@ -39,8 +39,9 @@ def estimate(scene: Scene) -> Estimate:
     per_image = 0.07 + 1.6e-7 * pixels * scene.samples * longer
     fixed = (40.0 if scene.body == "anny" else 6.0) + 0.25 * scene.frames + 0.5 * training * (scene.scanner.rms_mm > 0)
     size = int(images * pixels * 1.1 + scene.frames * 1.2e6 + 3 * scene.texture**2)
-    # Of each vertex the simulated place, the stored one, and the one that cameras are aimed at: 24, 12 and 24 bytes.
-    memory = LEAST_MEMORY + 60 * VERTICES[scene.body] * scene.frames
+    # Of the template, which has a quarter of the vertices, all frames twice; of the surface the longest clip, thrice.
+    longest = max(clip.frames for clip in scene.clips)
+    memory = LEAST_MEMORY + VERTICES[scene.body] * (12 * scene.frames + 80 * longest)
     return Estimate(images=images, core_seconds=fixed + images * per_image, bytes=size, memory=memory)
 
 

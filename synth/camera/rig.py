@@ -69,9 +69,14 @@ def make_cameras(rig: Rig, points: np.ndarray, *, margin: float = 0.04) -> list[
             if (depth < 0.05).any() or (pixels.max(axis=0) < 0).any() or (pixels.min(axis=0) > _size(rig)).any():
                 raise InputError(f"camera {camera.name}: expected the person in front of it and in its picture")
         return cameras
-    corners = points[np.sort(ConvexHull(points).vertices)]  # The others lie between them in every picture.
+    corners = hull_of(points)  # The others lie between them in every picture.
     pairs = zip(names(rig), place(rig), strict=True)
     return [_frame(rig, name, position, corners, margin=margin) for name, position in pairs]
+
+
+def hull_of(points: np.ndarray) -> np.ndarray:
+    """Those of the points `[n, 3]` that are corners of their convex hull, in the points' order."""
+    return points[np.sort(ConvexHull(points).vertices)]
 
 
 MAX_BYTES = 16 << 20  # of a user's cameras.json
