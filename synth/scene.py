@@ -102,7 +102,7 @@ class Rig:
     given: str = ""  # the text of a user's cameras.json, for kind "given"
     cameras: int = 16
     held_out: int = 4
-    part: int = 0  # so many training cameras see each training frame, by turns; 0: all do
+    part: int = 0  # so many training cameras see each training frame, by turns; 0, or as many as there are: all do
     width: int = 256
     height: int = 256
     radius: float = 3.4  # metres
@@ -117,11 +117,9 @@ class Rig:
             raise InputError("a rig of kind 'given' needs the text of a cameras.json, and only such a rig has one")
         if not 0 < self.held_out < self.cameras <= 1000:
             raise InputError(f"rig: {self.held_out} of {self.cameras} cameras held out, expected 1 to all but one")
-        training = self.cameras - self.held_out
-        if not 0 <= self.part <= training or (self.part and training % self.part):
+        if self.part < 0:
             raise InputError(
-                f"rig: a part of {self.part} of {training} training cameras sees each frame, expected a divisor of"
-                f" {training}, or 0 for all"
+                f"rig: a part of {self.part} training cameras sees each frame, expected 1 or more, or 0 for all"
             )
         if not (16 <= self.width <= 8192 and 16 <= self.height <= 8192):
             raise InputError(f"rig: images of {self.width}x{self.height}, expected 16 to 8192 pixels")
@@ -205,7 +203,9 @@ class Scene:
             del parameters["rig"]["part"]
         for name in ("near", "far"):
             if not parameters[name]:
-                del parameters[name], parameters[f"{name}_stride"]
+                del parameters[name]
+            if parameters[f"{name}_stride"] == 1:
+                del parameters[f"{name}_stride"]
         for clip in (clip for name in ("train", "test", "near", "far") for clip in parameters.get(name, ())):
             del clip["path"]
             if clip["take"] == asdict(Take()):

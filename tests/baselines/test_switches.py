@@ -44,8 +44,11 @@ def made(row: MethodSpec, capture: Capture) -> AshAvatar:
 
 
 def drawn(avatar: AshAvatar, capture: Capture, folder: Path) -> np.ndarray:
+    """A pose that was learned from, and one that was not."""
     avatar.fit(capture.training_only(), folder=folder)
-    return avatar.render(Pose(capture.motion, 3), next(iter(capture.cameras.values())), clock=StageClock())
+    camera = next(iter(capture.cameras.values()))
+    poses = (Pose(capture.motion, frame) for frame in (3, len(capture.motion.dofs) - 1))
+    return np.stack([avatar.render(pose, camera, clock=StageClock()) for pose in poses])
 
 
 @pytest.mark.parametrize("row", SWITCHES, ids=lambda row: row.name)
@@ -80,7 +83,7 @@ def require_a_way(avatar: AshAvatar, unlearned: bool, capture: Capture, folder: 
 
 
 def test_the_suites_have_them_as_rows() -> None:
-    assert len(SWITCHES) == 23 and len(LEARNED) == 4
+    assert len(SWITCHES) == 24 and len(LEARNED) == 4
     methods = [row.of or row.name for suite in ("switches", "template") for row in find_suite(suite).methods]
     assert all(find_method(method).is_ours and callable(find_method(method).load()) for method in methods)
     named = ["baselines.switches:by_surface", "baselines.switches:by_vertices"]

@@ -1,6 +1,7 @@
 """Cameras that see the training frames by turns."""
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from ash.files import InputError
 from synth import presets
 from synth.camera.rig import held_out, place, rotation
 from synth.scene import Rig
+from synth.views import splits
 
 
 @pytest.mark.parametrize("rig", [presets.ROTATING, Rig(kind="ring", cameras=20, held_out=4, part=8), Rig(part=1)])
@@ -39,8 +41,19 @@ def test_cameras_meet_in_other_parts_from_round_to_round():
     assert max(pairs.values()) <= 6  # of 25
 
 
-def test_a_part_that_leaves_cameras_over_is_refused():
-    with pytest.raises(InputError, match="expected a divisor of 12"):
-        Rig(part=5)
-    with pytest.raises(InputError, match="expected a divisor of 12"):
-        Rig(part=16)
+@pytest.mark.parametrize(("cameras", "part"), [(16, 5), (24, 7), (9, 4)])
+def test_where_sectors_differ_by_a_camera_all_are_used_nearly_alike(cameras, part):
+    rig = Rig(cameras=cameras, part=part)
+    training, frames = set(range(cameras)) - set(held_out(rig)), 60
+    parts = rotation(rig, frames)
+    assert all(len(set(seen)) == part for seen in parts)
+    uses = Counter(camera for seen in parts for camera in seen)
+    assert set(uses) == training
+    assert max(uses.values()) <= 1.5 * frames * part / len(training)
+
+
+def test_a_part_of_all_cameras_or_more_is_all_of_them():
+    scene = replace(presets.scene("loose", size="quick"), rig=Rig(cameras=8, held_out=4, part=4))
+    assert splits(scene)["train"].parts == ()
+    with pytest.raises(InputError, match="expected 1 or more, or 0 for all"):
+        Rig(part=-1)
