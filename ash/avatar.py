@@ -52,7 +52,8 @@ class AshAvatar:
     ) -> None:
         """`template`: one to stand on, where it exists already."""
         capture = _seen(capture, config.training)
-        self.template = template or template_of(config.template, capture, seed=config.seed)
+        self.device = device_named(config.device)
+        self.template = template or template_of(config.template, capture, seed=config.seed, device=self.device)
         self.choice: Choice | None = None
         if config.search and config.model.motion and config.model.head == "unet" and make_decoders is None:
             self.choice = sufficient(self._brief(config), config, capture)
@@ -72,7 +73,6 @@ class AshAvatar:
         if isinstance(decoders, LocalBlendshapes):
             window, frames = config.model.window, capture.splits["train"].frames
             decoders.observe([normalised_motion(Pose(capture.motion, frame), window=window) for frame in frames])
-        self.device = device_named(config.device)
         self.module.to(self.device)
         self.template, self.lattice = self.module.template, self.module.lattice
         self.analytic = self.analytic.to(self.device)

@@ -190,7 +190,8 @@ class DdcAvatar:
 
     def __init__(self, config: DdcConfig, capture: Capture, *, template: Template | None = None) -> None:
         """`template`: one to stand on, where it exists already."""
-        self.template = template or template_of(config.template, capture, seed=config.seed)
+        self.device = device_named(config.device)
+        self.template = template or template_of(config.template, capture, seed=config.seed, device=self.device)
         self.choice: Choice | None = None
         if config.search:
             self.choice = sufficient(self._brief(config), config, capture)
@@ -209,7 +210,6 @@ class DdcAvatar:
             fade=config.model.fade,
         )
         textures.observe(self.template, capture.motion, capture.splits["train"].frames)
-        self.device = device_named(config.device)
         self.module = DdcModel(config, capture.template, self.template, textures, initial).to(self.device)
         self.template = self.module.template
         self._motion = capture.motion

@@ -130,9 +130,8 @@ def _to_torch(matrix: scipy.sparse.csr_matrix) -> Tensor:
     indices = (torch.from_numpy(matrix.indptr).long(), torch.from_numpy(matrix.indices).long())
     with warnings.catch_warnings():  # torch calls its CSR support beta; this one product is all that is used of it.
         warnings.simplefilter("ignore")
-        return torch.sparse_csr_tensor(
-            *indices, torch.from_numpy(matrix.data).float(), size=matrix.shape, check_invariants=True
-        )
+        values = torch.from_numpy(matrix.data).float()
+        return torch.sparse_csr_tensor(*indices, values, size=matrix.shape, check_invariants=True, device=values.device)
 
 
 def vertex_neighbours(mesh: TemplateMesh) -> NeighbourMean:

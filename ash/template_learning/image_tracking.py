@@ -8,6 +8,9 @@ embedded graph, held together and at home by weights that stand for how a templa
 every view once, sharper from pass to pass. What comes out are tracked frames, as from any other supervision.
 
 Colours cannot tell where on the surface its paint lies: along it, the mean over the frames stays at rest.
+
+The template is posed, shaded and drawn, and the nodes' equations are solved, on the template's device; between, images
+are filtered and equations put together by NumPy and SciPy.
 """
 
 from collections.abc import Sequence
@@ -20,9 +23,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ash.capture.dataset import Camera, Capture, Pose
+from ash.devices import moved
 from ash.harmonics import sh_basis
 from ash.mesh.drawing import Topology, topology_of
-from ash.mesh.rasterizing import Rasterized, project_vertices, rasterize_mesh
+from ash.mesh.rasterizing import project_vertices, rasterize_mesh
 from ash.rotations import RigidTransforms, unitquat_to_rotmat
 from ash.template.graph import EmbeddedGraph
 from ash.template.template import Template, vertex_normals
@@ -65,7 +69,7 @@ def track_images(capture: Capture, template: Template, graph: EmbeddedGraph, *, 
             subject.move(index, posed[index], views, paint, reach=reach)
         subject.paint = paint.mean()
     canonical = torch.from_numpy(np.stack([subject.canonical(i) for i in range(len(images.frames))])).float()
-    return Tracked(frames=images.frames, canonical=canonical)
+    return Tracked(frames=images.frames, canonical=canonical.to(template.device))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -142,11 +146,21 @@ class _Pull:
 class _Shown:
     """The template as a frame has it."""
 
-    vertices: Float[Tensor, "v 3"]  # metres, world
+    vertices: Float[Tensor, "v 3"]  # metres, world; on the template's device
+    corners: Float[np.ndarray, "v 3"]  # the same
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
     basis: Float[np.ndarray, "n 9"]  # of light
     shade: Float[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Drawn:
+    """What a camera sees of the template."""
+
+    triangle: Int[np.ndarray, "h w"]  # -1: none
+    depth: Float[np.ndarray, "h w"]  # metres
+    screen: Float[np.ndarray, "v 2"]  # the vertices in pixels
 
 
 class _Subject:
@@ -154,10 +168,11 @@ class _Subject:
 
     def __init__(self, template: Template, graph: EmbeddedGraph, frames: int) -> None:
         mesh = template.mesh
-        self.lattice: TexelLattice = build_lattice(mesh, TEXELS)
-        self.topology: Topology = topology_of(template.faces)
+        self.lattice: TexelLattice = moved(build_lattice(mesh, TEXELS), template.device)
+        self.topology: Topology = topology_of(torch.from_numpy(mesh.faces))  # Whose outlines NumPy follows.
+        self.faces = template.faces
         self.rest = mesh.vertices
-        self.normals = vertex_normals(torch.from_numpy(mesh.vertices), template.faces).numpy()
+        self.normals = vertex_normals(torch.from_numpy(mesh.vertices), self.topology.faces).numpy()
         self.solver = _NodeSolver(graph)
         self.nodes = np.zeros((frames, len(graph.nodes), 3))
         self.paint = Painted(colours=np.full((len(self.lattice.texels), 3), np.nan), light=np.zeros((9, 3)))
@@ -177,22 +192,23 @@ class _Subject:
         shown = self._show(index, transforms)
         pull, seen = _Pull(len(self.rest)), _Pull(len(self.lattice.texels))
         for view in views:
-            drawn = _draw(shown.vertices, self.topology.faces, view.camera)
+            drawn = _draw(shown.vertices, self.faces, view.camera)
             _pull_by_colours(seen, shown, view, drawn, self.paint, paint)
             _pull_by_outline(pull, shown, view, drawn, self.topology, reach)
-        pull.add(self.lattice.corners.numpy(), self.lattice.barycentric.double().numpy(), seen.normal, seen.right)
-        rotations = unitquat_to_rotmat(transforms.quats).double().numpy()
+        pull.add(_here(self.lattice.corners), _here(self.lattice.barycentric.double()), seen.normal, seen.right)
+        rotations = _here(unitquat_to_rotmat(transforms.quats).double())
         self.nodes[index] = self.solver.solve(self.nodes[index], *pull.in_canonical(rotations))
 
     def _show(self, index: int, transforms: RigidTransforms) -> _Shown:
-        vertices = transforms.apply(torch.from_numpy(self.canonical(index)).float())
-        normals = vertex_normals(vertices, self.topology.faces)
+        vertices = transforms.apply(torch.from_numpy(self.canonical(index)).float().to(self.faces.device))
+        normals = vertex_normals(vertices, self.faces)
         across = torch.nn.functional.normalize(self.lattice.interpolate(normals), dim=-1)
-        basis = sh_basis(across, 2).double().numpy()
+        basis = _here(sh_basis(across, 2).double())
         return _Shown(
             vertices=vertices,
-            points=self.lattice.interpolate(vertices).double().numpy(),
-            normals=across.double().numpy(),
+            corners=_here(vertices.double()),
+            points=_here(self.lattice.interpolate(vertices).double()),
+            normals=_here(across.double()),
             basis=basis,
             shade=np.exp(basis @ self.paint.light),
         )
@@ -202,13 +218,14 @@ class _NodeSolver:
     """From what vertices want to what the nodes of the graph do."""
 
     def __init__(self, graph: EmbeddedGraph) -> None:
-        self.links, self.weights = graph.links.numpy(), graph.weights.double().numpy()
+        self.device = graph.links.device
+        self.links, self.weights = _here(graph.links), _here(graph.weights.double())
         self.count, links = len(graph.nodes), self.links.shape[1]
         pairs = self.links[:, :, None] * self.count + self.links[:, None]
         self.pairs = pairs.reshape(-1)
         self.products = (self.weights[:, :, None] * self.weights[:, None]).reshape(-1)
         self.vertices = np.repeat(np.arange(len(self.links)), links * links)
-        apart = np.eye(self.count) - graph.adjacency(torch.eye(self.count)).double().numpy()
+        apart = np.eye(self.count) - _here(graph.adjacency(torch.eye(self.count, device=self.device)).double())
         self.restraint = HOLD * np.eye(self.count) + STIFFNESS * apart.T @ apart
 
     def spread(self, nodes: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "v 3"]:
@@ -232,17 +249,23 @@ class _NodeSolver:
                 system[:, i, :, j] += block.reshape(size, size)
                 if i != j:
                     system[:, j, :, i] += block.reshape(size, size)
-        factor = torch.linalg.cholesky(torch.from_numpy(system.reshape(3 * size, 3 * size)))
-        step = torch.cholesky_solve(torch.from_numpy(target.reshape(-1, 1)), factor)
-        return nodes + step.numpy().reshape(size, 3)
+        whole = torch.from_numpy(system.reshape(3 * size, 3 * size)).to(self.device)
+        wanted = torch.from_numpy(target.reshape(-1, 1)).to(self.device)
+        step = torch.cholesky_solve(wanted, torch.linalg.cholesky(whole))
+        return nodes + _here(step).reshape(size, 3)
 
 
-def _draw(vertices: Tensor, faces: Tensor, camera: Camera) -> tuple[Rasterized, np.ndarray]:
-    """What the camera sees of the template, and its vertices in pixels `[v, 2]`."""
-    viewmat, K = torch.from_numpy(camera.viewmat).float(), torch.from_numpy(camera.K).float()
+def _here(tensor: Tensor) -> np.ndarray:
+    """What equations are put together from: on the CPU, whatever the device."""
+    return tensor.cpu().numpy()
+
+
+def _draw(vertices: Tensor, faces: Tensor, camera: Camera) -> _Drawn:
+    viewmat, K = (torch.from_numpy(matrix).to(vertices) for matrix in (camera.viewmat, camera.K))
     corners = project_vertices(vertices, viewmat, K)
     drawn = rasterize_mesh(corners, faces, width=camera.width, height=camera.height)
-    return drawn, (corners[:, :2] / corners[:, 2:]).double().numpy()
+    screen = (corners[:, :2] / corners[:, 2:]).double()
+    return _Drawn(triangle=_here(drawn.triangle), depth=_here(drawn.depth), screen=_here(screen))
 
 
 def _slopes(camera: Camera, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 2 3"]:
@@ -258,18 +281,18 @@ def _pull_by_colours(
     pull: _Pull,
     shown: _Shown,
     view: ObservedView,
-    drawn: tuple[Rasterized, np.ndarray],
+    drawn: _Drawn,
     known: Painted,
     paint: _Paint,
 ) -> None:
     """Points that are seen want to go where the image has their colour."""
-    camera, (seen, _) = view.camera, drawn
+    camera = view.camera
     pixels, depth = camera.project(shown.points)
     towards = camera.position - shown.points
     facing = (towards * shown.normals).sum(1) / np.linalg.norm(towards, axis=1)
     column = np.clip(pixels[:, 0], 0, camera.width - 1).astype(np.int64)
     row = np.clip(pixels[:, 1], 0, camera.height - 1).astype(np.int64)
-    front = (seen.triangle.numpy()[row, column] >= 0) & (depth < seen.depth.numpy()[row, column] + VISIBLE_WITHIN_M)
+    front = (drawn.triangle[row, column] >= 0) & (depth < drawn.depth[row, column] + VISIBLE_WITHIN_M)
     chosen = np.flatnonzero((facing > FACING) & front)
     values = sample(view.colours, pixels[chosen]).astype(np.float64)
     whole = values[:, 9] > 0.99
@@ -294,13 +317,13 @@ def _pull_by_outline(
     pull: _Pull,
     shown: _Shown,
     view: ObservedView,
-    drawn: tuple[Rasterized, np.ndarray],
+    drawn: _Drawn,
     topology: Topology,
     reach: float,
 ) -> None:
     """The template's outline wants to go to that of the mask, across it."""
-    seen, screen = drawn
-    ends, share, outward = _outline_points(screen, topology, seen.triangle.numpy())
+    screen = drawn.screen
+    ends, share, outward = _outline_points(screen, topology, drawn.triangle)
     if len(ends) == 0:
         return
     points = screen[ends[:, 0]] * share[:, :1] + screen[ends[:, 1]] * share[:, 1:]
@@ -311,8 +334,7 @@ def _pull_by_outline(
     ends, share = ends[nearest], share[nearest]
     off = ((view.outline[found] - points[nearest]) * normal).sum(1)
     weight = OUTLINE_WEIGHT / (1 + (off / OUTLINE_OUTLIER) ** 2)
-    vertices = shown.vertices.double().numpy()
-    places = vertices[ends[:, 0]] * share[:, :1] + vertices[ends[:, 1]] * share[:, 1:]
+    places = shown.corners[ends[:, 0]] * share[:, :1] + shown.corners[ends[:, 1]] * share[:, 1:]
     slope = (normal[:, None] @ _slopes(view.camera, places))[:, 0]
     pull.add(ends, share, weight[:, None, None] * slope[:, :, None] * slope[:, None], (weight * off)[:, None] * slope)
 

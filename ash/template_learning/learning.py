@@ -11,6 +11,7 @@ from ash.capture.dataset import Capture
 from ash.capture.formats import read_template_truth
 from ash.checkpoints import load_module, read_safetensors
 from ash.config import TemplateConfig
+from ash.devices import CPU
 from ash.files import InputError, hash_of, hash_sources, only_one, write_atomic
 from ash.protocol import TrainingOutcome
 from ash.template.graph import EmbeddedGraph
@@ -32,18 +33,19 @@ from ash.template_learning.tracking import Tracked, track_scans, track_surface, 
 Deformer = LinearDeformation | GraphDeformation
 
 
-def template_of(config: TemplateConfig, capture: Capture, *, seed: int) -> Template:
-    """The template that a configuration names; "exact", and supervision "surface" and "vertices", are for oracles."""
+def template_of(config: TemplateConfig, capture: Capture, *, seed: int, device: torch.device = CPU) -> Template:
+    """The template that a configuration names, on the CPU; "exact", and supervision "surface" and "vertices", are for
+    oracles. One that is to be learned is learned on `device`."""
     if config.kind == "skinned":
         return skinned_template(capture)
     if config.kind == "exact":
         planted = PlantedError(rms_mm=config.error_mm, static=config.error_static, lag=config.error_lag)
         return exact_template(capture, read_template_truth(capture), planted=planted, seed=seed)
-    return learned_template(config, capture, seed=seed)
+    return learned_template(config, capture, seed=seed, device=device)
 
 
-def learned_template(config: TemplateConfig, capture: Capture, *, seed: int) -> Template:
-    """Learn the template, or read it from the capture's `store` where an equal one lies.
+def learned_template(config: TemplateConfig, capture: Capture, *, seed: int, device: torch.device = CPU) -> Template:
+    """Learn the template on a device, or read it from the capture's `store` where an equal one lies; to the CPU.
 
     A capture without a store has it learned anew each time, to the same result. Of two processes that want the same
     template at once, one learns it and the other waits.
@@ -53,12 +55,12 @@ def learned_template(config: TemplateConfig, capture: Capture, *, seed: int) -> 
     deformation: Deformer = make(config, capture.template, capture.skeleton)
     template = _around(deformation, deformation.graph, config, capture)
     if capture.store is None:
-        facts = _learn(deformation, config, capture, seed)
+        facts = _learn(deformation, config, capture, seed, device)
     else:
-        path = capture.store / f"{template_key(config, capture, seed=seed)}.safetensors"
+        path = capture.store / f"{template_key(config, capture, seed=seed, device=device)}.safetensors"
         with only_one(path):
             if not path.exists():
-                facts = _learn(deformation, config, capture, seed)
+                facts = _learn(deformation, config, capture, seed, device)
                 write_atomic(path, safetensors.torch.save(_state(deformation), metadata=facts))
             tensors, facts = read_safetensors(path)
             load_module(deformation, tensors, path)
@@ -75,7 +77,7 @@ def with_template(outcome: TrainingOutcome | None, template: Template) -> Traini
     return replace(outcome, template=template.learned.found)
 
 
-def template_key(config: TemplateConfig, capture: Capture, *, seed: int) -> str:
+def template_key(config: TemplateConfig, capture: Capture, *, seed: int, device: torch.device = CPU) -> str:
     """Hash of everything that decides a learned template, sources included."""
     train = capture.splits["train"]
     views = {"train": asdict(train) if config.supervision == "images" else train.frames}
@@ -84,6 +86,7 @@ def template_key(config: TemplateConfig, capture: Capture, *, seed: int) -> str:
         "capture": capture.identity,
         "config": asdict(config),
         "seed": drawn,
+        "device": device.type,
         "sources": hash_sources(Path(__file__).parents[1]),
     }
     return hash_of(decisive | views)[:16]
@@ -94,9 +97,13 @@ def _around(deformation: Deformation, graph: EmbeddedGraph, config: TemplateConf
     return Template(capture.template, capture.skeleton, deformation, through=through)
 
 
-def _learn(deformation: Deformer, config: TemplateConfig, capture: Capture, seed: int) -> dict[str, str]:
+def _learn(
+    deformation: Deformer, config: TemplateConfig, capture: Capture, seed: int, device: torch.device
+) -> dict[str, str]:
+    """Learn in place: on the device, and back."""
     start = time.perf_counter()
-    at_rest = _around(RestDeformation(capture.template), deformation.graph, config, capture)
+    at_rest = _around(RestDeformation(capture.template), deformation.graph, config, capture).to(device)
+    deformation.to(device)
     tracked = _track(config, capture, at_rest, deformation.graph)
     if isinstance(deformation, LinearDeformation):
         choice = fit_linear(deformation, capture.motion, tracked)
@@ -104,6 +111,7 @@ def _learn(deformation: Deformer, config: TemplateConfig, capture: Capture, seed
     else:
         step = fit_graph(deformation, capture.motion, tracked, steps=config.steps, seed=seed)
         found = f"step {step} of {config.steps}"
+    deformation.to(CPU)
     return {"seconds": repr(time.perf_counter() - start), "found": f"learned from {config.supervision}: {found}"}
 
 

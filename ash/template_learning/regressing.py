@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ash.capture.dataset import Motion, Pose
+from ash.devices import CPU
 from ash.rotations import RigidTransforms
 from ash.template.graph import EmbeddedGraph
 from ash.template_learning.deforming import LinearDeformation
@@ -58,14 +59,15 @@ def fit_linear(deformation: LinearDeformation, motion: Motion, tracked: Tracked)
 
 
 def _node_translations(graph: EmbeddedGraph, shift: Float[Tensor, "t v 3"]) -> Float[Tensor, "t g 3"]:
-    """Translations of the nodes whose blend is nearest to the shifts of the vertices, least squares."""
+    """Translations of the nodes whose blend is nearest to the shifts of the vertices, least squares: by SciPy."""
     count, links = graph.links.shape
     rows = np.repeat(np.arange(count), links)
-    entries = (graph.weights.double().numpy().ravel(), (rows, graph.links.numpy().ravel()))
+    entries = (graph.weights.double().cpu().numpy().ravel(), (rows, graph.links.cpu().numpy().ravel()))
     blend = scipy.sparse.csr_matrix(entries, shape=(count, len(graph.nodes)))
     normal = (blend.T @ blend + BLEND_RIDGE * scipy.sparse.eye(len(graph.nodes))).tocsc()
     solve = scipy.sparse.linalg.splu(normal).solve
-    return torch.from_numpy(np.stack([solve(blend.T @ frame) for frame in shift.double().numpy()]))
+    found = np.stack([solve(blend.T @ frame) for frame in shift.double().cpu().numpy()])
+    return torch.from_numpy(found).to(shift.device)
 
 
 def _ridge(
@@ -77,7 +79,7 @@ def _ridge(
     gram, moment = centred.T @ centred, torch.einsum("tf,tgo->gfo", centred, targets - targets.mean(0))
     maps = []
     for scale, right in zip(reach, moment, strict=True):  # One system at a time: together they would be gigabytes.
-        left = scale[:, None] * gram * scale + ridge * torch.eye(len(scale), dtype=gram.dtype)
+        left = scale[:, None] * gram * scale + ridge * torch.eye(len(scale), dtype=gram.dtype, device=gram.device)
         maps.append(scale[:, None] * torch.cholesky_solve(scale[:, None] * right, torch.linalg.cholesky(left)))
     return mean, torch.stack(maps)
 
@@ -127,7 +129,7 @@ def fit_graph(deformation: GraphDeformation, motion: Motion, tracked: Tracked, *
     nothing, where no training helps. Then the networks learn as many steps on all frames, from the same start.
     """
     folds = held_out_folds(motion.sequence[list(tracked.frames)])
-    held = folds[seed % len(folds)] if folds else torch.zeros(len(tracked.frames), dtype=torch.bool)
+    held = folds[seed % len(folds)] if folds else torch.zeros(len(tracked.frames), dtype=torch.bool, device=CPU)
     windows = [deformation.window_transforms(Pose(motion, frame)) for frame in tracked.frames]
     start = {name: value.clone() for name, value in deformation.state_dict().items()}
     best, kept = float("inf"), 0
@@ -146,10 +148,10 @@ def _train(
     deformation: GraphDeformation, windows: list[Window], tracked: Tracked, seen: Tensor, *, steps: int, seed: int
 ) -> Iterator[int]:
     """Learn from the frames that are `seen` `[t]`; stops at step 0, at every twentieth, and at the last."""
-    with torch.no_grad():
-        deformation.static.copy_(tracked.canonical[seen].mean(0) - deformation.rest)
-    optimiser = torch.optim.AdamW(deformation.networks(), lr=2e-3, weight_decay=0.1)
     indices = seen.nonzero().squeeze(1).tolist()
+    with torch.no_grad():
+        deformation.static.copy_(tracked.canonical[indices].mean(0) - deformation.rest)
+    optimiser = torch.optim.AdamW(deformation.networks(), lr=2e-3, weight_decay=0.1)
     for step in range(steps):
         if step % LOOK_EVERY == 0:
             yield step

@@ -39,7 +39,7 @@ class Tracked:
     """The template in the training frames."""
 
     frames: tuple[int, ...]
-    canonical: Float[Tensor, "t v 3"]  # metres, deformed but unposed
+    canonical: Float[Tensor, "t v 3"]  # metres, deformed but unposed; on the template's device
 
     @property
     def shift(self) -> Float[Tensor, "t v 3"]:
@@ -54,7 +54,7 @@ ReadMesh = Callable[[Capture, int], tuple[np.ndarray, np.ndarray]]  # Frame -> v
 def track_vertices(capture: Capture, template: Template) -> Tracked:
     """The oracle: the true vertices, brought back to canonical space."""
     frames = capture.splits["train"].frames
-    truth = torch.from_numpy(read_template_truth(capture)).float()
+    truth = torch.from_numpy(read_template_truth(capture)).float().to(template.device)
     canonical = [template.pose(Pose(capture.motion, f)).transforms.apply_inverse(truth[f]) for f in frames]
     return Tracked(frames=frames, canonical=torch.stack(canonical))
 
@@ -77,8 +77,9 @@ def track_chamfer(capture: Capture, template: Template, read: ReadMesh, *, rim: 
     corrections are smoothed over the template, less from pass to pass. Where the mesh has a hole nothing pulls, and a
     point that is far off all others around it is noise: the template follows its neighbours there.
     """
-    meshes = {frame: _Mesh(*read(capture, frame), rim=rim) for frame in capture.splits["train"].frames}
-    neighbours = vertex_neighbours(template.mesh)
+    device = template.device
+    meshes = {frame: _Mesh(*read(capture, frame), rim=rim, device=device) for frame in capture.splits["train"].frames}
+    neighbours = vertex_neighbours(template.mesh).to(device)
 
     def towards_mesh(frame: int, posed: Tensor) -> tuple[Tensor, Tensor]:
         return meshes[frame].correction(posed, vertex_normals(posed, template.faces), neighbours)
@@ -88,9 +89,9 @@ def track_chamfer(capture: Capture, template: Template, read: ReadMesh, *, rim: 
 
 def _register(capture: Capture, template: Template, correction: Correction) -> Tracked:
     frames = capture.splits["train"].frames
-    neighbours = vertex_neighbours(template.mesh)
+    neighbours = vertex_neighbours(template.mesh).to(template.device)
     transforms = {frame: template.pose(Pose(capture.motion, frame)).transforms for frame in frames}
-    rest = torch.from_numpy(template.mesh.vertices).float()
+    rest = torch.from_numpy(template.mesh.vertices).float().to(template.device)
     canonical = rest.expand(len(frames), -1, -1).clone()
     some = range(0, len(frames), -(-len(frames) // SHARED_FRAMES))
     for sweeps in SHARED_SWEEPS:
@@ -134,15 +135,17 @@ def _told(weight: Float[Tensor, " v"], neighbours: NeighbourMean) -> Float[Tenso
 
 
 class _Mesh:
-    """A surface of one frame, to look up the nearest points of."""
+    """A surface of one frame on a device, to look up the nearest points of: by SciPy, on the CPU."""
 
-    def __init__(self, vertices: Float[np.ndarray, "s 3"], faces: Int[np.ndarray, "f 3"], *, rim: int) -> None:
+    def __init__(
+        self, vertices: Float[np.ndarray, "s 3"], faces: Int[np.ndarray, "f 3"], *, rim: int, device: torch.device
+    ) -> None:
         """`rim`: how many vertices deep the rim of holes is that is not believed."""
-        self.points = torch.from_numpy(vertices).float()
-        self.normals = _smooth_normals(self.points, torch.from_numpy(faces))
-        self.believed = ~_rim(faces, len(vertices), rings=rim) if rim else torch.ones(len(vertices), dtype=torch.bool)
-        self.tree = cKDTree(vertices)
-        self.few = torch.arange(0, len(vertices), max(1, len(vertices) // POINTS))
+        self.tree, self.places = cKDTree(vertices), vertices.astype(np.float32)
+        self.points = torch.from_numpy(self.places).to(device)
+        self.normals = _smooth_normals(self.points, torch.from_numpy(faces).to(device))
+        self.believed = ~torch.from_numpy(_rim(faces, len(vertices), rings=rim)).to(device)
+        self.few = torch.arange(0, len(vertices), max(1, len(vertices) // POINTS), device=device)
 
     def correction(self, posed: Tensor, normals: Tensor, neighbours: NeighbourMean) -> tuple[Tensor, Tensor]:
         """Mean shift along the normals of the mesh, from each vertex' nearest point and from the points nearest to it;
@@ -160,14 +163,16 @@ class _Mesh:
     def _matches(self, posed: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
         """Pairs of a vertex and a point that belong together."""
         # A vertex without a point in range gets an infinite distance and a number beyond the last point.
-        distance, nearest = self.tree.query(posed.numpy(), distance_upper_bound=RANGE_M)
-        forward = torch.from_numpy(np.minimum(nearest, len(self.points) - 1))
-        back, vertex = (torch.from_numpy(found) for found in cKDTree(posed.numpy()).query(self.points.numpy()))
+        places, device = posed.cpu().numpy(), posed.device
+        distance, nearest = self.tree.query(places, distance_upper_bound=RANGE_M)
+        forward = torch.from_numpy(np.minimum(nearest, len(self.places) - 1)).to(device)
+        back, vertex = (torch.from_numpy(found).to(device) for found in cKDTree(places).query(self.places))
         off, beside = self._apart(posed, forward)
         # A leg under a skirt that alone was scanned is not to be drawn to it: the skirt's own vertices are nearer.
         owner_off, _ = self._apart(posed[vertex[forward]], forward)
-        own = torch.from_numpy(np.isfinite(distance)) & (beside < HOLE_M) & (off.abs() < owner_off.abs() + LAYER_M)
-        vertices = torch.cat([torch.arange(len(posed))[own], vertex[self.few][back[self.few] < RANGE_M]])
+        there = torch.from_numpy(np.isfinite(distance)).to(device)
+        own = there & (beside < HOLE_M) & (off.abs() < owner_off.abs() + LAYER_M)
+        vertices = torch.cat([own.nonzero().squeeze(1), vertex[self.few][back[self.few] < RANGE_M]])
         points = torch.cat([forward[own], self.few[back[self.few] < RANGE_M]])
         kept = ((self.normals[points] * normals[vertices]).sum(1) > ALIGNED) & self.believed[points]
         return vertices[kept], points[kept]
@@ -179,14 +184,15 @@ class _Mesh:
         return off, (apart - normal * off[:, None]).norm(dim=1)
 
 
-def _rim(faces: Int[np.ndarray, "f 3"], count: int, *, rings: int) -> Bool[Tensor, " s"]:
-    """Vertices on open edges, and those around them: seen from aside, a scanner is at its worst there."""
+def _rim(faces: Int[np.ndarray, "f 3"], count: int, *, rings: int) -> Bool[np.ndarray, " s"]:
+    """Vertices on open edges, and those around them, so many deep: seen from aside, a scanner is at its worst there."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
     _, name, uses = np.unique(edges[:, 0] * count + edges[:, 1], return_inverse=True, return_counts=True)
-    rim = torch.zeros(count, dtype=torch.bool)
-    rim[torch.from_numpy(edges[uses[name] == 1].ravel())] = True
+    rim = np.zeros(count, bool)
+    if rings:
+        rim[edges[uses[name] == 1].ravel()] = True
     for _ in range(rings - 1):
-        rim[torch.from_numpy(faces)[rim[torch.from_numpy(faces)].any(1)].reshape(-1)] = True
+        rim[faces[rim[faces].any(1)].ravel()] = True
     return rim
 
 
@@ -201,13 +207,13 @@ def _smooth_normals(vertices: Float[Tensor, "s 3"], faces: Int[Tensor, "f 3"]) -
 
 def _mean_of_matches(values: Tensor, vertices: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Mean of the values `[n, c]` of each vertex' matches, and 1 where there is any, else 0."""
-    total = torch.zeros(count, values.shape[1]).index_add_(0, vertices, values)
-    matches = torch.zeros(count).index_add_(0, vertices, torch.ones(len(vertices)))
+    total = values.new_zeros(count, values.shape[1]).index_add_(0, vertices, values)
+    matches = values.new_zeros(count).index_add_(0, vertices, values.new_ones(len(vertices)))
     return total / matches.clamp(min=1)[:, None], (matches > 0).float()
 
 
 def template_error_mm(template: Template, capture: Capture, frames: tuple[int, ...]) -> Float[np.ndarray, "t v"]:
     """Distance of every posed vertex from where it really is, millimetres: known only because the truth was made."""
     truth = read_template_truth(capture)
-    posed = [template.pose(Pose(capture.motion, frame)).vertices.numpy() for frame in frames]
+    posed = [template.pose(Pose(capture.motion, frame)).vertices.cpu().numpy() for frame in frames]
     return 1e3 * np.linalg.norm(np.stack(posed) - truth[list(frames)], axis=-1)

@@ -41,5 +41,5 @@ def runs_on(device: torch.device) -> bool:
     """Whether Warp has the device too."""
     try:
         return bool(wp.device_from_torch(device).is_cuda)
-    except (RuntimeError, ValueError):
+    except (RuntimeError, ValueError, IndexError):
         return False

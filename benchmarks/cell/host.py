@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, distribution
 from importlib.util import find_spec
 from pathlib import Path
@@ -35,6 +35,7 @@ from benchmarks.cell.cells import CHECKPOINT, Cell, DrawnBy, Status
 from benchmarks.cell.children import end_family, pass_on, peak_memory_mb
 from benchmarks.cell.failing import Killed, MethodFailed
 from benchmarks.cell.guest import LARGEST_HEADER
+from benchmarks.cell.kernels import KERNELS, give_kernels, looking_in
 from benchmarks.cell.methods import OUR_PACKAGES, Method
 from benchmarks.cell.sources import editable_folder, package_files
 from benchmarks.cell.timing import Spent
@@ -252,18 +253,20 @@ def hosted(
         "changes": cell.config.changes,
         "room": None,
     }
+    kernels = give_kernels(cell.config.device, place)
     wanted = not oracle and os.environ.get(ISOLATION) != "off"
     if wanted:
         if store is not None:
             store.mkdir(parents=True, exist_ok=True)
-        order["room"] = asdict(room_for(place, capture, seen, method, store, secret=secret))
-    host, pump = _start(order, isolated=wanted)
+        room = room_for(place, capture, seen, method, store, secret=secret)
+        order["room"] = asdict(replace(room, writable=(*room.writable, str(kernels))))
+    host, pump = _start(order, kernels, isolated=wanted)
     try:
         try:
             host._receive(0)
         except isolation.Refused:
             end_family(host._process)
-            host, pump = _start(order | {"room": None}, isolated=False)
+            host, pump = _start(order | {"room": None}, kernels, isolated=False)
             host._receive(0)
         yield host
     finally:
@@ -271,7 +274,7 @@ def hosted(
         for descriptor in (host._requests, host._replies):
             os.close(descriptor)
         pump.join(5)
-        for name in (EXAM, BASE):
+        for name in (EXAM, BASE, KERNELS):
             shutil.rmtree(place / name, ignore_errors=True)
 
 
@@ -345,7 +348,7 @@ def _package_folders(target: str) -> set[str]:
     return {str(place.resolve()) for place in places}
 
 
-def _start(order: dict[str, Any], *, isolated: bool) -> tuple[Host, threading.Thread]:
+def _start(order: dict[str, Any], kernels: Path, *, isolated: bool) -> tuple[Host, threading.Thread]:
     theirs, requests = os.pipe()
     replies, answers = os.pipe()
     command = [sys.executable, "-m", "benchmarks.cell.guest", str(theirs), str(answers), json.dumps(order)]
@@ -355,6 +358,7 @@ def _start(order: dict[str, Any], *, isolated: bool) -> tuple[Host, threading.Th
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         pass_fds=(theirs, answers),
+        env=looking_in(kernels),
     )
     os.close(theirs)
     os.close(answers)

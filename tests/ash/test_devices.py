@@ -9,11 +9,13 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers.captures import write_tube_capture
-from helpers.devices import META, as_if_averaged, step_of, tiny, without_numbers
+from helpers.devices import META, as_if_averaged, learning_without_numbers, step_of, tiny, without_numbers
 
+import ash.avatar
+import baselines.ddc
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture, Pose
-from ash.config import AshConfig
+from ash.config import AshConfig, TemplateConfig
 from ash.devices import CPU, device_named, moved, obstacle
 from ash.files import InputError
 from ash.presets import PRESETS, named
@@ -21,7 +23,9 @@ from ash.template.graph import NeighbourMean
 from ash.template.template import Template
 from ash.template_learning.deforming import LinearDeformation
 from ash.template_learning.graph_nets import GraphDeformation
+from ash.template_learning.learning import _learn, learned_template
 from ash.textures import TexelLattice, build_lattice
+from baselines.ddc import DdcAvatar, ddc
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +73,78 @@ def test_a_learned_template_is_posed_on_its_device(kind: type, tube: Capture, mo
     monkeypatch.setattr(NeighbourMean, "__call__", as_if_averaged)  # `meta` has no sparse product.
     posed = template.to(META).pose(Pose(tube.motion, 2))
     assert {posed.vertices.device, posed.normals.device, posed.transforms.quats.device} == {META}
+
+
+LEARNED = [("linear", "images"), ("linear", "scans"), ("graph", "vertices")]
+
+
+def learning(network: str, supervision: str) -> TemplateConfig:
+    """A small template, through all that a larger one is learned by."""
+    parts = {"network": network, "supervision": supervision, "weights": "per-node", "skinning": "graph", "dense": True}
+    return TemplateConfig(kind="learned", nodes=30, width=4, blocks=1, steps=3, passes=1, **parts)
+
+
+def unlearned(config: TemplateConfig, tube: Capture) -> LinearDeformation | GraphDeformation:
+    kind = LinearDeformation if config.network == "linear" else GraphDeformation
+    return kind(config, tube.template, tube.skeleton)
+
+
+@pytest.mark.parametrize(("network", "supervision"), LEARNED)
+def test_a_template_is_learned_on_its_device(
+    network: str, supervision: str, tube: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learning_without_numbers(monkeypatch)
+    config = learning(network, supervision)
+    deformation = unlearned(config, tube)
+    _learn(deformation, config, tube, 0, META)
+    assert {value.device for value in deformation.state_dict().values()} == {META}
+
+
+@pytest.mark.parametrize(("network", "supervision"), LEARNED)
+def test_nothing_of_learning_a_template_is_made_on_the_default_device(
+    network: str, supervision: str, tube: Capture
+) -> None:
+    config = learning(network, supervision)
+    deformation, expected = unlearned(config, tube), learned_template(config, tube, seed=0).deformation
+    deformation.load_state_dict(started(config, tube))
+    with META:
+        _learn(deformation, config, tube, 0, CPU)
+    for found, wanted in zip(deformation.parameters(), expected.parameters(), strict=True):
+        assert torch.equal(found, wanted)
+
+
+def started(config: TemplateConfig, tube: Capture) -> dict[str, torch.Tensor]:
+    """What `learned_template` starts from."""
+    torch.manual_seed(0)
+    return unlearned(config, tube).state_dict()
+
+
+@pytest.mark.parametrize("kind", [AshAvatar, DdcAvatar])
+def test_an_avatar_learns_its_template_on_its_own_device(
+    kind: type, tube: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Asked(Exception):
+        """For a template, on a device."""
+
+    def ask(*_: object, device: torch.device, **__: object) -> None:
+        raise Asked(device)
+
+    for module in (ash.avatar, baselines.ddc):
+        monkeypatch.setattr(module, "device_named", lambda name: META)
+        monkeypatch.setattr(module, "template_of", ask)
+    config = named("ci") if kind is AshAvatar else ddc.config("ci")
+    with pytest.raises(Asked, match="meta"):
+        kind(config, tube)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
+@pytest.mark.parametrize(("network", "supervision"), LEARNED)
+def test_a_gpu_learns_the_template_that_the_cpu_learns(network: str, supervision: str, tube: Capture) -> None:
+    config = learning(network, supervision)
+    there, here = (learned_template(config, tube, seed=0, device=torch.device(name)) for name in ("cuda", "cpu"))
+    a, b = (template.pose(Pose(tube.motion, 3)).vertices for template in (there, here))
+    assert a.device == CPU
+    torch.testing.assert_close(a, b, rtol=0, atol=1e-4)
 
 
 def test_moving_nothing_copies_nothing(tube: Capture) -> None:

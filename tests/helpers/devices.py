@@ -8,6 +8,7 @@ product with a sparse matrix, which `meta` has not.
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from helpers.captures import tiny_preset
@@ -17,6 +18,10 @@ import ash.avatar
 import ash.mesh.drawing
 import ash.model
 import ash.template.graph
+import ash.template_learning.image_tracking
+import ash.template_learning.learning
+import ash.template_learning.regressing
+import ash.template_learning.tracking
 import ash.textures
 import ash.training.adam
 import baselines.ddc
@@ -24,7 +29,7 @@ from ash.capture.dataset import Camera, Capture
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted
 from ash.mesh.drawing import SUPERSAMPLING, Topology, _MeshView, _weights_of
-from ash.mesh.rasterizing import project_vertices
+from ash.mesh.rasterizing import Rasterized, project_vertices
 from ash.template.graph import NeighbourMean
 from ash.training.adam import Adam
 from ash.training.batches import draw_batch
@@ -108,3 +113,44 @@ def as_if_averaged(mean: NeighbourMean, x: Tensor) -> Tensor:
 
 def _no_outlines(samples: Tensor, view: _MeshView, topology: Topology) -> Tensor:
     return samples.new_zeros(view.camera.height, view.camera.width, samples.shape[1])
+
+
+def learning_without_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Templates are learned on `meta` and stay there; where NumPy and SciPy work in between, they see other numbers."""
+    images, learning = ash.template_learning.image_tracking, ash.template_learning.learning
+    regressing, tracking = ash.template_learning.regressing, ash.template_learning.tracking
+    monkeypatch.setattr(learning, "CPU", META)
+    monkeypatch.setattr(ash.template.graph.NeighbourMean, "__call__", as_if_averaged)
+    monkeypatch.setattr(images, "_here", _some_numbers)
+    monkeypatch.setattr(images, "rasterize_mesh", _nothing_seen)
+    monkeypatch.setattr(regressing, "_node_translations", _no_translations)
+    monkeypatch.setattr(regressing, "_mean_square", lambda error: _on_meta(error) and 1.0)
+    monkeypatch.setattr(tracking._Mesh, "correction", _no_correction)
+
+
+def _on_meta(*tensors: Tensor) -> bool:
+    assert {tensor.device for tensor in tensors} == {META}
+    return True
+
+
+def _some_numbers(tensor: Tensor) -> np.ndarray:
+    assert _on_meta(tensor)
+    if not tensor.is_floating_point():
+        return np.zeros(tensor.shape, np.int64)
+    return np.random.default_rng(0).uniform(0.1, 1, tensor.shape)
+
+
+def _nothing_seen(vertices: Tensor, faces: Tensor, *, width: int, height: int) -> Rasterized:
+    assert _on_meta(vertices, faces)
+    image = vertices.new_zeros(height, width)
+    return Rasterized(triangle=image.int(), barycentric=image[..., None].expand(-1, -1, 3), depth=image)
+
+
+def _no_translations(graph: Any, shift: Tensor) -> Tensor:
+    assert _on_meta(graph.weights, graph.links, shift)
+    return shift.new_zeros(len(shift), len(graph.nodes), 3)
+
+
+def _no_correction(mesh: Any, posed: Tensor, normals: Tensor, neighbours: NeighbourMean) -> tuple[Tensor, Tensor]:
+    assert _on_meta(mesh.points, mesh.normals, mesh.believed, mesh.few, posed, normals, neighbours.operator)
+    return torch.zeros_like(posed), torch.ones_like(posed[:, 0])

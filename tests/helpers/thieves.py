@@ -94,6 +94,34 @@ class Slow(FakeAvatar):
         return super().render(pose, camera, clock=clock)
 
 
+class Warps(FakeAvatar):
+    """Runs a kernel of Warp's on the CPU, writes down what was compiled before and after, and spoils it."""
+
+    def fit(self, capture: Capture, *, folder: Path) -> None:
+        import torch
+
+        from ash.mesh.rasterizing import rasterize_by_warp
+
+        super().fit(capture, folder=folder)
+        corners = torch.tensor([[0.0, 0, 1], [8, 0, 1], [0, 8, 1]], dtype=torch.float64)
+        before = _files(Path(os.environ["WARP_CACHE_PATH"]))
+        seen = rasterize_by_warp(corners, torch.tensor([[0, 1, 2]], dtype=torch.int32), width=4, height=4, near=0.01)
+        after = _files(Path(os.environ["WARP_CACHE_PATH"]))
+        said = {"before": before, "after": after, "seen": int((seen.triangle == 0).sum())}
+        (folder / "compiled.json").write_text(json.dumps(said))
+        for name in after:
+            (Path(os.environ["WARP_CACHE_PATH"]) / name).write_bytes(b"spoilt")
+
+
+def _files(folder: Path) -> dict[str, int]:
+    """Files below, with the times at which they were written."""
+    return {str(p.relative_to(folder)): p.stat().st_mtime_ns for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def warps(capture: Capture, *, seed: int, preset: str) -> Warps:
+    return Warps(capture, detail=0.9, seed=seed)
+
+
 def thief(capture: Capture, *, seed: int, preset: str) -> Thief:
     return Thief(capture, detail=0.9, seed=seed)
 

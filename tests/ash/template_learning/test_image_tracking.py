@@ -12,8 +12,10 @@ from ash.capture.dataset import Capture, Pose, image_path
 from ash.config import TemplateConfig
 from ash.files import InputError, write_image
 from ash.mesh.drawing import draw_mesh, textured, topology_of
+from ash.mesh.rasterizing import Rasterized, rasterize_by_warp
 from ash.template.graph import build_graph
 from ash.template.template import skinned_template
+from ash.template_learning import image_tracking
 from ash.template_learning.image_tracking import track_images
 from ash.template_learning.observing import observe, sample
 from ash.training.images import Cutout
@@ -83,6 +85,24 @@ def test_every_frame_counts_also_when_there_is_one(capture: Capture) -> None:
     train = replace(capture.splits["train"], frames=(1,))
     left, before = errors_m(replace(capture, splits={"train": train}), passes=3)
     assert left.mean() < 0.6 * before.mean()
+
+
+def test_the_rasteriser_of_a_gpu_shows_the_same(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Warp's, on the CPU."""
+    train = replace(capture.splits["train"], frames=(0, 1))
+    few = replace(capture, splits={"train": train})
+    expected, _ = errors_m(few, passes=2)
+    drawn = []
+
+    def rasterize(corners: torch.Tensor, faces: torch.Tensor, *, width: int, height: int) -> Rasterized:
+        drawn.append(corners)
+        rows = faces.to(torch.int32)
+        return rasterize_by_warp(corners.double().contiguous(), rows, width=width, height=height, near=0.01)
+
+    monkeypatch.setattr(image_tracking, "rasterize_mesh", rasterize)
+    found, _ = errors_m(few, passes=2)
+    assert len(drawn) == 2 * 2 * 8
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
 def test_passes_are_at_least_one() -> None:

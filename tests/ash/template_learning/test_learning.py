@@ -190,6 +190,7 @@ def test_the_key_names_what_decides_a_template_and_nothing_else(capture):
     assert template_key(config, replace(capture, splits={"train": fewer}), seed=0) != key
     one = replace(capture, splits={"train": replace(capture.splits["train"], cameras=("cam1",))})
     assert template_key(config, one, seed=0) == key
+    assert template_key(config, capture, seed=0, device=torch.device("cuda", 1)) != key  # A GPU rounds otherwise.
     images = replace(config, supervision="images")
     assert template_key(images, one, seed=0) != template_key(images, capture, seed=0)
 

@@ -13,7 +13,7 @@ from helpers import fakes, thieves
 from ash.capture.formats import load_capture
 from ash.capture.manifest import verify_capture
 from ash.files import InputError, sha256_of
-from benchmarks.cell import host
+from benchmarks.cell import host, kernels
 from benchmarks.cell.cells import Cell, failed_result, read_result, result_of, write_result
 from benchmarks.cell.failing import MethodFailed
 from benchmarks.cell.methods import find_method
@@ -24,7 +24,7 @@ from benchmarks.suites.runs import cell_for
 from benchmarks.suites.suites import CaptureSpec, CellSpec
 
 LIMITS = Limits(seconds=300.0, memory_mb=4096)
-METHODS = ("thief", "clock", *thieves.HOW, *thieves.SHOWN)
+METHODS = ("thief", "clock", "warps", *thieves.HOW, *thieves.SHOWN)
 
 
 @pytest.fixture(scope="module")
@@ -201,6 +201,38 @@ def test_isolation_costs_a_cell_at_most_half_a_second(
     isolated, exposed = (min(times) for times in zip(*((seconds("on"), seconds("off")) for _ in range(5)), strict=True))
     print(f"isolated {isolated:.3f} s, not isolated {exposed:.3f} s")
     assert isolated - exposed < 0.5
+
+
+@pytest.mark.parametrize("way", ["on", "off"])
+@pytest.mark.parametrize("seeded", [True, False])
+def test_kernels_are_compiled_once_and_every_cell_has_its_own_copy(
+    seeded: bool, way: str, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On Warp's CPU device, as if it were a GPU."""
+    monkeypatch.setattr(kernels, "runs_kernels", lambda device: seeded)
+    monkeypatch.setenv(host.ISOLATION, way)
+    target, whole = cell("warps", capture, tmp_path), load_capture(capture)
+    method = find_method("warps")
+    with (
+        seen_by_method(whole, tmp_path / "input", oracle=False) as seen,
+        host.hosted(target, whole, seen, method, oracle=False) as guest,
+    ):
+        guest.make()
+        guest.fit()
+    told = json.loads((target.folder / host.WORK / "compiled.json").read_text())
+    assert told["seen"] == 16, "the triangle covers the whole picture"
+    assert bool(told["before"]) == seeded and bool(told["after"])
+    assert (told["after"] == told["before"]) == seeded, "what lies there is not compiled again"
+    assert not (target.folder / kernels.KERNELS).exists()
+    if seeded:
+        again = kernels.give_kernels("cpu", tmp_path / "again")
+        assert not [path for path in again.rglob("*") if path.is_file() and path.read_bytes() == b"spoilt"]
+
+
+def test_without_a_gpu_there_is_nothing_to_compile(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert not any(kernels.give_kernels("cpu", tmp_path).iterdir()) and capfd.readouterr().err == ""
+    assert not any(kernels.give_kernels("cuda:99", tmp_path).iterdir())
+    assert "device cuda:99: no kernels are compiled, Warp" in capfd.readouterr().err
 
 
 def test_a_capture_that_a_method_changed_is_seen_and_used_no_more(

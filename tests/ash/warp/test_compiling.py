@@ -1,0 +1,40 @@
+"""What is compiled ahead is all that there is: a process that finds the copy compiles nothing."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+
+import ash.warp
+from ash.warp.compiling import MODULES, copy_compiled, main
+
+TESTS = Path(__file__).parents[2]
+LEARNS = """
+import torch
+from helpers.numerics import random_scene, splat_warp, values_and_gradients
+values_and_gradients(splat_warp, random_scene(cameras=2), torch.float32)
+"""
+
+
+def test_a_splatter_that_finds_the_copy_compiles_nothing(tmp_path: Path) -> None:
+    copy_compiled(torch.device("cpu"), tmp_path)
+    before = _files(tmp_path)
+    found = os.environ | {"WARP_CACHE_PATH": str(tmp_path), "PYTHONPATH": str(TESTS)}
+    subprocess.run([sys.executable, "-c", LEARNS], env=found, check=True)
+    assert _files(tmp_path) == before
+
+
+def test_no_kernel_is_left_out() -> None:
+    holding = {path.stem for path in Path(ash.warp.__path__[0]).glob("*.py") if "\n@wp.kernel" in path.read_text()}
+    assert {module.__name__ for module in MODULES} == {f"ash.warp.{name}" for name in holding}
+
+
+def test_the_command_fills_a_folder(tmp_path: Path) -> None:
+    assert main(["cpu", str(tmp_path)]) == 0
+    assert len(list(tmp_path.glob("*/wp_ash.warp.*"))) == len(MODULES)
+
+
+def _files(folder: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
