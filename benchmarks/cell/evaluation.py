@@ -178,7 +178,7 @@ def scored_views(cell: Cell, capture: Capture, views: Sequence[View]) -> list[Vi
 def _score(cell: Cell, capture: Capture, view: View, prediction: np.ndarray) -> ViewScore:
     truth = metrics.on_black(capture.image(view.camera, view.frame))
     scores = metrics.score_view(prediction, truth)
-    perceptual = _perceptual()
+    perceptual = _perceptual(cell.config.device)
     if perceptual is not None:
         scores["full", "lpips"] = perceptual(prediction[..., :3], truth[..., :3])
     noise = pixels_path(capture.folder, view.camera, view.frame)
@@ -190,14 +190,15 @@ def _score(cell: Cell, capture: Capture, view: View, prediction: np.ndarray) -> 
 
 
 @cache
-def _perceptual() -> Callable[[np.ndarray, np.ndarray], float] | None:
-    """LPIPS, where the user gave its weights."""
+def _perceptual(device: str) -> Callable[[np.ndarray, np.ndarray], float] | None:
+    """LPIPS, where the user gave its weights; on the device that the pictures are from, or the CPU without it here."""
     path = weights_file()
     if path is None:
         return None
+    from ash.devices import obstacle
     from benchmarks.cell.lpips import Lpips
 
-    return Lpips(path)
+    return Lpips(path, "cpu" if device == "cpu" or obstacle(device) else device)
 
 
 def _image_summary(scored: list[ViewScore]) -> tuple[Summary, ...]:

@@ -20,20 +20,21 @@ SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 
 
 class Lpips:
-    """Distance of two images; small is alike."""
+    """Distance of two images, computed on a device; small is alike."""
 
-    def __init__(self, backbone: Path) -> None:
-        self.trunk = _trunk(_load(backbone), backbone)
+    def __init__(self, backbone: Path, device: str = "cpu") -> None:
+        self.device = torch.device(device)
+        self.trunk = _trunk(_load(backbone), backbone).to(self.device)
         found = _load(_heads_file())
         try:
-            self.heads = [found[f"lin{i}.model.1.weight"] for i in range(len(TAPS))]
+            self.heads = [found[f"lin{i}.model.1.weight"].to(self.device) for i in range(len(TAPS))]
         except KeyError as error:
             raise InputError(f"{_heads_file()}: expected the heads of LPIPS, which has no {error}") from error
 
     def __call__(self, predicted: np.ndarray, truth: np.ndarray) -> float:
         """LPIPS x 1000 of uint8 images `[h, w, 3]`, whole frame."""
         with torch.no_grad():
-            pair = [_activations(self.trunk, _prepared(image)) for image in (predicted, truth)]
+            pair = [_activations(self.trunk, _prepared(image).to(self.device)) for image in (predicted, truth)]
             terms = [(((a - b) ** 2) * head).sum(1).mean() for a, b, head in zip(*pair, self.heads, strict=True)]
         return 1000 * float(torch.stack(terms).sum())
 

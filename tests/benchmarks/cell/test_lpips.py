@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from ash.files import InputError
-from benchmarks.cell import lpips, weights
+from benchmarks.cell import evaluation, lpips, weights
 
 
 def alexnet() -> nn.Sequential:
@@ -62,6 +62,22 @@ def test_it_agrees_with_the_package(backbone: Path, pair, monkeypatch: pytest.Mo
     with torch.no_grad():
         expected = 1000 * float(reference(*images))
     assert lpips.Lpips(backbone)(*pair) == pytest.approx(expected, rel=1e-4)
+
+
+def test_it_is_computed_on_its_device(backbone: Path, pair) -> None:
+    """Shapes without numbers go all the way: nothing stays behind on the CPU, where it would raise sooner."""
+    with pytest.raises(RuntimeError, match="item"):
+        lpips.Lpips(backbone, "meta")(*pair)
+
+
+def test_a_machine_without_the_device_of_the_pictures_computes_it_on_its_cpu(
+    backbone: Path, pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(weights.ENVIRONMENT, str(backbone))
+    evaluation._perceptual.cache_clear()
+    distances = [evaluation._perceptual(device)(*pair) for device in ("cpu", "cuda:99")]
+    evaluation._perceptual.cache_clear()
+    assert distances[0] == distances[1] > 0
 
 
 def test_without_weights_there_is_none(tmp_path: Path, backbone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
