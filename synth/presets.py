@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from ash.capture.dataset import Skeleton
 from ash.files import InputError
@@ -14,6 +15,7 @@ from synth.scene import Clip, Light, Outfit, Rig, Scene, Take
 
 SIZES = ("ci", "rung", "quick", "long", "table", "paper")
 ROTATING = Rig(cameras=24, held_out=4, part=4)
+ALONE: dict[str, Any] = {"near": (), "far": (), "near_stride": 1, "far_stride": 1}  # no motion beside what is asked for
 EVENING = Light(falloff=0.4, gloss=0.2)  # a lamp that lights one side of the floor, on cloth that shines a little
 
 
@@ -140,7 +142,7 @@ def still(*, size: str, seed: int) -> Scene:
     base = skinned(size=size, seed=seed)
     train, test = (Clip(generator="stand", frames=frames) for frames in (4, 2))
     rig = replace(base.rig, part=0)
-    return replace(base, name="still", rig=rig, train=(train,), test=(test,), near=(), far=(), novel_view_stride=2)
+    return replace(base, name="still", rig=rig, train=(train,), test=(test,), **ALONE, novel_view_stride=2)
 
 
 RUNGS = ("wrinkles", "swing", "lit", "glossy", "turning")
@@ -179,7 +181,7 @@ def with_motion(
         most = sum(clip.frames for clip in clips)
         return clips if path is None else (clip_from_file(path, skeleton, fps=scene.fps, most=most, take=take),)
 
-    return replace(scene, train=driven(scene.train, train), test=driven(scene.test, test), near=(), far=())
+    return replace(scene, train=driven(scene.train, train), test=driven(scene.test, test), **ALONE)
 
 
 def with_rig(scene: Scene, path: Path) -> Scene:

@@ -191,14 +191,13 @@ def _score(cell: Cell, capture: Capture, view: View, prediction: np.ndarray) -> 
 
 @cache
 def _perceptual(device: str) -> Callable[[np.ndarray, np.ndarray], float] | None:
-    """LPIPS, where the user gave its weights; on the device that the pictures are from, or the CPU without it here."""
+    """LPIPS, where the user gave its weights."""
     path = weights_file()
     if path is None:
         return None
-    from ash.devices import obstacle
     from benchmarks.cell.lpips import Lpips
 
-    return Lpips(path, "cpu" if device == "cpu" or obstacle(device) else device)
+    return Lpips(path, device)
 
 
 def _image_summary(scored: list[ViewScore]) -> tuple[Summary, ...]:

@@ -20,10 +20,10 @@ SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 
 
 class Lpips:
-    """Distance of two images, computed on a device; small is alike."""
+    """Distance of two images, computed on a device, or on the CPU where that is not there; small is alike."""
 
     def __init__(self, backbone: Path, device: str = "cpu") -> None:
-        self.device = torch.device(device)
+        self.device = _there(device)
         self.trunk = _trunk(_load(backbone), backbone).to(self.device)
         found = _load(_heads_file())
         try:
@@ -37,6 +37,13 @@ class Lpips:
             pair = [_activations(self.trunk, _prepared(image).to(self.device)) for image in (predicted, truth)]
             terms = [(((a - b) ** 2) * head).sum(1).mean() for a, b, head in zip(*pair, self.heads, strict=True)]
         return 1000 * float(torch.stack(terms).sum())
+
+
+def _there(device: str) -> torch.device:
+    try:
+        return torch.empty(0, device=device).device
+    except (AssertionError, RuntimeError):  # A torch without CUDA, a machine without the GPU.
+        return torch.device("cpu")
 
 
 def _prepared(image: np.ndarray) -> Float[Tensor, "1 3 h w"]:

@@ -18,6 +18,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 import ash.avatar
 import ash.model
 import baselines.ddc
+from ash import harmonics
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture, Pose
 from ash.devices import CPU, moved
@@ -89,6 +90,8 @@ def fake_cuda(monkeypatch: pytest.MonkeyPatch) -> Any:
         centres = gaussians.means[None, :, :2]
         return Splatted(rgb=image[..., None].expand(-1, -1, -1, 3), alpha=image, depth=image, means2d=centres)
 
+    for degree in range(4):
+        harmonics._sampling(degree)  # Kept for the process, so made of numbers before anything is fake.
     without_numbers(monkeypatch)
     for module in (ash.avatar, baselines.ddc):  # Made on the CPU, then moved.
         monkeypatch.setattr(module, "device_named", lambda name: CPU)
