@@ -13,7 +13,7 @@ from ash.config import TrainingConfig
 
 FIRST_MARK = 64  # Steps after which views are scored for the first time; twice on the way to half as many more, ...
 LEAST_STEPS = 1000  # Before that a lull is chance: static Gaussians rest at 200 steps and gain 0.5 dB afterwards.
-GAIN_DB = 0.1  # Less than that, gained over the last third of the steps, is a plateau.
+GAIN_DB = 0.1  # Less than that, gained over the last third of the steps at two marks in a row, is a plateau.
 RAMP_STEPS = 20  # Over which the learning rates rise.
 DECAY = 0.25  # Of the steps before they fall, hence the last fifth of all.
 FINAL_LEARNING_RATE = 0.02  # Of the initial one, at the end.
@@ -74,15 +74,20 @@ def decided(course: TrainingCourse, config: TrainingConfig, *, step: int, second
     if course.decay_from is not None:
         return course
     share = 1.0 if config.schedule == "constant" else 1 / (1 + DECAY)
-    gain = gain_of_last_third(course.scores, since=2 * config.warmup_steps)
     if step >= share * config.steps:
         return replace(course, decay_from=step, ended_by="steps")
     if seconds >= share * config.seconds:
         return replace(course, decay_from=step, ended_by="seconds")
     scored = step >= LEAST_STEPS and course.scores and course.scores[-1].step == step
-    if scored and gain is not None and gain < GAIN_DB:
+    if scored and rests(course.scores, since=2 * config.warmup_steps):
         return replace(course, decay_from=step, ended_by="plateau")
     return course
+
+
+def rests(scores: tuple[ReservedScore, ...], *, since: int) -> bool:
+    """Whether less than `GAIN_DB` was gained twice in a row: one score alone strays by as much as that."""
+    gains = [gain_of_last_third(scores[: len(scores) - back], since=since) for back in (0, 1)]
+    return all(gain is not None and gain < GAIN_DB for gain in gains)
 
 
 def last_step(course: TrainingCourse, config: TrainingConfig) -> int:

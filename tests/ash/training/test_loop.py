@@ -103,7 +103,7 @@ def test_a_run_stopped_before_and_in_its_decay_decides_nothing_anew(capture, tmp
     settings = config(steps=200, warmup="none", warmup_steps=0)
     undisturbed = AshAvatar(settings, capture)
     undisturbed.fit(capture, folder=tmp_path / "whole")
-    assert (undisturbed.outcome().ended_by, undisturbed.outcome().steps) == ("plateau", 15)
+    assert (undisturbed.outcome().ended_by, undisturbed.outcome().steps) == ("plateau", 19)
     for stop in (3, 9, 11, 13):
         avatar = AshAvatar(settings, capture)
         stop_before_end_of(avatar, stop)

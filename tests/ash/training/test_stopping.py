@@ -44,14 +44,22 @@ def test_marks_come_twice_on_the_way_to_half_as_many_steps_more():
 
 
 def test_training_ends_a_quarter_after_the_scores_stop_gaining():
-    """A decibel per e-fold until 3,000 steps, then nothing: the plateau shows at the second mark after that."""
+    """A decibel per e-fold until 3,000 steps, then nothing: the plateau shows at the third mark after that."""
     course, factors = train(lambda step: 20 + math.log(min(step, 3000)), CONFIG)
     assert course.ended_by == "plateau"
-    assert 3000 < course.decay_from < 3000 * 1.5**1.5
+    assert 3000 < course.decay_from < 3000 * 1.5**2
     assert len(factors) == pytest.approx(course.decay_from / 0.8, abs=1)
     before = [score for score in course.scores if score.step <= course.decay_from]
     assert gain_of_last_third(tuple(before)) < 0.1
-    assert gain_of_last_third(tuple(before[:-1])) > 0.1
+    assert gain_of_last_third(tuple(before[:-1])) < 0.1
+    assert gain_of_last_third(tuple(before[:-2])) > 0.1
+
+
+def test_one_score_that_strays_is_no_plateau():
+    steady = 0.15 / math.log(1.5)
+    course, _ = train(lambda step: steady * math.log(step) - 0.06 * (1500 < step < 1700), CONFIG)
+    assert any(score.step == 1640 for score in course.scores)
+    assert course.ended_by == "steps"
 
 
 def test_a_curve_that_gains_a_tenth_in_every_third_never_ends_by_itself():
