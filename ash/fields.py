@@ -4,6 +4,7 @@ A scene, a preset and a user's configuration are varied in one way: a mapping of
 `train.0.yaw` is a field of the first element of a tuple.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from difflib import get_close_matches
@@ -17,6 +18,7 @@ Config = TypeVar("Config")
 Changes = tuple[
     tuple[str, Any], ...
 ]  # Dotted key and value, in order of the keys: what is replaced in a configuration.
+INFINITE = ("inf", "-inf")  # JSON has no number for them.
 WRITTEN: dict[Any, str] = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
 
 
@@ -32,6 +34,11 @@ def changed(before: Any, after: Any) -> Changes:
     """What to replace in `before` to get `after`, two dataclasses of the same type."""
     old = flat(before)
     return tuple((key, value) for key, value in sorted(flat(after).items()) if key not in old or old[key] != value)
+
+
+def for_json(changes: Changes) -> dict[str, Any]:
+    """Changes as a file or a hash takes them: where a number is infinite its name, which `replaced` takes as well."""
+    return {key: str(value) if isinstance(value, float) and math.isinf(value) else value for key, value in changes}
 
 
 def replaced(config: Config, changes: Mapping[str, Any] | Changes, *, of: str) -> Config:
@@ -100,7 +107,7 @@ def _hint(config: Any, name: str) -> Any:
 
 def _of_type(hint: Any, value: Any, where: str) -> Any:
     """The value, if it is what the annotation wants: a list stands for a tuple, a whole number for a real one."""
-    value = _as_tuple(value)
+    value = float(value) if hint is float and value in INFINITE else _as_tuple(value)
     try:
         check_type(value, hint)
         if isinstance(value, bool) and hint in (int, float):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ash.capture.formats import load_capture
 from ash.capture.typed import from_json
+from ash.fields import for_json
 from ash.files import InputError, only_run_in, read_json, require_plain, write_json
 from benchmarks.cell.cells import Cell, CellConfig, CellResult, read_cell, result_of
 from benchmarks.cell.methods import code_version, find_method
@@ -110,7 +111,7 @@ def cell_for(spec: CellSpec, capture_folder: Path, out: Path) -> Cell:
         seed=spec.seed,
         code=code_version(spec.factory or spec.method),
         factory=spec.factory,
-        changes=dict(spec.changes),
+        changes=for_json(spec.changes),
         axis=spec.capture.stress.axis if spec.capture.stress else "",
         severity=spec.capture.stress.severity if spec.capture.stress else 0.0,
         subject=subject_of(capture.manifest),

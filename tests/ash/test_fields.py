@@ -1,11 +1,12 @@
 """Dotted keys: what a configuration holds, what differs, and what is refused."""
 
+import math
 from dataclasses import dataclass
 
 import pytest
 
-from ash.fields import changed, flat, nearest, replaced
-from ash.files import InputError
+from ash.fields import changed, flat, for_json, nearest, replaced
+from ash.files import InputError, hash_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +41,12 @@ def test_every_field_has_a_key_and_what_differs_is_found() -> None:
 def test_values_are_what_the_annotation_says() -> None:
     after = replaced(Whole(), {"part.names": ["a"], "part.share": 1}, of="whole")
     assert after.part.names == ("a",) and type(after.part.share) is float
+
+
+def test_an_infinite_number_goes_through_files() -> None:
+    changes = for_json((("part.share", math.inf), ("part.size", 8)))
+    assert changes == {"part.share": "inf", "part.size": 8} and hash_of(changes)
+    assert replaced(Whole(), changes, of="whole").part == Part(share=math.inf, size=8)
 
 
 def test_a_value_may_follow_from_the_rest() -> None:

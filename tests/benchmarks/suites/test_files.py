@@ -1,6 +1,7 @@
 """A suite's file: ours and a user's, and errors that name file, line and key."""
 
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from ash.files import InputError
 from benchmarks.cell.methods import WRONG_BY_MM, is_oracle
 from benchmarks.suites.captures import described
 from benchmarks.suites.files import find_suite, given_captures, line_of, read_suite, suite_files
+from benchmarks.suites.runs import cell_for
 from benchmarks.suites.suites import SceneSpec, varied_name
 
 GOOD = """\
@@ -150,6 +152,13 @@ def test_our_suites_are_such_files() -> None:
         assert suite.name == name and suite.about and list(suite.cells)
     template = {row.name for row in find_suite("template").methods}
     assert {method for row in WRONG_BY_MM.values() for method in row} <= template
+
+
+def test_every_row_of_our_suites_has_an_identity(tmp_path: Path) -> None:
+    capture = fakes.write_capture(tmp_path / "mine")
+    for suite in map(find_suite, suite_files()):
+        rows = [cell_for(cell, capture, tmp_path).config for cell in islice(suite.cells, len(suite.methods))]
+        assert len({row.key for row in rows}) == len(suite.methods)
 
 
 def test_every_subject_has_its_captures_and_subject_0_keeps_its_names(tmp_path: Path) -> None:
