@@ -1,6 +1,5 @@
 """How fast the kernels are beside their definitions, all in one run: `ash-bench speed kernels`."""
 
-import statistics
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -18,7 +17,8 @@ from ash.mesh.rasterizing import rasterize_mesh, rasterize_mesh_naive
 from ash.native.library import fma_peak, instruction_set, stage_ms
 from ash.training.losses import l1_ssim_loss, l1_ssim_loss_naive, ssim_target
 from benchmarks.cell.timing import peak_memory_mb
-from benchmarks.speed.rows import SpeedRow, TimedCandidate, as_json, in_turns, print_rows, rows_of, time_interleaved
+from benchmarks.speed.mixture import Mixture, print_mixtures, time_mixture
+from benchmarks.speed.rows import SpeedRow, as_json, in_turns, print_rows, rows_of, time_interleaved
 from benchmarks.speed.scenes import SplatScene, body_mesh, splat_scene
 
 # Floating point operations of one splat at one pixel, counted in native/blend.inc: the exponent and its power of two,
@@ -43,20 +43,6 @@ class SplatDetail:
     backward_peak_share: float
 
 
-@dataclass(frozen=True, kw_only=True)
-class Mixture:
-    """What splatting and torch's convolutions cost each other, both on two threads."""
-
-    convolution_ms: float
-    splat_ms: float
-    alternating_ms: float
-
-    @property
-    def ratio(self) -> float:
-        """Alternating over the sum of both alone; 1: they do not disturb each other."""
-        return self.alternating_ms / (self.convolution_ms + self.splat_ms)
-
-
 def speed_kernels(
     *, rounds: int = 3, threads: tuple[int, ...] = (1, 2), device: torch.device = CPU
 ) -> Iterator[list[SpeedRow] | SplatDetail | Mixture]:
@@ -72,7 +58,7 @@ def speed_kernels(
     for size, pixels in (("256", 256), ("512", 512)):
         yield _time_rasterizer(size, pixels, rounds=rounds, threads=threads, device=device)
     if device == CPU:
-        yield time_mixture(rounds=10 * rounds)
+        yield from time_mixture(rounds=5 * rounds)
 
 
 def time_splat(scene: SplatScene, *, rounds: int, threads: tuple[int, ...]) -> Iterator[list[SpeedRow] | SplatDetail]:
@@ -114,36 +100,6 @@ def time_splat(scene: SplatScene, *, rounds: int, threads: tuple[int, ...]) -> I
             forward_peak_share=forward_rate * FORWARD_FLOPS / peak,
             backward_peak_share=backward_rate * BACKWARD_FLOPS / peak,
         )
-
-
-def time_mixture(*, rounds: int, threads: int = 2) -> Mixture:
-    """Forward and backward of a convolution and of scene S, each alone and by turns: medians in milliseconds."""
-    scene = splat_scene("S")
-    leaves = {name: getattr(scene.gaussians, name).clone().requires_grad_() for name in Gaussians.__slots__}
-    layer = torch.nn.Conv2d(32, 32, 3, padding=1)
-    features = torch.randn(1, 32, 64, 64, generator=torch.Generator().manual_seed(0))
-
-    def convolve() -> None:
-        layer(features).square().sum().backward()
-
-    def draw() -> None:
-        splat(Gaussians(**leaves), **scene.cameras, threads=threads).rgb.sum().backward()
-
-    def both() -> None:
-        convolve()
-        draw()
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        medians = []
-        for call in (convolve, draw, both):
-            candidate = TimedCandidate(name="mixture", threads=threads, call=call)
-            samples = time_interleaved([candidate], rounds=rounds)["mixture", threads]
-            medians.append(statistics.median(samples[len(samples) // 10 :]))
-    finally:
-        torch.set_num_threads(before)
-    return Mixture(convolution_ms=medians[0], splat_ms=medians[1], alternating_ms=medians[2])
 
 
 def count_pairs(scene: SplatScene) -> tuple[float, int]:
@@ -230,13 +186,11 @@ def main(json_path: Path | None, device: torch.device = CPU) -> int:
             _print_detail(result)
         elif isinstance(result, Mixture):
             mixtures.append(result)
-            print(
-                f"on two threads each: convolution {result.convolution_ms:.2f} ms, splat S {result.splat_ms:.2f} ms,"
-                f" by turns {result.alternating_ms:.2f} ms: {result.ratio:.2f} of the sum"
-            )
         else:
             rows += result
             print_rows(result)
+    if mixtures:
+        print_mixtures(mixtures)
     peak_mb = peak_memory_mb()
     print(f"peak memory of this process, torch and the definitions included: {peak_mb:.0f} MB")
     if json_path is not None:
