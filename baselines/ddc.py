@@ -26,7 +26,7 @@ from ash.files import InputError, write_atomic
 from ash.gaussians.initialising import initial_texture
 from ash.gaussians.texels import LIGHT_COEFFICIENTS
 from ash.kept import Kept
-from ash.mesh.drawing import draw_mesh_views, textured, topology_of
+from ash.mesh.drawing import MeshView, draw_seen, see_mesh, textured, topology_of
 from ash.model import stage
 from ash.presets import Recipe, named
 from ash.protocol import Display, DressedMesh, StageClock, TrainingOutcome
@@ -165,16 +165,20 @@ class DdcModel(MovingModule):
         phi = self.phi(conditions.root_translation) if self.phi is not None else None
         return self.network(seen, phi).squeeze(0)  # type: ignore[no-any-return]
 
+    def see(self, posed: PosedTemplate, cameras: list[Camera]) -> list[MeshView]:
+        """What cameras of one size see of the posed mesh, whatever its texture."""
+        return see_mesh(posed.vertices, self.topology, cameras)
+
     def draw(
-        self, texture: Float[Tensor, "3 t t"], posed: PosedTemplate, cameras: list[Camera], background: Tensor
+        self, texture: Float[Tensor, "3 t t"], posed: PosedTemplate, views: list[MeshView], background: Tensor
     ) -> Float[Tensor, "c h w 4"]:
         """Rgb over `background`, and coverage. Differentiable in the texture, the light and the posed vertices.
 
         Outlines are blended while vertices learn, for the gradient's sake; what is shown counts samples.
         """
         shade = textured(texture, self.uvs, self.uv_faces, posed.normals, self.template.faces, self.light)
-        learns = posed.vertices.requires_grad
-        return draw_mesh_views(posed.vertices, self.topology, cameras, shade, background, outlines=learns)
+        learns = any(view.corners.requires_grad for view in views)
+        return draw_seen(views, self.topology, shade, background, outlines=learns)
 
     def refined(self, posed: PosedTemplate, conditions: MeshConditions) -> PosedTemplate:
         """The template with its vertices where the images moved them. The light keeps the normals that it had."""
@@ -214,6 +218,8 @@ class DdcAvatar:
         self.template = self.module.template
         self._motion = capture.motion
         self._outcome: TrainingOutcome | None = None
+        # Vertices, cameras and what these see of them, in the training views drawn last.
+        self._seen: tuple[Tensor, list[Camera], list[MeshView]] | None = None
         # The template is frozen: each training frame is posed once, as far as there is room.
         self._conditions: Kept[int, MeshConditions] = Kept(
             lambda frame: self.module.conditions(Pose(capture.motion, frame))
@@ -259,16 +265,28 @@ class DdcAvatar:
         texture = self._training_texture(frame, step)
         with torch.set_grad_enabled(torch.is_grad_enabled() and step % self.config.vertices_every == 0):
             posed = self._refined(frame)
-        return self._drawn(texture, posed, cameras, background)
+        views = self.module.see(posed, cameras)
+        constant = [replace(view, corners=view.corners.detach()) for view in views]
+        self._seen = posed.vertices.detach(), cameras, constant
+        return self._drawn(texture, posed, views, background)
 
     def draw_static_views(self, frame: int, cameras: list[Camera], background: Tensor) -> Tensor | None:
         """Views with the texture that counts far from the training motion; its vertices are not its own."""
         static = self.module.static_texture
         if static is None:
             return None
-        with torch.no_grad():
-            posed = self._refined(frame)
-        return self._drawn(static, posed, cameras, background)
+        posed, views = self._seen_just_now(frame, cameras)
+        return self._drawn(static, posed, views, background)
+
+    @torch.no_grad()
+    def _seen_just_now(self, frame: int, cameras: list[Camera]) -> tuple[PosedTemplate, list[MeshView]]:
+        """The posed mesh and what these cameras see of it: where it is as it was drawn last, that is not found anew."""
+        posed = self._refined(frame)
+        if self._seen is not None:
+            vertices, by, views = self._seen
+            if by is cameras and torch.equal(vertices, posed.vertices):
+                return posed, views
+        return posed, self.module.see(posed, cameras)
 
     @torch.no_grad()
     def end_warmup(self) -> None:
@@ -276,9 +294,9 @@ class DdcAvatar:
         if self.module.static_texture is not None:
             self.module.static_texture.copy_(self.module.texture)
 
-    def _drawn(self, texture: Tensor, posed: PosedTemplate, cameras: list[Camera], background: Tensor) -> Tensor:
+    def _drawn(self, texture: Tensor, posed: PosedTemplate, views: list[MeshView], background: Tensor) -> Tensor:
         flat = background if background.ndim == 1 else background.new_zeros(3)
-        drawn = self.module.draw(texture, posed, cameras, flat)
+        drawn = self.module.draw(texture, posed, views, flat)
         return drawn[..., :3] if background.ndim == 1 else over(drawn[..., :3], drawn[..., 3], background)
 
     def corrections(self, frame: int) -> Tensor | None:
@@ -306,7 +324,8 @@ class DdcAvatar:
         """Premultiplied RGBA, float32 `[h, w, 4]`."""
         posed, texture = self.dress(pose, clock)
         with stage(clock, "stg4", self.device):
-            return self.module.draw(texture, posed, [camera], texture.new_zeros(3))[0].clamp(0, 1).cpu().numpy()
+            views = self.module.see(posed, [camera])
+            return self.module.draw(texture, posed, views, texture.new_zeros(3))[0].clamp(0, 1).cpu().numpy()
 
     @torch.no_grad()
     def dress(self, pose: Pose, clock: StageClock) -> tuple[PosedTemplate, Float[Tensor, "3 t t"]]:

@@ -36,7 +36,8 @@ class OracleTexture(DdcAvatar):
         """The texture, drawn into each camera."""
         if frame not in self._surfaces:
             self._surfaces[frame] = self.template.pose(Pose(self._motion, frame))
-        return self._drawn(self.module.texture, self._surfaces[frame], cameras, background)
+        posed = self._surfaces[frame]
+        return self._drawn(self.module.texture, posed, self.module.see(posed, cameras), background)
 
     def corrections(self, frame: int) -> None:
         """There is nothing that could differ between frames."""

@@ -18,7 +18,7 @@ from torch import Tensor
 import ash.native.shading
 from ash.capture.dataset import Camera
 from ash.harmonics import sh_basis
-from ash.mesh.rasterizing import project_vertices, rasterize_mesh
+from ash.mesh.rasterizing import Rasterized, project_vertices, rasterize_mesh
 
 SUPERSAMPLING = 2  # Samples per pixel side.
 OWN_SURFACE_M = 0.15  # A sample inside an outline that is this far from it in depth shows another surface.
@@ -45,6 +45,17 @@ def topology_of(faces: Int[Tensor, "f 3"]) -> Topology:
     total = np.bincount(name, weights=owner, minlength=len(count)).astype(np.int64)
     across = np.where(count[name] == 2, total[name] - owner, -1)
     return Topology(faces=faces, across=torch.from_numpy(across.reshape(-1, 3)))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class MeshView:
+    """What the samples of one camera see."""
+
+    camera: Camera
+    corners: Float[Tensor, "v 3"]  # homogeneous samples
+    drawn: Rasterized
+    covered: Int[Tensor, " n"]  # samples that see a triangle, row-major
+    seen: Int[Tensor, " n"]  # theirs
 
 
 def draw_mesh(
@@ -75,9 +86,26 @@ def draw_mesh_views(
     surfaces is in front. `outlines`: blend samples at outlines, which their gradient needs; without, coverage counts
     samples, as a display does.
     """
-    views = [_view_of(vertices, topology, camera) for camera in cameras]
+    return draw_seen(see_mesh(vertices, topology, cameras), topology, shade, background, outlines=outlines)
+
+
+def see_mesh(vertices: Float[Tensor, "v 3"], topology: Topology, cameras: list[Camera]) -> list[MeshView]:
+    """What each camera sees of a mesh, whatever its colours: the first half of `draw_mesh_views`."""
+    return [_view_of(vertices, topology, camera) for camera in cameras]
+
+
+def draw_seen(
+    views: list[MeshView],
+    topology: Topology,
+    shade: Shade,
+    background: Float[Tensor, " c"],
+    *,
+    outlines: bool = False,
+) -> Float[Tensor, "n h w d"]:
+    """The second half of `draw_mesh_views`: the same views may be drawn in several colours."""
+    weights = torch.cat([_weights_in(view, topology) for view in views])
     # All at once: a texture's gradient is as large as the texture, however many samples it has.
-    colours = shade(torch.cat([view.seen for view in views]), torch.cat([view.weights for view in views]))
+    colours = shade(torch.cat([view.seen for view in views]), weights)
     images = []
     for view, own in zip(views, colours.split([len(view.seen) for view in views]), strict=True):
         image = _resolved(own, view.covered, background, view.camera)
@@ -88,41 +116,23 @@ def draw_mesh_views(
     return torch.stack(images)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _MeshView:
-    """What the samples of one camera see."""
-
-    camera: Camera
-    corners: Float[Tensor, "v 3"]  # homogeneous samples
-    triangle: Int[Tensor, "h w"]  # -1: none
-    depth: Float[Tensor, "h w"]
-    covered: Int[Tensor, " n"]  # samples that see a triangle, row-major
-    seen: Int[Tensor, " n"]  # theirs
-    weights: Float[Tensor, "n 3"]  # of its corners
-
-
-def _view_of(vertices: Float[Tensor, "v 3"], topology: Topology, camera: Camera) -> _MeshView:
+def _view_of(vertices: Float[Tensor, "v 3"], topology: Topology, camera: Camera) -> MeshView:
     width, height = camera.width * SUPERSAMPLING, camera.height * SUPERSAMPLING
     scale = torch.diag(vertices.new_tensor([SUPERSAMPLING, SUPERSAMPLING, 1.0]))
     viewmat, K = torch.from_numpy(camera.viewmat).to(vertices), scale @ torch.from_numpy(camera.K).to(vertices)
     corners = project_vertices(vertices, viewmat, K)
     drawn = rasterize_mesh(corners, topology.faces, width=width, height=height)
-    triangle = drawn.triangle.long()
-    covered = (triangle.reshape(-1) >= 0).nonzero().squeeze(1)
-    seen = triangle.reshape(-1)[covered]
-    if vertices.requires_grad:
-        weights = _weights_of(corners, topology.faces, seen, covered, width)
-    else:
-        weights = drawn.barycentric.reshape(-1, 3)[covered].to(vertices)
-    return _MeshView(
-        camera=camera,
-        corners=corners,
-        triangle=triangle,
-        depth=drawn.depth,
-        covered=covered,
-        seen=seen,
-        weights=weights,
-    )
+    triangle = drawn.triangle.reshape(-1)
+    covered = (triangle >= 0).nonzero().squeeze(1)
+    return MeshView(camera=camera, corners=corners, drawn=drawn, covered=covered, seen=triangle[covered].long())
+
+
+def _weights_in(view: MeshView, topology: Topology) -> Float[Tensor, "n 3"]:
+    """Weights of the corners of the triangles seen: anew where they have a gradient, else the rasteriser's."""
+    if view.corners.requires_grad:
+        width = view.camera.width * SUPERSAMPLING
+        return _weights_of(view.corners, topology.faces, view.seen, view.covered, width)
+    return view.drawn.barycentric.reshape(-1, 3)[view.covered].to(view.corners)
 
 
 def _resolved(
@@ -197,14 +207,15 @@ def corner_weights(
     return torch.stack([volume / total for volume in volumes], 1)
 
 
-def _outlines(samples: Float[Tensor, "s d"], view: _MeshView, topology: Topology) -> Float[Tensor, "y x d"]:
+def _outlines(samples: Float[Tensor, "s d"], view: MeshView, topology: Topology) -> Float[Tensor, "y x d"]:
     """What an image gains where an outline runs between two samples: one of them takes some of the other's colour.
 
     `samples`: the covered ones, then one for the whole background.
     """
     corners, covered = view.corners, view.covered
-    height, width = view.triangle.shape
-    row_of = torch.full_like(view.triangle.reshape(-1), len(covered))
+    triangle, depth = view.drawn.triangle.reshape(-1), view.drawn.depth.reshape(-1)
+    height, width = view.drawn.triangle.shape
+    row_of = torch.full_like(triangle, len(covered), dtype=torch.long)
     row_of[covered] = torch.arange(len(covered), device=covered.device)
     screen = corners[:, :2] / corners[:, 2:]
     face, edge = _outline_edges(screen.detach(), topology).nonzero(as_tuple=True)
@@ -214,7 +225,7 @@ def _outlines(samples: Float[Tensor, "s d"], view: _MeshView, topology: Topology
     gained = samples.new_zeros(pixels, samples.shape[1])
     for axis in (0, 1):  # Neighbours in a row, then in a column.
         found = _crossings(screen, corners[:, 2].detach(), ends, third, axis, (width, height))
-        kept = _visible(found, view.triangle.reshape(-1), view.depth.reshape(-1))
+        kept = _visible(found, triangle, depth)
         inner, outer, share = found.inner[kept], found.outer[kept], found.reach[kept][:, None] - 0.5
         # The surface reaches beyond the middle: the sample outside takes some of its colour; or it falls short of it.
         takes = torch.where(share[:, 0] > 0, outer, inner)

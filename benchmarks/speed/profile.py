@@ -163,6 +163,7 @@ def _watched(parts: _Parts, learner: AshAvatar | DdcAvatar, run: ash.training.lo
         drawing = [
             (learner, "_training_texture", "decode"),
             (learner.module, "refined", "pose"),
+            (learner.module, "see", "draw"),
             (learner.module, "draw", "draw"),
         ]
     rest = [(ash.training.loop, "view_loss", "loss"), (run.optimiser, "step", "adam")]

@@ -130,7 +130,7 @@ def test_a_frame_of_the_mesh_stays_on_cuda(changes: dict[str, str], tube: Captur
     with mode, to_cuda, torch.no_grad():
         model = on_cuda(avatar)
         posed, texture = avatar.dress(Pose(tube.motion, 3), StageClock())
-        drawn = model.draw(texture, posed, [tube.cameras["cam0"]], texture.new_zeros(3))
+        drawn = model.draw(texture, posed, model.see(posed, [tube.cameras["cam0"]]), texture.new_zeros(3))
     assert drawn.device == texture.device == posed.vertices.device == CUDA
     assert drawn.shape == (1, 48, 48, 4)
 

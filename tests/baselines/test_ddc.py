@@ -7,7 +7,8 @@ import torch
 from helpers.captures import write_tube_capture
 from helpers.figures import front_camera, tube_motion
 
-from ash.capture.dataset import Pose, image_path
+import ash.mesh.drawing
+from ash.capture.dataset import Camera, Pose, image_path
 from ash.capture.formats import load_capture
 from ash.config import TemplateConfig
 from ash.fields import replaced
@@ -46,7 +47,7 @@ def test_a_constant_texture_draws_a_flat_silhouette_over_the_background(capture)
     colour, background = torch.tensor([0.2, 0.5, 0.8]), torch.tensor([1.0, 0.0, 0.0])
     texture = colour[:, None, None].expand(3, 32, 32)
     with torch.no_grad():
-        image = model.draw(texture, posed, [front_camera()], background)[0]
+        image = model.draw(texture, posed, model.see(posed, [front_camera()]), background)[0]
     coverage = image[..., 3:]
     torch.testing.assert_close(image[..., :3], colour * coverage + background * (1 - coverage), atol=1e-6, rtol=0)
     steps = coverage * SUPERSAMPLING**2
@@ -58,7 +59,7 @@ def test_gradients_reach_exactly_the_texture_pixels_that_are_seen(capture):
     model = avatar(capture).module
     posed = model.template.pose(Pose(tube_motion(), 0))
     texture = torch.full((3, 32, 32), 0.5, requires_grad=True)
-    model.draw(texture, posed, [front_camera()], torch.zeros(3))[..., 1].sum().backward()
+    model.draw(texture, posed, model.see(posed, [front_camera()]), torch.zeros(3))[..., 1].sum().backward()
     assert texture.grad is not None
     assert not texture.grad[[0, 2]].any()
     lit = texture.grad[1] != 0
@@ -127,3 +128,30 @@ def test_far_from_training_a_static_texture_is_what_counts(capture, tmp_path):
         for trust in (0.0, 0.25):
             expected = (1 - trust) * module.static_texture + trust * near
             torch.testing.assert_close(module.dynamic_texture(replace(seen, trust=trust)), expected)
+
+
+def test_static_views_are_drawn_into_what_the_training_views_saw(capture, monkeypatch):
+    mesh, cameras, background = avatar(capture, steps=40), [*capture.cameras.values()][:2], torch.full((3,), 0.5)
+    seen: list[int] = []
+    find = ash.mesh.drawing.rasterize_mesh
+    monkeypatch.setattr(ash.mesh.drawing, "rasterize_mesh", lambda *a, **k: (seen.append(1), find(*a, **k))[1])
+
+    def static_and_gradient(by: list[Camera]) -> tuple[torch.Tensor, torch.Tensor]:
+        drawn = mesh.draw_static_views(1, by, background)
+        mesh.module.zero_grad()
+        drawn.square().sum().backward()
+        assert mesh.module.refinement.rough.grad is None
+        return drawn, mesh.module.static_texture.grad
+
+    assert mesh.draw_training_views(1, cameras, background, step=0).requires_grad
+    assert mesh.module.refinement is not None
+    shared = static_and_gradient(cameras)
+    assert len(seen) == 2, "the two views are found once"
+    anew = static_and_gradient(list(cameras))
+    assert len(seen) == 4
+    assert all(map(torch.equal, shared, anew))
+    with torch.no_grad():
+        mesh.module.refinement.rough += 0.05
+    moved = static_and_gradient(cameras)
+    assert len(seen) == 6, "other vertices are other views"
+    assert not torch.equal(moved[0], shared[0])
