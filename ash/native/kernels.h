@@ -128,6 +128,21 @@ struct ShadeArgs {
     float *grad_texture = nullptr, *grad_weights = nullptr;  // the latter may be null
 };
 
+struct Triangle {
+    double edges[3][3];  // opposite corner 0, 1, 2: factors of x, y and 1; positive inside
+    double volume;  // positive
+    int left, right, top, bottom;  // pixels that may lie inside, the last ones excluded
+    bool front[3];  // a pixel exactly on the edge is inside: left and top edges
+};
+
+struct RasterBand {
+    int top, bottom;  // rows of the image, the last one excluded
+    int64_t stride;   // of a row
+    double near;      // least depth that is seen
+    double* nearest;  // depths, infinite at first
+    int64_t* seen;    // triangles
+};
+
 constexpr int PRODUCT_COLUMNS = 16;
 
 // c[p][j] = start[j] + sum over segments s and steps i of a[p a_step + a_at[s] + i a_inner] b[b_at[s] + i b_inner + j], for rows p and
@@ -181,6 +196,7 @@ struct Kernels {
     void (*shade_backward)(const ShadeArgs&, int64_t first, int64_t last, double* grad_light);  // adds to [9, 3]
     void (*multiply)(const Product&);
     void (*pack)(const Packing&);
+    void (*raster_band)(const Triangle*, const int* members, int64_t count, const RasterBand&);
 };
 
 extern const Kernels avx512_kernels, avx2_kernels, plain_kernels;

@@ -5,27 +5,25 @@
 // that share it see exactly opposite numbers: no pixel is drawn twice or left out along it.
 #include <algorithm>
 #include <cmath>
+#include <memory>
 #include <new>
 #include <vector>
 
+#include "dispatch.h"
 #include "team.h"
+
+using namespace ash;
 
 namespace {
 
 constexpr int BAND = 16;  // rows handed out at once
+constexpr int BEYOND = 8;  // samples after a row's last that are drawn into, see rasterize.inc
 
 struct Vec3 {
     double x, y, z;
 };
 
 Vec3 cross(Vec3 a, Vec3 b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
-
-struct Triangle {
-    Vec3 edges[3];  // opposite vertex 0, 1, 2; positive inside
-    double volume;  // positive
-    int left, right, top, bottom;  // pixels that may lie inside, the last ones excluded
-    bool front[3];  // a pixel exactly on the edge is inside: left and top edges
-};
 
 Vec3 edge_between(const Vec3* v, int a, int b, double sign) {
     Vec3 e = a < b ? cross(v[a], v[b]) : cross(v[b], v[a]);
@@ -46,8 +44,9 @@ bool set_up(const Vec3* v, const int* face, int width, int height, double near, 
     t.left = t.top = 0, t.right = width, t.bottom = height;
     bool all_in_front = true, none_in_front = true;
     for (int i = 0; i < 3; ++i) {
-        t.edges[i] = edge_between(v, face[(i + 1) % 3], face[(i + 2) % 3], sign);
-        t.front[i] = t.edges[i].x > 0 || (t.edges[i].x == 0 && t.edges[i].y > 0);
+        const Vec3 edge = edge_between(v, face[(i + 1) % 3], face[(i + 2) % 3], sign);
+        t.edges[i][0] = edge.x, t.edges[i][1] = edge.y, t.edges[i][2] = edge.z;
+        t.front[i] = edge.x > 0 || (edge.x == 0 && edge.y > 0);
         bool in_front = v[face[i]].z >= near;
         all_in_front &= in_front, none_in_front &= !in_front;
     }
@@ -69,33 +68,22 @@ bool set_up(const Vec3* v, const int* face, int width, int height, double near, 
 
 struct Target {
     int width;
-    double near;
     int* triangle;
     float *barycentric, *depth;
-    double* nearest;
 };
 
-void draw(const Triangle& t, int number, int top, int bottom, const Target& target) {
-    for (int y = std::max(top, t.top); y < std::min(bottom, t.bottom); ++y) {
-        double py = y + 0.5, at[3];
-        for (int i = 0; i < 3; ++i) at[i] = t.edges[i].y * py + t.edges[i].z;
-        for (int x = t.left; x < t.right; ++x) {
-            double px = x + 0.5, e[3];
-            bool inside = true;
-            for (int i = 0; i < 3; ++i) {
-                e[i] = t.edges[i].x * px + at[i];
-                inside &= e[i] > 0 || (e[i] == 0 && t.front[i]);
-            }
-            if (!inside) continue;
-            double sum = e[0] + e[1] + e[2], depth = t.volume / sum;
-            int64_t pixel = int64_t(y) * target.width + x;
-            // Of two at the same depth the one listed first is seen.
-            if (!(depth >= target.near && depth < target.nearest[pixel])) continue;
-            target.nearest[pixel] = depth;
-            target.triangle[pixel] = number;
-            target.depth[pixel] = float(depth);
-            for (int i = 0; i < 3; ++i) target.barycentric[3 * pixel + i] = float(e[i] / sum);
-        }
+// Writes what the samples of a row see in the columns from `left` on, of which those not seen are written already.
+void write_row(const Triangle* triangles, const double* nearest, const int64_t* seen, int left, int right, int y, const Target& target) {
+    for (int x = left; x < right; ++x) {
+        if (seen[x] < 0) continue;
+        const int64_t pixel = int64_t(y) * target.width + x;
+        const Triangle& t = triangles[seen[x]];
+        double px = x + 0.5, py = y + 0.5, e[3];
+        for (int i = 0; i < 3; ++i) e[i] = t.edges[i][0] * px + (t.edges[i][1] * py + t.edges[i][2]);
+        const double sum = e[0] + e[1] + e[2];
+        target.triangle[pixel] = int(seen[x]);
+        target.depth[pixel] = float(nearest[x]);
+        for (int i = 0; i < 3; ++i) target.barycentric[3 * pixel + i] = float(e[i] / sum);
     }
 }
 
@@ -108,22 +96,33 @@ int ash_rasterize(const double* vertices, const int* faces, int64_t face_count, 
                   int* triangle, float* barycentric, float* depth) try {
     const auto* v = reinterpret_cast<const Vec3*>(vertices);
     const int bands = (height + BAND - 1) / BAND;
-    std::vector<Triangle> triangles(face_count);
+    const std::unique_ptr<Triangle[]> triangles(new Triangle[face_count]);
     std::vector<std::vector<int>> members(bands);
     for (int64_t f = 0; f < face_count; ++f) {
         Triangle& t = triangles[f];
         if (!set_up(v, faces + 3 * f, width, height, near, t)) continue;
         for (int band = t.top / BAND; band <= (t.bottom - 1) / BAND; ++band) members[band].push_back(int(f));
     }
-    std::vector<double> nearest(int64_t(width) * height, INFINITY);
-    const Target target{width, near, triangle, barycentric, depth, nearest.data()};
-    ash::in_parallel(threads, bands, [&](int64_t band) {
-        int top = int(band) * BAND, bottom = std::min(height, top + BAND);
+    const Target target{width, triangle, barycentric, depth};
+    const int64_t stride = width + BEYOND, room = bands * BAND * stride;
+    const std::unique_ptr<double[]> all_nearest(new double[room]);
+    const std::unique_ptr<int64_t[]> all_seen(new int64_t[room]);
+    in_parallel(threads, bands, [&](int64_t number) {
+        const int top = int(number) * BAND, bottom = std::min(height, top + BAND);
         const int64_t from = int64_t(top) * width, until = int64_t(bottom) * width;
         std::fill(triangle + from, triangle + until, -1);
         std::fill(depth + from, depth + until, 0.0f);
         std::fill(barycentric + 3 * from, barycentric + 3 * until, 0.0f);
-        for (int number : members[band]) draw(triangles[number], number, top, bottom, target);
+        int left = width, right = 0;
+        for (int f : members[number]) left = std::min(left, triangles[f].left), right = std::max(right, triangles[f].right);
+        const RasterBand band{top, bottom, stride, near, all_nearest.get() + top * stride, all_seen.get() + top * stride};
+        for (int y = 0; y < bottom - top && left < right; ++y) {
+            std::fill(band.nearest + y * stride + left, band.nearest + y * stride + right + BEYOND, INFINITY);
+            std::fill(band.seen + y * stride + left, band.seen + y * stride + right + BEYOND, -1);
+        }
+        kernels().raster_band(triangles.get(), members[number].data(), int64_t(members[number].size()), band);
+        for (int y = top; y < bottom; ++y)
+            write_row(triangles.get(), band.nearest + (y - top) * stride, band.seen + (y - top) * stride, left, right, y, target);
     });
     return 0;
 } catch (const std::bad_alloc&) {

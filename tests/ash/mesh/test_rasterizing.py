@@ -20,6 +20,7 @@ from ash.mesh.rasterizing import (
     rasterize_mesh,
     rasterize_mesh_naive,
 )
+from ash.native.library import use_instruction_set
 
 WIDTH, HEIGHT = 96, 80
 
@@ -53,13 +54,21 @@ def triangle_soup(kind: str, seed: int) -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("kind", ["in_front", "behind", "on_centres"])
-def test_rasterizer_is_its_definition(kind: str, seed: int) -> None:
+def test_rasterizer_is_its_definition(kind: str, seed: int, instructions: str) -> None:
     vertices, faces = triangle_soup(kind, seed)
     truth = rasterize_mesh_naive(vertices, faces, width=61, height=47)
     assert (truth.triangle >= 0).float().mean() > 0.2
     for threads in (1, 2, 4):
         drawn = rasterize_mesh(vertices, faces, width=61, height=47, threads=threads)
         assert_equal(drawn, truth)
+
+
+def test_instruction_sets_and_threads_change_no_bit(instructions: str) -> None:
+    vertices, faces = triangle_soup("behind", 3)
+    drawn = rasterize_mesh(vertices, faces, width=157, height=93, threads=3)
+    use_instruction_set("plain")  # The fixture takes the one before up again.
+    plain = rasterize_mesh(vertices, faces, width=157, height=93)
+    assert all(torch.equal(getattr(drawn, name), getattr(plain, name)) for name in ("triangle", "barycentric", "depth"))
 
 
 @pytest.mark.parametrize("seed", range(3))
