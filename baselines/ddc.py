@@ -177,8 +177,7 @@ class DdcModel(MovingModule):
         Outlines are blended while vertices learn, for the gradient's sake; what is shown counts samples.
         """
         shade = textured(texture, self.uvs, self.uv_faces, posed.normals, self.template.faces, self.light)
-        learns = any(view.corners.requires_grad for view in views)
-        return draw_seen(views, self.topology, shade, background, outlines=learns)
+        return draw_seen(views, self.topology, shade, background, outlines=any(v.corners.requires_grad for v in views))
 
     def refined(self, posed: PosedTemplate, conditions: MeshConditions) -> PosedTemplate:
         """The template with its vertices where the images moved them. The light keeps the normals that it had."""
@@ -218,8 +217,7 @@ class DdcAvatar:
         self.template = self.module.template
         self._motion = capture.motion
         self._outcome: TrainingOutcome | None = None
-        # Vertices, cameras and what these see of them, in the training views drawn last.
-        self._seen: tuple[Tensor, list[Camera], list[MeshView]] | None = None
+        self._seen: tuple[Tensor, list[Camera], list[MeshView]] = (torch.empty(0), [], [])  # vertices drawn last
         # The template is frozen: each training frame is posed once, as far as there is room.
         self._conditions: Kept[int, MeshConditions] = Kept(
             lambda frame: self.module.conditions(Pose(capture.motion, frame))
@@ -266,27 +264,19 @@ class DdcAvatar:
         with torch.set_grad_enabled(torch.is_grad_enabled() and step % self.config.vertices_every == 0):
             posed = self._refined(frame)
         views = self.module.see(posed, cameras)
-        constant = [replace(view, corners=view.corners.detach()) for view in views]
-        self._seen = posed.vertices.detach(), cameras, constant
+        self._seen = posed.vertices.detach(), cameras, [replace(v, corners=v.corners.detach()) for v in views]
         return self._drawn(texture, posed, views, background)
 
     def draw_static_views(self, frame: int, cameras: list[Camera], background: Tensor) -> Tensor | None:
         """Views with the texture that counts far from the training motion; its vertices are not its own."""
-        static = self.module.static_texture
-        if static is None:
+        if (static := self.module.static_texture) is None:
             return None
-        posed, views = self._seen_just_now(frame, cameras)
+        with torch.no_grad():
+            posed = self._refined(frame)
+        vertices, by, views = self._seen
+        if by is not cameras or not torch.equal(vertices, posed.vertices):
+            views = self.module.see(posed, cameras)
         return self._drawn(static, posed, views, background)
-
-    @torch.no_grad()
-    def _seen_just_now(self, frame: int, cameras: list[Camera]) -> tuple[PosedTemplate, list[MeshView]]:
-        """The posed mesh and what these cameras see of it: where it is as it was drawn last, that is not found anew."""
-        posed = self._refined(frame)
-        if self._seen is not None:
-            vertices, by, views = self._seen
-            if by is cameras and torch.equal(vertices, posed.vertices):
-                return posed, views
-        return posed, self.module.see(posed, cameras)
 
     @torch.no_grad()
     def end_warmup(self) -> None:
@@ -295,8 +285,7 @@ class DdcAvatar:
             self.module.static_texture.copy_(self.module.texture)
 
     def _drawn(self, texture: Tensor, posed: PosedTemplate, views: list[MeshView], background: Tensor) -> Tensor:
-        flat = background if background.ndim == 1 else background.new_zeros(3)
-        drawn = self.module.draw(texture, posed, views, flat)
+        drawn = self.module.draw(texture, posed, views, background if background.ndim == 1 else background.new_zeros(3))
         return drawn[..., :3] if background.ndim == 1 else over(drawn[..., :3], drawn[..., 3], background)
 
     def corrections(self, frame: int) -> Tensor | None:
@@ -324,8 +313,8 @@ class DdcAvatar:
         """Premultiplied RGBA, float32 `[h, w, 4]`."""
         posed, texture = self.dress(pose, clock)
         with stage(clock, "stg4", self.device):
-            views = self.module.see(posed, [camera])
-            return self.module.draw(texture, posed, views, texture.new_zeros(3))[0].clamp(0, 1).cpu().numpy()
+            drawn = self.module.draw(texture, posed, self.module.see(posed, [camera]), texture.new_zeros(3))
+            return drawn[0].clamp(0, 1).cpu().numpy()
 
     @torch.no_grad()
     def dress(self, pose: Pose, clock: StageClock) -> tuple[PosedTemplate, Float[Tensor, "3 t t"]]:
