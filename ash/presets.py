@@ -154,7 +154,7 @@ PRESETS = {
 }
 
 
-VALIDATION = "tight and loose, capture seed 100; learning rates and weights of the loss on the capture of the tables"
+VALIDATION = "tight and loose, capture seed 100; the weights of the loss on a capture of the tables"
 # On which captures a preset's numbers were chosen. From now on: on none that a suite runs on (docs/tuning.md).
 CHOSEN_ON = {
     **dict.fromkeys(("ci", "brief", "cpu", "fit", "thorough", "budget", "frugal"), VALIDATION),
