@@ -202,7 +202,7 @@ class AshConfig:
     template: TemplateConfig = TemplateConfig()
     search: bool = False  # choose the size of the decoders on a training sequence left out; not in the paper
     seed: int = 0
-    device: str = "cpu"  # or "cuda", "cuda:1": where it learns and draws; templates are learned on the CPU
+    device: str = "cpu"  # or "cuda", "cuda:1": where it learns and draws, its template included
 
     def __post_init__(self) -> None:
         """Refuse training that the model cannot take."""

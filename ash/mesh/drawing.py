@@ -218,7 +218,7 @@ def _outlines(samples: Float[Tensor, "s d"], view: MeshView, topology: Topology)
     row_of = torch.full_like(triangle, len(covered), dtype=torch.long)
     row_of[covered] = torch.arange(len(covered), device=covered.device)
     screen = corners[:, :2] / corners[:, 2:]
-    face, edge = _outline_edges(screen.detach(), topology).nonzero(as_tuple=True)
+    face, edge = outline_edges(screen.detach(), topology).nonzero(as_tuple=True)
     ends = torch.stack([topology.faces[face, edge], topology.faces[face, (edge + 1) % 3]], 1)
     third = topology.faces[face, (edge + 2) % 3]
     columns, pixels = width // SUPERSAMPLING, height * width // SUPERSAMPLING**2
@@ -292,7 +292,7 @@ def _visible(found: _Crossings, triangle: Int[Tensor, " s"], depth: Float[Tensor
     return kept[order[first]]
 
 
-def _outline_edges(screen: Float[Tensor, "v 2"], topology: Topology) -> Bool[Tensor, "f 3"]:
+def outline_edges(screen: Float[Tensor, "v 2"], topology: Topology) -> Bool[Tensor, "f 3"]:
     """Edges beyond which the surface ends or turns away from the camera; of the two faces at an edge, one has it."""
     a, b, c = screen[topology.faces].unbind(1)
     turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0] > 0

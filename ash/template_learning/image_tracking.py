@@ -9,31 +9,30 @@ every view once, sharper from pass to pass. What comes out are tracked frames, a
 
 Colours cannot tell where on the surface its paint lies: along it, the mean over the frames stays at rest.
 
-The template is posed, shaded and drawn, and the nodes' equations are solved, on the template's device; between, images
-are filtered and equations put together by NumPy and SciPy.
+All of it happens on the template's device, in float64 wherever equations are put together.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from contextlib import closing
+from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 
-from ash.capture.dataset import Camera, Capture, Pose
-from ash.devices import moved
+from ash.capture.dataset import Capture, Pose
+from ash.devices import CPU, moved
 from ash.harmonics import sh_basis
-from ash.mesh.drawing import Topology, topology_of
+from ash.mesh.drawing import Topology, outline_edges, topology_of
 from ash.mesh.rasterizing import project_vertices, rasterize_mesh
 from ash.rotations import RigidTransforms, unitquat_to_rotmat
 from ash.template.graph import EmbeddedGraph
 from ash.template.template import Template, vertex_normals
+from ash.template_learning.nearest import NearestPoint
 from ash.template_learning.observing import ObservedView, observe, sample
 from ash.template_learning.tracking import Tracked
 from ash.textures import TexelLattice, build_lattice
-from ash.training.images import load_training_images
+from ash.training.images import READERS, ReadAhead, View, load_training_images
 
 TEXELS = 192  # Points of the surface: the texels of such a lattice.
 BLURS = (1.5, 0.5)  # Pixels, in the first and in the last pass.
@@ -55,29 +54,35 @@ SEEN_OFTEN = 0.3  # Weight from which a point's mean colour is worth something.
 
 def track_images(capture: Capture, template: Template, graph: EmbeddedGraph, *, passes: int) -> Tracked:
     """Fit the template to the training images, frame by frame, `passes` times over."""
-    images = load_training_images(capture)
-    subject = _Subject(template, graph, len(images.frames))
-    posed = [template.pose(Pose(capture.motion, frame)).transforms for frame in images.frames]
-    for step in range(passes):
-        progress = step / max(1, passes - 1)
-        blur, reach = (first * (last / first) ** progress for first, last in (BLURS, REACHES))
-        paint = _Paint(subject.paint)
-        for index, frame in enumerate(images.frames):
-            views = [
-                observe(images.views[name, frame], images.cameras[name], blur=blur) for name in images.seeing(frame)
-            ]
-            subject.move(index, posed[index], views, paint, reach=reach)
-        subject.paint = paint.mean()
-    canonical = torch.from_numpy(np.stack([subject.canonical(i) for i in range(len(images.frames))])).float()
-    return Tracked(frames=images.frames, canonical=canonical.to(template.device))
+    images = load_training_images(capture, template.device)
+    frames = images.frames
+    subject = _Subject(template, graph, len(frames))
+    posed = [template.pose(Pose(capture.motion, frame)).transforms for frame in frames]
+
+    def needed(step: int) -> tuple[View, ...]:
+        frame = frames[step % len(frames)]
+        return tuple((name, frame) for name in images.seeing(frame)) if step < passes * len(frames) else ()
+
+    with closing(ReadAhead(images.views, readers=0 if images.device == CPU else READERS)) as ahead:
+        for turn in range(passes):
+            progress = turn / max(1, passes - 1)
+            blur, reach = (first * (last / first) ** progress for first, last in (BLURS, REACHES))
+            paint = _Paint(subject.paint)
+            for index in range(len(frames)):
+                step = turn * len(frames) + index
+                cutouts = ahead.of_step(step, needed)
+                views = [observe(cutouts[view], images.cameras[view[0]], blur=blur) for view in needed(step)]
+                subject.move(index, posed[index], views, paint, reach=reach)
+            subject.paint = paint.mean()
+    return Tracked(frames=frames, canonical=torch.stack([subject.canonical(i) for i in range(len(frames))]).float())
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Painted:
     """What colours the surface has."""
 
-    colours: Float[np.ndarray, "n 3"]  # of the points; NaN: hardly ever seen
-    light: Float[np.ndarray, "9 3"]  # coefficients of the exponent that multiplies them
+    colours: Float[Tensor, "n 3"]  # of the points; NaN: hardly ever seen
+    light: Float[Tensor, "9 3"]  # coefficients of the exponent that multiplies them
 
 
 class _Paint:
@@ -85,132 +90,123 @@ class _Paint:
 
     def __init__(self, known: Painted) -> None:
         self.known = known
-        self.total, self.weight = np.zeros_like(known.colours), np.zeros_like(known.colours)
-        self.normal, self.right = np.zeros((3, 9, 9)), np.zeros((3, 9))
+        self.total, self.weight = torch.zeros_like(known.colours), torch.zeros_like(known.colours)
+        self.normal, self.right = known.light.new_zeros(3, 9, 9), known.light.new_zeros(3, 9)
 
-    def see(self, points: Int[np.ndarray, " k"], weight: np.ndarray, shade: np.ndarray, seen: np.ndarray) -> None:
-        """`shade`: what light makes of white there; `seen`: its colour, `[k, 3]` both."""
+    def see(self, points: Int[Tensor, " k"], weight: Tensor, shade: Tensor, seen: Tensor) -> None:
+        """`shade`: what light makes of white there; `seen`: its colour, `[k, 3]` both. No point twice."""
         self.total[points] += weight[:, None] * shade * seen
         self.weight[points] += weight[:, None] * shade**2
 
-    def correct_light(self, basis: np.ndarray, weight: np.ndarray, drawn: np.ndarray, error: np.ndarray) -> None:
+    def correct_light(self, basis: Tensor, weight: Tensor, drawn: Tensor, error: Tensor) -> None:
         """Normal equations of the light's coefficients, from colours `drawn` and how far they are off, `[k, 3]`."""
-        for channel in range(3):
-            slope = drawn[:, channel : channel + 1] * basis
-            self.normal[channel] += (slope * weight[:, None]).T @ slope
-            self.right[channel] += (slope * weight[:, None]).T @ error[:, channel]
+        slopes = drawn.T[:, :, None] * basis
+        weighted = (slopes * weight[:, None]).mT
+        self.normal += weighted @ slopes
+        self.right += (weighted @ error.T[:, :, None])[..., 0]
 
     def mean(self) -> Painted:
         """The colours and the light that follow."""
-        enough = (self.weight > SEEN_OFTEN).all(1, keepdims=True)
-        colours = np.where(enough, self.total / np.where(enough, self.weight, 1), np.nan)
-        damped = self.normal + 1e-3 * np.trace(self.normal, axis1=1, axis2=2)[:, None, None] * np.eye(9) / 9
-        solvable = damped.any((1, 2))
-        light = self.known.light.copy()
-        light[:, solvable] += LIGHT_STEP * np.linalg.solve(damped[solvable], self.right[solvable][..., None])[..., 0].T
-        return Painted(colours=colours, light=light)
+        enough = (self.weight > SEEN_OFTEN).all(1, keepdim=True)
+        colours = torch.where(enough, self.total / torch.where(enough, self.weight, 1), torch.nan)
+        damping = 1e-3 / 9 * self.normal.diagonal(dim1=1, dim2=2).sum(1)
+        # A channel that nobody saw has no equations: its light stays.
+        damping = torch.where(damping > 0, damping, 1)
+        eye = torch.eye(9, dtype=damping.dtype, device=damping.device)
+        step = torch.linalg.solve(self.normal + damping[:, None, None] * eye, self.right)
+        return Painted(colours=colours, light=self.known.light + LIGHT_STEP * step.T)
 
 
-@dataclass(slots=True)
 class _Pull:
-    """Normal equations of where the vertices of a frame want to go: world, metres.
+    """Normal equations of where points want to go: world, metres.
 
     A point within a triangle is three vertices: its equation is shared out between them, which bounds the sum from
     above, so that a step never overshoots.
     """
 
-    count: int
-    normal: np.ndarray = field(init=False)  # [v, 3, 3]
-    right: np.ndarray = field(init=False)  # [v, 3]
+    def __init__(self, count: int, device: torch.device) -> None:
+        self.sums = torch.zeros(count, 3, 4, dtype=torch.float64, device=device)  # left and right side
 
-    def __post_init__(self) -> None:
-        self.normal, self.right = np.zeros((self.count, 3, 3)), np.zeros((self.count, 3))
+    def see(self, points: Int[Tensor, " k"], normal: Float[Tensor, "k 3 3"], right: Float[Tensor, "k 3"]) -> None:
+        """Equations of the points themselves, no point twice."""
+        self.sums[points] += torch.cat([normal, right[..., None]], 2)
 
-    def add(self, vertices: np.ndarray, weights: np.ndarray, normal: np.ndarray, right: np.ndarray) -> None:
-        """Points `[k]` of corners `vertices` `[k, c]` with `weights`, their `normal` `[k, 3, 3]`, `right` `[k, 3]`."""
-        for corner, share in zip(vertices.T, weights.T, strict=True):
-            for i in range(3):
-                self.right[:, i] += np.bincount(corner, share * right[:, i], self.count)
-                for j in range(i, 3):
-                    self.normal[:, i, j] += np.bincount(corner, share * normal[:, i, j], self.count)
+    def add(self, vertices: Int[Tensor, "k c"], weights: Float[Tensor, "k c"], sums: Float[Tensor, "k 3 4"]) -> None:
+        """Equations of points with such corners, in such shares."""
+        shared = weights[:, :, None] * sums.reshape(-1, 1, 12)
+        self.sums.view(-1, 12).index_add_(0, vertices.reshape(-1), shared.reshape(-1, 12))
 
-    def in_canonical(self, rotations: Float[np.ndarray, "v 3 3"]) -> tuple[np.ndarray, np.ndarray]:
-        """The equations for shifts before posing: `normal` whole, and `right`."""
-        upper = np.triu(np.ones((3, 3), bool))
-        whole = np.where(upper, self.normal, self.normal.transpose(0, 2, 1))
-        turned = rotations.transpose(0, 2, 1)
-        return turned @ whole @ rotations, (turned @ self.right[..., None])[..., 0]
+    def in_canonical(self, rotations: Float[Tensor, "v 3 3"]) -> Float[Tensor, "v 3 4"]:
+        """The equations for shifts before posing."""
+        turned = rotations.mT @ self.sums
+        return torch.cat([turned[..., :3] @ rotations, turned[..., 3:]], 2)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Shown:
-    """The template as a frame has it."""
+    """The template as a frame has it, float64 but for what is drawn."""
 
-    vertices: Float[Tensor, "v 3"]  # metres, world; on the template's device
-    corners: Float[np.ndarray, "v 3"]  # the same
-    points: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    basis: Float[np.ndarray, "n 9"]  # of light
-    shade: Float[np.ndarray, "n 3"]
+    vertices: Float[Tensor, "v 3"]  # metres, world, float32
+    points: Float[Tensor, "n 3"]
+    normals: Float[Tensor, "n 3"]
+    basis: Float[Tensor, "n 9"]  # of light
+    shade: Float[Tensor, "n 3"]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Drawn:
     """What a camera sees of the template."""
 
-    triangle: Int[np.ndarray, "h w"]  # -1: none
-    depth: Float[np.ndarray, "h w"]  # metres
-    screen: Float[np.ndarray, "v 2"]  # the vertices in pixels
+    triangle: Int[Tensor, "h w"]  # -1: none
+    depth: Float[Tensor, "h w"]  # metres
+    screen: Float[Tensor, "v 2"]  # the vertices in pixels, float64
 
 
 class _Subject:
     """Everything that is learned: translations of the nodes per frame, colours, light."""
 
     def __init__(self, template: Template, graph: EmbeddedGraph, frames: int) -> None:
-        mesh = template.mesh
-        self.lattice: TexelLattice = moved(build_lattice(mesh, TEXELS), template.device)
-        self.topology: Topology = topology_of(torch.from_numpy(mesh.faces))  # Whose outlines NumPy follows.
-        self.faces = template.faces
-        self.rest = mesh.vertices
-        self.normals = vertex_normals(torch.from_numpy(mesh.vertices), self.topology.faces).numpy()
+        mesh, device = template.mesh, template.device
+        self.lattice: TexelLattice = moved(build_lattice(mesh, TEXELS), device)
+        self.topology: Topology = moved(topology_of(torch.from_numpy(mesh.faces)), device)
+        self.rest = torch.from_numpy(mesh.vertices).to(device)
+        self.normals = vertex_normals(self.rest, self.topology.faces)
         self.solver = _NodeSolver(graph)
-        self.nodes = np.zeros((frames, len(graph.nodes), 3))
-        self.paint = Painted(colours=np.full((len(self.lattice.texels), 3), np.nan), light=np.zeros((9, 3)))
-        self._slide = np.zeros_like(self.rest)
+        self.nodes = self.rest.new_zeros(frames, len(graph.nodes), 3)
+        colours = self.rest.new_full((len(self.lattice.texels), 3), torch.nan)
+        self.paint = Painted(colours=colours, light=self.rest.new_zeros(9, 3))
 
-    def canonical(self, index: int) -> Float[np.ndarray, "v 3"]:
+    def canonical(self, index: int) -> Float[Tensor, "v 3"]:
         """The vertices of the `index`-th training frame."""
         mean = self.solver.spread(self.nodes.mean(0))
-        along = mean - self.normals * (mean * self.normals).sum(1, keepdims=True)
-        shifted: np.ndarray = self.rest + self.solver.spread(self.nodes[index]) - along
-        return shifted
+        along = mean - self.normals * (mean * self.normals).sum(1, keepdim=True)
+        return self.rest + self.solver.spread(self.nodes[index]) - along
 
     def move(
         self, index: int, transforms: RigidTransforms, views: Sequence[ObservedView], paint: _Paint, *, reach: float
     ) -> None:
         """One step of Gauss and Newton for a frame; what it sees goes into `paint`."""
         shown = self._show(index, transforms)
-        pull, seen = _Pull(len(self.rest)), _Pull(len(self.lattice.texels))
+        pull, seen = (_Pull(count, self.rest.device) for count in (len(self.rest), len(self.lattice.texels)))
         for view in views:
-            drawn = _draw(shown.vertices, self.faces, view.camera)
+            drawn = _draw(shown.vertices, self.topology.faces, view)
             _pull_by_colours(seen, shown, view, drawn, self.paint, paint)
             _pull_by_outline(pull, shown, view, drawn, self.topology, reach)
-        pull.add(_here(self.lattice.corners), _here(self.lattice.barycentric.double()), seen.normal, seen.right)
-        rotations = _here(unitquat_to_rotmat(transforms.quats).double())
-        self.nodes[index] = self.solver.solve(self.nodes[index], *pull.in_canonical(rotations))
+        pull.add(self.lattice.corners, self.lattice.barycentric.double(), seen.sums)
+        rotations = unitquat_to_rotmat(transforms.quats).double()
+        self.nodes[index] = self.solver.solve(self.nodes[index], pull.in_canonical(rotations))
 
     def _show(self, index: int, transforms: RigidTransforms) -> _Shown:
-        vertices = transforms.apply(torch.from_numpy(self.canonical(index)).float().to(self.faces.device))
-        normals = vertex_normals(vertices, self.faces)
+        vertices = transforms.apply(self.canonical(index).float())
+        normals = vertex_normals(vertices, self.topology.faces)
         across = torch.nn.functional.normalize(self.lattice.interpolate(normals), dim=-1)
-        basis = _here(sh_basis(across, 2).double())
+        basis = sh_basis(across, 2).double()
         return _Shown(
             vertices=vertices,
-            corners=_here(vertices.double()),
-            points=_here(self.lattice.interpolate(vertices).double()),
-            normals=_here(across.double()),
+            points=self.lattice.interpolate(vertices).double(),
+            normals=across.double(),
             basis=basis,
-            shade=np.exp(basis @ self.paint.light),
+            shade=(basis @ self.paint.light).exp(),
         )
 
 
@@ -218,63 +214,46 @@ class _NodeSolver:
     """From what vertices want to what the nodes of the graph do."""
 
     def __init__(self, graph: EmbeddedGraph) -> None:
-        self.device = graph.links.device
-        self.links, self.weights = _here(graph.links), _here(graph.weights.double())
-        self.count, links = len(graph.nodes), self.links.shape[1]
-        pairs = self.links[:, :, None] * self.count + self.links[:, None]
-        self.pairs = pairs.reshape(-1)
-        self.products = (self.weights[:, :, None] * self.weights[:, None]).reshape(-1)
-        self.vertices = np.repeat(np.arange(len(self.links)), links * links)
-        apart = np.eye(self.count) - _here(graph.adjacency(torch.eye(self.count, device=self.device)).double())
-        self.restraint = HOLD * np.eye(self.count) + STIFFNESS * apart.T @ apart
+        self.links, self.weights = graph.links, graph.weights.double()
+        self.count = len(graph.nodes)
+        self.pairs = (self.links[:, :, None] * self.count + self.links[:, None]).reshape(-1)
+        self.products = (self.weights[:, :, None] * self.weights[:, None]).reshape(len(self.links), -1, 1)
+        eye = torch.eye(self.count, device=self.links.device)
+        apart = (eye - graph.adjacency(eye)).double()
+        self.restraint = HOLD * eye.double() + STIFFNESS * apart.T @ apart
 
-    def spread(self, nodes: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "v 3"]:
+    def spread(self, nodes: Float[Tensor, "g 3"]) -> Float[Tensor, "v 3"]:
         """What the nodes have, blended at the vertices."""
         return (nodes[self.links] * self.weights[..., None]).sum(1)
 
-    def solve(
-        self, nodes: Float[np.ndarray, "g 3"], normal: Float[np.ndarray, "v 3 3"], right: Float[np.ndarray, "v 3"]
-    ) -> Float[np.ndarray, "g 3"]:
+    def solve(self, nodes: Float[Tensor, "g 3"], pull: Float[Tensor, "v 3 4"]) -> Float[Tensor, "g 3"]:
         """Where the nodes lie in balance between the vertices' equations and their restraint."""
         size = self.count
-        system = np.zeros((size, 3, size, 3))
-        target = np.zeros((size, 3))
-        for i in range(3):
-            system[:, i, :, i] = self.restraint
-            pulled = (self.weights * right[:, i : i + 1]).ravel()
-            target[:, i] = np.bincount(self.links.ravel(), pulled, size) - self.restraint @ nodes[:, i]
-        for i in range(3):
-            for j in range(i, 3):
-                block = np.bincount(self.pairs, self.products * normal[self.vertices, i, j], size * size)
-                system[:, i, :, j] += block.reshape(size, size)
-                if i != j:
-                    system[:, j, :, i] += block.reshape(size, size)
-        whole = torch.from_numpy(system.reshape(3 * size, 3 * size)).to(self.device)
-        wanted = torch.from_numpy(target.reshape(-1, 1)).to(self.device)
-        step = torch.cholesky_solve(wanted, torch.linalg.cholesky(whole))
-        return nodes + _here(step).reshape(size, 3)
+        pulled = self.weights[..., None] * pull[:, None, :, 3]
+        target = -(self.restraint @ nodes).index_add_(0, self.links.reshape(-1), -pulled.reshape(-1, 3))
+        shared = self.products * pull[:, None, :, :3].reshape(-1, 1, 9)
+        blocks = pull.new_zeros(size * size, 9).index_add_(0, self.pairs, shared.reshape(-1, 9))
+        system = blocks.reshape(size, size, 3, 3).permute(0, 2, 1, 3).contiguous()
+        for axis in range(3):
+            system[:, axis, :, axis] += self.restraint
+        factor = torch.linalg.cholesky(system.reshape(3 * size, 3 * size))
+        return nodes + torch.cholesky_solve(target.reshape(-1, 1), factor).reshape(size, 3)
 
 
-def _here(tensor: Tensor) -> np.ndarray:
-    """What equations are put together from: on the CPU, whatever the device."""
-    return tensor.cpu().numpy()
-
-
-def _draw(vertices: Tensor, faces: Tensor, camera: Camera) -> _Drawn:
-    viewmat, K = (torch.from_numpy(matrix).to(vertices) for matrix in (camera.viewmat, camera.K))
-    corners = project_vertices(vertices, viewmat, K)
-    drawn = rasterize_mesh(corners, faces, width=camera.width, height=camera.height)
+def _draw(vertices: Tensor, faces: Tensor, view: ObservedView) -> _Drawn:
+    corners = project_vertices(vertices, view.viewmat.to(vertices), view.K.to(vertices))
+    drawn = rasterize_mesh(corners, faces, width=view.width, height=view.height)
     screen = (corners[:, :2] / corners[:, 2:]).double()
-    return _Drawn(triangle=_here(drawn.triangle), depth=_here(drawn.depth), screen=_here(screen))
+    return _Drawn(triangle=drawn.triangle, depth=drawn.depth, screen=screen)
 
 
-def _slopes(camera: Camera, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 2 3"]:
+def _slopes(view: ObservedView, points: Float[Tensor, "k 3"]) -> Float[Tensor, "k 2 3"]:
     """How pixels move with points in the world, per metre."""
-    rotation, K = camera.viewmat[:3, :3], camera.K
-    x, y, depth = (points @ rotation.T + camera.viewmat[:3, 3]).T
+    rotation = view.viewmat[:3, :3]
+    x, y, depth = (points @ rotation.T + view.viewmat[:3, 3]).T
     right = rotation[0] - (x / depth)[:, None] * rotation[2]
     down = rotation[1] - (y / depth)[:, None] * rotation[2]
-    return np.stack([right * (K[0, 0] / depth)[:, None], down * (K[1, 1] / depth)[:, None]], 1)
+    return torch.stack([right * (view.K[0, 0] / depth)[:, None], down * (view.K[1, 1] / depth)[:, None]], 1)
 
 
 def _pull_by_colours(
@@ -286,31 +265,30 @@ def _pull_by_colours(
     paint: _Paint,
 ) -> None:
     """Points that are seen want to go where the image has their colour."""
-    camera = view.camera
-    pixels, depth = camera.project(shown.points)
-    towards = camera.position - shown.points
-    facing = (towards * shown.normals).sum(1) / np.linalg.norm(towards, axis=1)
-    column = np.clip(pixels[:, 0], 0, camera.width - 1).astype(np.int64)
-    row = np.clip(pixels[:, 1], 0, camera.height - 1).astype(np.int64)
+    corners = project_vertices(shown.points, view.viewmat, view.K)
+    pixels, depth = corners[:, :2] / corners[:, 2:], corners[:, 2]
+    towards = view.position - shown.points
+    facing = (towards * shown.normals).sum(1) / towards.norm(dim=1)
+    column, row = pixels[:, 0].clamp(0, view.width - 1).long(), pixels[:, 1].clamp(0, view.height - 1).long()
     front = (drawn.triangle[row, column] >= 0) & (depth < drawn.depth[row, column] + VISIBLE_WITHIN_M)
-    chosen = np.flatnonzero((facing > FACING) & front)
-    values = sample(view.colours, pixels[chosen]).astype(np.float64)
-    whole = values[:, 9] > 0.99
+    chosen = ((facing > FACING) & front).nonzero().squeeze(1)
+    values = sample(view.colours, pixels[chosen]).double()
+    whole = (values[:, 9] > 0.99).nonzero().squeeze(1)
     chosen, values = chosen[whole], values[whole]
     paint.see(chosen, facing[chosen], shown.shade[chosen], values[:, :3])
-    painted = np.isfinite(known.colours[chosen, 0])
+    painted = known.colours[chosen, 0].isfinite().nonzero().squeeze(1)
     chosen, values = chosen[painted], values[painted]
     if len(chosen) == 0:
         return
     colours = known.colours[chosen] * shown.shade[chosen]
     error = colours - values[:, :3]
-    surprise = np.sqrt((error**2).mean(1)) / (OUTLIER * COLOUR_ERROR)
+    surprise = (error**2).mean(1).sqrt() / (OUTLIER * COLOUR_ERROR)
     weight = facing[chosen] / (1 + surprise**2) ** 2 / COLOUR_ERROR**2
     some = slice(None, None, LIGHT_STRIDE)
     paint.correct_light(shown.basis[chosen][some], weight[some], colours[some], -error[some])
-    slopes = np.stack([values[:, 3:6], values[:, 6:9]], 2) @ _slopes(camera, shown.points[chosen])  # [k, 3 colours, 3]
-    pull.normal[chosen] += (slopes * weight[:, None, None]).transpose(0, 2, 1) @ slopes
-    pull.right[chosen] += ((error * weight[:, None])[:, None] @ slopes)[:, 0]
+    slopes = torch.stack([values[:, 3:6], values[:, 6:9]], 2) @ _slopes(view, shown.points[chosen])  # [k, 3 colours, 3]
+    weighted = (slopes * weight[:, None, None]).mT
+    pull.see(chosen, weighted @ slopes, (weighted @ error[..., None])[..., 0])
 
 
 def _pull_by_outline(
@@ -326,39 +304,43 @@ def _pull_by_outline(
     ends, share, outward = _outline_points(screen, topology, drawn.triangle)
     if len(ends) == 0:
         return
-    points = screen[ends[:, 0]] * share[:, :1] + screen[ends[:, 1]] * share[:, 1:]
-    distance, nearest = cKDTree(points).query(view.outline, distance_upper_bound=reach)
-    found = np.flatnonzero(np.isfinite(distance))
-    found = found[(outward[nearest[found]] * view.outward[found]).sum(1) > ALIGNED]
+    points = _between(screen, ends, share)
+    distance, nearest = NearestPoint(points).of(view.outline, reach)
+    aligned = (outward[nearest] * view.outward).sum(1) > ALIGNED
+    found = (distance.isfinite() & aligned).nonzero().squeeze(1)
     nearest, normal = nearest[found], view.outward[found]
     ends, share = ends[nearest], share[nearest]
     off = ((view.outline[found] - points[nearest]) * normal).sum(1)
     weight = OUTLINE_WEIGHT / (1 + (off / OUTLINE_OUTLIER) ** 2)
-    places = shown.corners[ends[:, 0]] * share[:, :1] + shown.corners[ends[:, 1]] * share[:, 1:]
-    slope = (normal[:, None] @ _slopes(view.camera, places))[:, 0]
-    pull.add(ends, share, weight[:, None, None] * slope[:, :, None] * slope[:, None], (weight * off)[:, None] * slope)
+    places = _between(shown.vertices.double(), ends, share)
+    slope = (normal[:, None] @ _slopes(view, places))[:, 0]
+    both = torch.cat([slope, off[:, None]], 1)
+    pull.add(ends, share, weight[:, None, None] * slope[:, :, None] * both[:, None])
+
+
+def _between(corners: Float[Tensor, "v d"], ends: Int[Tensor, "k 2"], share: Float[Tensor, "k 2"]) -> Tensor:
+    """Points on edges, `[k, d]`."""
+    return corners[ends[:, 0]] * share[:, :1] + corners[ends[:, 1]] * share[:, 1:]
 
 
 def _outline_points(
-    screen: Float[np.ndarray, "v 2"], topology: Topology, triangle: Int[np.ndarray, "h w"]
-) -> tuple[Int[np.ndarray, "k 2"], Float[np.ndarray, "k 2"], Float[np.ndarray, "k 2"]]:
+    screen: Float[Tensor, "v 2"], topology: Topology, triangle: Int[Tensor, "h w"]
+) -> tuple[Int[Tensor, "k 2"], Float[Tensor, "k 2"], Float[Tensor, "k 2"]]:
     """Points on edges beyond which there is nothing: their ends, the ends' shares, and the way out, in pixels."""
-    faces, across = topology.faces.numpy(), topology.across.numpy()
-    a, b, c = (screen[faces[:, corner]] for corner in range(3))
-    turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0] > 0
-    ahead = across > np.arange(len(faces))[:, None]
-    face, edge = np.nonzero((across < 0) | (ahead & (turn[across] != turn[:, None])))
-    ends = np.stack([faces[face, edge], faces[face, (edge + 1) % 3]], 1)
+    faces = topology.faces
+    face, edge = outline_edges(screen, topology).nonzero(as_tuple=True)
+    ends = torch.stack([faces[face, edge], faces[face, (edge + 1) % 3]], 1)
     along = screen[ends[:, 1]] - screen[ends[:, 0]]
-    outward = np.stack([along[:, 1], -along[:, 0]], 1) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
+    outward = torch.stack([along[:, 1], -along[:, 0]], 1) / along.norm(dim=1, keepdim=True).clamp(min=1e-9)
     inside = ((screen[faces[face, (edge + 2) % 3]] - screen[ends[:, 0]]) * outward).sum(1) > 0
-    outward = np.where(inside[:, None], -outward, outward)
-    share = np.tile(np.array([[1 - s, s] for s in ALONG_EDGE]), (len(ends), 1))
-    ends, outward = (np.repeat(rows, len(ALONG_EDGE), 0) for rows in (ends, outward))
-    points = screen[ends[:, 0]] * share[:, :1] + screen[ends[:, 1]] * share[:, 1:]
-    beyond = np.floor(points + 1.2 * outward).astype(np.int64)
+    outward = torch.where(inside[:, None], -outward, outward)
+    shares = screen.new_tensor([[1 - s, s] for s in ALONG_EDGE])
+    share = shares.repeat(len(ends), 1)
+    ends, outward = (rows.repeat_interleave(len(ALONG_EDGE), 0) for rows in (ends, outward))
+    beyond = (_between(screen, ends, share) + 1.2 * outward).floor().long()
     height, width = triangle.shape
-    there = ((beyond >= 0) & (beyond < (width, height))).all(1)
-    column, row = np.where(there[:, None], beyond, 0).T
-    free = ~there | (triangle[row, column] < 0)
+    column, row = beyond.T
+    there = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    seen = triangle[row.clamp(0, height - 1), column.clamp(0, width - 1)]
+    free = (~there | (seen < 0)).nonzero().squeeze(1)
     return ends[free], share[free], outward[free]

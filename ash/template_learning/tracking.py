@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ash.capture.dataset import Capture, Pose
@@ -19,6 +18,7 @@ from ash.capture.formats import read_scan, read_surface_mesh_truth, read_templat
 from ash.rotations import RigidTransforms
 from ash.template.graph import NeighbourMean, vertex_neighbours
 from ash.template.template import Template, vertex_normals
+from ash.template_learning.nearest import NearestPoint
 
 RANGE_M = 0.1  # A surface point farther away than this is no match,
 ALIGNED = 0.7  # nor one whose normal differs by more than this cosine.
@@ -135,14 +135,14 @@ def _told(weight: Float[Tensor, " v"], neighbours: NeighbourMean) -> Float[Tenso
 
 
 class _Mesh:
-    """A surface of one frame on a device, to look up the nearest points of: by SciPy, on the CPU."""
+    """A surface of one frame on a device, to look up the nearest points of."""
 
     def __init__(
         self, vertices: Float[np.ndarray, "s 3"], faces: Int[np.ndarray, "f 3"], *, rim: int, device: torch.device
     ) -> None:
         """`rim`: how many vertices deep the rim of holes is that is not believed."""
-        self.tree, self.places = cKDTree(vertices), vertices.astype(np.float32)
-        self.points = torch.from_numpy(self.places).to(device)
+        places = torch.from_numpy(vertices).double().to(device)
+        self.nearest, self.points = NearestPoint(places), places.float()
         self.normals = _smooth_normals(self.points, torch.from_numpy(faces).to(device))
         self.believed = ~torch.from_numpy(_rim(faces, len(vertices), rings=rim)).to(device)
         self.few = torch.arange(0, len(vertices), max(1, len(vertices) // POINTS), device=device)
@@ -157,24 +157,22 @@ class _Mesh:
         for _ in range(TRIM_SWEEPS):
             around = 0.5 * (around + neighbours(around))
         surprise = (off - around[vertices]).abs().squeeze(1)
-        kept = surprise <= TRIM * surprise.square().mean().sqrt()
+        kept = (surprise <= TRIM * surprise.square().mean().sqrt()).nonzero().squeeze(1)
         return _mean_of_matches((off * normal)[kept], vertices[kept], len(posed))
 
     def _matches(self, posed: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
         """Pairs of a vertex and a point that belong together."""
-        # A vertex without a point in range gets an infinite distance and a number beyond the last point.
-        places, device = posed.cpu().numpy(), posed.device
-        distance, nearest = self.tree.query(places, distance_upper_bound=RANGE_M)
-        forward = torch.from_numpy(np.minimum(nearest, len(self.places) - 1)).to(device)
-        back, vertex = (torch.from_numpy(found).to(device) for found in cKDTree(places).query(self.places))
+        distance, forward = self.nearest.of(posed.double(), RANGE_M)
+        back, vertex = NearestPoint(posed.double()).of(self.points.double())
         off, beside = self._apart(posed, forward)
         # A leg under a skirt that alone was scanned is not to be drawn to it: the skirt's own vertices are nearer.
         owner_off, _ = self._apart(posed[vertex[forward]], forward)
-        there = torch.from_numpy(np.isfinite(distance)).to(device)
-        own = there & (beside < HOLE_M) & (off.abs() < owner_off.abs() + LAYER_M)
-        vertices = torch.cat([own.nonzero().squeeze(1), vertex[self.few][back[self.few] < RANGE_M]])
-        points = torch.cat([forward[own], self.few[back[self.few] < RANGE_M]])
-        kept = ((self.normals[points] * normals[vertices]).sum(1) > ALIGNED) & self.believed[points]
+        nearer = off.abs() < owner_off.abs() + LAYER_M
+        own = (distance.isfinite() & (beside < HOLE_M) & nearer).nonzero().squeeze(1)
+        few = self.few[(back[self.few] < RANGE_M).nonzero().squeeze(1)]
+        vertices, points = torch.cat([own, vertex[few]]), torch.cat([forward[own], few])
+        aligned = (self.normals[points] * normals[vertices]).sum(1) > ALIGNED
+        kept = (aligned & self.believed[points]).nonzero().squeeze(1)
         return vertices[kept], points[kept]
 
     def _apart(self, places: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,6 @@ product with a sparse matrix, which `meta` has not.
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from helpers.captures import tiny_preset
@@ -21,7 +20,6 @@ import ash.template.graph
 import ash.template_learning.image_tracking
 import ash.template_learning.learning
 import ash.template_learning.regressing
-import ash.template_learning.tracking
 import ash.textures
 import ash.training.adam
 import baselines.ddc
@@ -115,16 +113,18 @@ def _no_outlines(samples: Tensor, view: MeshView, topology: Topology) -> Tensor:
 
 
 def learning_without_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Templates are learned on `meta` and stay there; where NumPy and SciPy work in between, they see other numbers."""
+    """Templates are learned on `meta` and stay there.
+
+    Where a choice depends on numbers, everything is chosen; where SciPy works in between, its result is replaced.
+    """
     images, learning = ash.template_learning.image_tracking, ash.template_learning.learning
-    regressing, tracking = ash.template_learning.regressing, ash.template_learning.tracking
+    regressing = ash.template_learning.regressing
     monkeypatch.setattr(learning, "CPU", META)
     monkeypatch.setattr(ash.template.graph.NeighbourMean, "__call__", as_if_averaged)
-    monkeypatch.setattr(images, "_here", _some_numbers)
+    monkeypatch.setattr(Tensor, "nonzero", _all_chosen)
     monkeypatch.setattr(images, "rasterize_mesh", _nothing_seen)
     monkeypatch.setattr(regressing, "_node_translations", _no_translations)
     monkeypatch.setattr(regressing, "_mean_square", lambda error: _on_meta(error) and 1.0)
-    monkeypatch.setattr(tracking._Mesh, "correction", _no_correction)
 
 
 def _on_meta(*tensors: Tensor) -> bool:
@@ -132,11 +132,14 @@ def _on_meta(*tensors: Tensor) -> bool:
     return True
 
 
-def _some_numbers(tensor: Tensor) -> np.ndarray:
-    assert _on_meta(tensor)
-    if not tensor.is_floating_point():
-        return np.zeros(tensor.shape, np.int64)
-    return np.random.default_rng(0).uniform(0.1, 1, tensor.shape)
+def _all_chosen(
+    mask: Tensor, *, as_tuple: bool = False, of_numbers: Any = Tensor.nonzero
+) -> Tensor | tuple[Tensor, ...]:
+    """What `Tensor.nonzero` returns on `meta` where everything is chosen."""
+    if mask.device != META:
+        return of_numbers(mask, as_tuple=as_tuple)  # type: ignore[no-any-return]
+    rows = torch.empty(mask.numel(), mask.dim(), dtype=torch.int64, device=META)
+    return rows.unbind(1) if as_tuple else rows
 
 
 def _nothing_seen(vertices: Tensor, faces: Tensor, *, width: int, height: int) -> Rasterized:
@@ -148,8 +151,3 @@ def _nothing_seen(vertices: Tensor, faces: Tensor, *, width: int, height: int) -
 def _no_translations(graph: Any, shift: Tensor) -> Tensor:
     assert _on_meta(graph.weights, graph.links, shift)
     return shift.new_zeros(len(shift), len(graph.nodes), 3)
-
-
-def _no_correction(mesh: Any, posed: Tensor, normals: Tensor, neighbours: NeighbourMean) -> tuple[Tensor, Tensor]:
-    assert _on_meta(mesh.points, mesh.normals, mesh.believed, mesh.few, posed, normals, neighbours.operator)
-    return torch.zeros_like(posed), torch.ones_like(posed[:, 0])

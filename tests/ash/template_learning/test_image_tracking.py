@@ -7,6 +7,7 @@ import pytest
 import torch
 from helpers.captures import write_tube_capture
 from helpers.figures import ring_cameras, tube_mesh, tube_motion
+from scipy.ndimage import gaussian_filter, minimum_filter
 
 from ash.capture.dataset import Capture, Pose, image_path
 from ash.config import TemplateConfig
@@ -17,7 +18,8 @@ from ash.template.graph import build_graph
 from ash.template.template import skinned_template
 from ash.template_learning import image_tracking
 from ash.template_learning.image_tracking import track_images
-from ash.template_learning.observing import observe, sample
+from ash.template_learning.nearest import NearestPoint, nearest_naive
+from ash.template_learning.observing import _least_around, blurred, observe, sample
 from ash.training.images import Cutout
 
 SIZE, FRAMES = 96, 6
@@ -105,6 +107,26 @@ def test_the_rasteriser_of_a_gpu_shows_the_same(capture: Capture, monkeypatch: p
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
+def test_all_distances_track_what_the_tree_tracks(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But for points of the outline where two edges start: of points in one place any may be the nearest."""
+    train = replace(capture.splits["train"], frames=(0, 1))
+    few = replace(capture, splits={"train": train})
+    expected, before = errors_m(few, passes=2)
+    by_tree, asked = NearestPoint.of, []
+
+    def of(nearest: NearestPoint, places: torch.Tensor, within: float) -> tuple[torch.Tensor, torch.Tensor]:
+        asked.append(len(places))
+        distance, row = nearest_naive(nearest.points, places, within)
+        torch.testing.assert_close(distance, by_tree(nearest, places, within)[0], rtol=1e-9, atol=1e-12)
+        return distance, row
+
+    monkeypatch.setattr(NearestPoint, "of", of)
+    found, _ = errors_m(few, passes=2)
+    assert len(asked) == 2 * 2 * 8 and min(asked) > 50
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)  # Metres: before, it is a hundred times as much.
+    assert before.max() > 1e-2
+
+
 def test_passes_are_at_least_one() -> None:
     with pytest.raises(InputError, match="passes"):
         TemplateConfig(passes=0)
@@ -120,18 +142,28 @@ def test_a_view_is_cut_out_around_the_subject_with_its_outline() -> None:
     camera = ring_cameras(1, 64)[0]
     cutout = Cutout(pixels=torch.from_numpy(rgba[23:45, 19:41].copy()), left=19, top=23)
     view = observe(cutout, camera, blur=0.5)
-    shift = camera.K[:2, 2] - view.camera.K[:2, 2]
-    outline = view.outline + shift
+    shift = camera.K[:2, 2] - view.K[:2, 2].numpy()
+    outline = view.outline.numpy() + shift
     assert len(outline) > 60
     np.testing.assert_allclose(np.hypot(outline[:, 0] - 30, outline[:, 1] - 34), 10.25, atol=0.12)
     away = (outline - [30, 34]) / 10.25
-    assert ((away * view.outward).sum(1) > 0.98).all()
+    assert ((away * view.outward.numpy()).sum(1) > 0.98).all()
     row, column = (np.array([34, 30]) - shift[::-1]).astype(int)
     np.testing.assert_allclose(view.colours[row, column], [200 / 255, 0, 0, 0, 0, 0, 0, 0, 0, 1], atol=1e-5)
     assert view.colours[int(34 - shift[1]), int(41 - shift[0]), 9] == 0  # The rim's colours do not count.
 
 
 def test_samples_are_bilinear_with_centres_at_a_half() -> None:
-    image = np.arange(12.0).reshape(3, 4, 1)
-    points = np.array([[0.5, 0.5], [1.0, 0.5], [1.5, 2.0], [-3.0, 9.0], [3.5, 2.5]])
+    image = torch.arange(12.0).reshape(3, 4, 1)
+    points = torch.tensor([[0.5, 0.5], [1.0, 0.5], [1.5, 2.0], [-3.0, 9.0], [3.5, 2.5]])
     np.testing.assert_allclose(sample(image, points)[:, 0], [0, 0.5, 7, 8, 11])
+
+
+@pytest.mark.parametrize(("size", "deviation"), [((40, 31), 1.5), ((40, 31), 0.5), ((3, 4), 1.5)])
+def test_images_are_filtered_as_by_scipy(size: tuple[int, int], deviation: float) -> None:
+    """Near the border, too, and where a filter reaches beyond the opposite one."""
+    image = torch.rand(2, *size, generator=torch.Generator().manual_seed(0))
+    expected = np.stack([gaussian_filter(channel, deviation) for channel in image.numpy()])
+    np.testing.assert_allclose(blurred(image, deviation), expected, rtol=0, atol=1e-7)
+    expected = minimum_filter(image[0].numpy(), 7)
+    np.testing.assert_array_equal(_least_around(image[0], 3), expected)
