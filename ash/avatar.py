@@ -27,7 +27,7 @@ from ash.template.motion import normalised_motion
 from ash.template.template import Template
 from ash.template_learning.learning import template_of, with_template
 from ash.template_learning.refining import refined_template
-from ash.textures import Conditions, TexelLattice, TextureDrawer, build_lattice, unsettled
+from ash.textures import Conditions, TexelLattice, TextureDrawer, build_lattice, unsettled_frames
 from ash.training.adam import Adam
 from ash.training.batches import draw_batch, over
 from ash.training.images import TrainingImages, load_training_images
@@ -36,6 +36,7 @@ from ash.training.loop import fit, view_loss
 RELEASED_OPACITY_WEIGHT = 0.1  # In the release's warm-up.
 FITTED_LOOK, FITTED_GAIN = 100, 0.01  # A frame is fitted until so many steps lower its loss by less than this share.
 
+DecodedFrame = tuple[Tensor, Conditions]  # raw parameters [n, o], and where they are posed
 MakeDecoders = Callable[[ModelConfig, TexelLattice], torch.nn.Module]
 
 
@@ -133,13 +134,20 @@ class AshAvatar:
         learned = [([p for p in group if p.requires_grad], rate) for group, rate in groups]
         return [{"params": group, "lr": rate} for group, rate in learned if group]
 
-    def draw_training_views(self, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
+    def draw_training_views(
+        self, frame: int, cameras: list[Camera], background: Tensor, step: int, decoded: DecodedFrame | None = None
+    ) -> Tensor:
         """Stages 3 and 4 on cached conditions; the base alone while the static warm-up lasts."""
-        training, conditions = self.config.training, self._conditions_of(frame)
+        raw, conditions = decoded or self.decode_together([frame], step)[0]
+        return self._drawn(raw, conditions, cameras, background)
+
+    def decode_together(self, frames: Sequence[int], step: int) -> list[DecodedFrame]:
+        """Stage 3 of a step's frames."""
+        training, conditions = self.config.training, [self._conditions_of(frame) for frame in frames]
         if step < training.static_steps:
-            return self._drawn(self.module.base, conditions, cameras, background)
-        noisy = unsettled(conditions.textures, training.texture_noise, seed=self.config.seed, step=step)
-        return self._drawn(self._decode(replace(conditions, textures=noisy)), conditions, cameras, background)
+            return [(self.module.base, seen) for seen in conditions]
+        noisy = unsettled_frames(conditions, training.texture_noise, seed=self.config.seed, step=step)
+        return list(zip(self._decode(noisy), conditions, strict=True))
 
     def draw_static_views(self, frame: int, cameras: list[Camera], background: Tensor) -> Tensor | None:
         """Views of the static avatar, which counts far from the training motion."""
@@ -167,10 +175,10 @@ class AshAvatar:
         decoders = self.module.decoders
         return None if decoders is None else self.module.corrections(decoders(self._conditions_of(frame)))
 
-    def _decode(self, conditions: Conditions) -> Tensor:
+    def _decode(self, frames: Sequence[Conditions]) -> list[Tensor]:
         """Stage 3 as it learns, in the precision of the configuration."""
         with decoding_in(self._precision, self.device):
-            return self.module.decode(conditions).float()
+            return [raw.float() for raw in self.module.decode_together(frames)]
 
     @property
     def _precision(self) -> str:
@@ -212,7 +220,7 @@ class AshAvatar:
             batch = draw_batch(alone, self.config.training, self.config.seed, step)
             fixed = torch.cat([torch.zeros_like(raw[:, :3]), raw[:, 3:]], 1)
             drawn = self._drawn(fixed, conditions, batch.cameras, batch.background)
-            loss = view_loss(drawn, batch, self.config.training)
+            loss = view_loss([drawn], [batch], self.config.training)
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
@@ -227,7 +235,7 @@ class AshAvatar:
         weights[10] = opacity
         for step in range(training.warmup_steps):
             frame = frames[step % len(frames)]
-            raw = self._decode(self._conditions_of(frame))
+            (raw,) = self._decode([self._conditions_of(frame)])
             loss = (weights * (raw - target(frame)) ** 2).mean()
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]

@@ -112,6 +112,7 @@ class TrainingConfig:
     # "random": a new colour every step, so that opacity is learned; "black": the paper's; "studio": as random, but
     # inside the mask the camera's picture of the empty studio, for masks that are too large
     background: str = "random"
+    frames_per_step: int = 1  # decoded together, each shown in `views_per_step` images: fewer kernels on a GPU
     schedule: str = "open"  # learning rates fall once a plateau or a limit is near; "constant": never, as released
     crop: bool = True  # draw only around the subject; the release draws whole frames
     # of the decoders while they learn; "bfloat16": autocast on a GPU, convolutions on a CPU that has tiles for it (AMX)
@@ -148,8 +149,15 @@ class TrainingConfig:
                 raise InputError(f"{name}: expected more than 0 and at most 1, got {getattr(self, name)}")
         if min(self.fitted_every, self.fitted_steps) < 1:
             raise InputError("fitted_every and fitted_steps: expected at least 1")
-        if self.steps < 1 or self.views_per_step < 1 or not 0 <= self.warmup_steps <= self.steps:
+        if min(self.steps, self.views_per_step) < 1 or not 0 <= self.warmup_steps <= self.steps:
             raise InputError("expected steps >= 1, views_per_step >= 1 and 0 <= warmup_steps <= steps")
+        if self.frames_per_step < 1:
+            raise InputError(f"frames_per_step: expected at least 1, got {self.frames_per_step}")
+
+    def check_norm(self, norm: str) -> None:
+        """Refuse U-Nets whose norm would mix the frames of a step."""
+        if self.frames_per_step > 1 and norm == "batch-as-released":
+            raise InputError(f"frames_per_step: norm {norm!r} mixes what is decoded together; expected 1")
 
 
 SUPERVISIONS = ("images", "scans", "surface", "vertices")
@@ -212,5 +220,6 @@ class AshConfig:
         if self.training.warmup in ("analytic", "fitted") and not self.model.motion:
             raise InputError(f"warmup={self.training.warmup!r} trains the decoders and needs motion=True")
         model = self.model
+        self.training.check_norm(model.norm)
         if self.training.texture_noise > 0 and not (model.motion and model.standardise and model.head == "unet"):
             raise InputError("texture_noise is for U-Nets that see standardised textures (standardise=True)")

@@ -1,6 +1,6 @@
 """Stg.3: from motion-aware textures to the canonical texel Gaussians' raw parameters (ASH Eq. 6 and 7)."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from itertools import pairwise
 from typing import cast
@@ -13,7 +13,7 @@ import ash.native.library
 import ash.native.unet
 from ash.config import ModelConfig
 from ash.gaussians.gaussians import GEOMETRY_CHANNELS, raw_channels
-from ash.textures import Conditions, TexelLattice
+from ash.textures import Conditions, SeenFrame, TexelLattice
 
 GLOBAL_FEATURES = 16
 OCTAVES = 6
@@ -62,31 +62,32 @@ class UNet(nn.Module):
         nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
 
     def forward(
-        self, texture: Float[Tensor, "b c h w"], features: Float[Tensor, " p"] | None = None
+        self, texture: Float[Tensor, "b c h w"], features: Float[Tensor, "*each p"] | None = None
     ) -> Float[Tensor, "b o h w"]:
-        """Map a texture to a texture; `features` are broadcast over the bottleneck.
+        """Map textures to textures; `features`, of all or of each, are broadcast over the bottleneck.
 
-        `forward_naive` is the definition; a single float32 image on the CPU goes through native kernels. Under torch's
+        `forward_naive` is the definition; float32 images on the CPU go one by one through native kernels. Under torch's
         autocast these round the factors of their 3x3 convolutions to bfloat16, where the machine has tiles for it.
         """
         if not self._takes_natively(texture):
             return self.forward_naive(texture, features)
-        return self._native(texture, features, None)[None]
+        return self._native(texture, features, None)
 
     def picked(
-        self, texture: Float[Tensor, "1 c h w"], features: Float[Tensor, " p"] | None, rows: "TexelRows"
-    ) -> Float[Tensor, "n o"]:
+        self, texture: Float[Tensor, "b c h w"], features: Float[Tensor, "*each p"] | None, rows: "TexelRows"
+    ) -> Float[Tensor, "b n o"]:
         """Of `forward`'s result the texels' rows: nothing is shuffled or kept that will not be used."""
         width = self.head.out_channels // rows.of_pixel
         if self._takes_natively(texture):
             return self._native(texture, features, ash.native.unet.Picks(rows.places, rows.lines, width))
         # In the network's own memory order a pixel's channels are its texels', one after the other.
-        return self.forward_naive(texture, features).permute(0, 2, 3, 1).reshape(-1, width).index_select(0, rows.rows)
+        pixels = self.forward_naive(texture, features).permute(0, 2, 3, 1)
+        return pixels.reshape(len(texture), -1, width).index_select(1, rows.rows)
 
     def _native(
         self,
-        texture: Float[Tensor, "1 c h w"],
-        features: Float[Tensor, " p"] | None,
+        texture: Float[Tensor, "b c h w"],
+        features: Float[Tensor, "*each p"] | None,
         picks: ash.native.unet.Picks | None,
     ) -> Tensor:
         height, width = texture.shape[2:]
@@ -101,11 +102,13 @@ class UNet(nn.Module):
             torch.is_autocast_enabled("cpu"),
         )
         features = None if features is None else features.float()
-        return ash.native.unet.unet(shape, texture[0], features, self._layers(), torch.get_num_threads(), picks)
+        each = [features] * len(texture) if features is None or features.dim() == 1 else features.unbind()
+        run, layers, threads = ash.native.unet.unet, self._layers(), torch.get_num_threads()
+        return as_batch([run(shape, *one, layers, threads, picks) for one in zip(texture, each, strict=True)])
 
     def _takes_natively(self, texture: Tensor) -> bool:
         levels = len(self.down)
-        whole = len(texture) == 1 and levels > 0 and not any(size % 2**levels for size in texture.shape[2:])
+        whole = levels > 0 and not any(size % 2**levels for size in texture.shape[2:])
         small = self.head.in_channels * 2**levels <= NATIVE_CHANNELS
         of_its_kind = texture.dtype == self.head.weight.dtype == torch.float32 and texture.device.type == "cpu"
         as_it_is = not (texture.requires_grad or torch.jit.is_tracing())
@@ -125,7 +128,7 @@ class UNet(nn.Module):
         return [(layer.weight, layer.bias) for layer in (*layers, self.head) if not isinstance(layer, nn.ReLU)]
 
     def forward_naive(
-        self, texture: Float[Tensor, "b c h w"], features: Float[Tensor, " p"] | None = None
+        self, texture: Float[Tensor, "b c h w"], features: Float[Tensor, "*each p"] | None = None
     ) -> Float[Tensor, "b o h w"]:
         """The network as it is defined, layer by layer."""
         skips = [self.first(texture)]
@@ -133,7 +136,7 @@ class UNet(nn.Module):
             skips.append(block(nn.functional.max_pool2d(skips[-1], 2)))
         x = skips.pop()
         if features is not None:
-            x = torch.cat([x, features[None, :, None, None].expand(len(x), -1, *x.shape[2:])], 1)
+            x = torch.cat([x, features[..., None, None].expand(len(x), -1, *x.shape[2:])], 1)
         for up, merge in zip(self.up, self.merge, strict=True):
             x = merge(torch.cat([up(x), skips.pop()], 1))
         return self.head(x)
@@ -179,11 +182,30 @@ class GlobalFeatures(nn.Module):
             nn.Linear(3 + 6 * OCTAVES, wide), nn.ReLU(), nn.Linear(wide, 32), nn.ReLU(), nn.Linear(32, GLOBAL_FEATURES)
         )
 
-    def forward(self, translation: Float[Tensor, " 3"]) -> Float[Tensor, " 16"]:
-        """Features of a root translation in metres."""
+    def forward(self, translation: Float[Tensor, "*each 3"]) -> Float[Tensor, "*each 16"]:
+        """Features of root translations in metres."""
         translation = translation / self.scale
-        angles = translation[:, None] * 2.0 ** torch.arange(OCTAVES, device=translation.device)
-        return self.mlp(torch.cat([translation, angles.sin().flatten(), angles.cos().flatten()]))
+        angles = translation[..., None] * 2.0 ** torch.arange(OCTAVES, device=translation.device)
+        return self.mlp(torch.cat([translation, angles.sin().flatten(-2), angles.cos().flatten(-2)], -1))
+
+
+def as_batch(tensors: Sequence[Tensor]) -> Tensor:
+    """Tensors one above the other; a single one is not copied."""
+    return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
+
+
+def apart(batch: Tensor) -> Sequence[Tensor]:
+    """The tensors of a batch; the gradient of a single one is not copied either."""
+    return [batch.squeeze(0)] if len(batch) == 1 else batch.unbind()
+
+
+def seen_together(
+    frames: Sequence[SeenFrame], phi: GlobalFeatures | None
+) -> tuple[Float[Tensor, "b c r r"], Float[Tensor, "*each 16"] | None]:
+    """Frames as one batch for U-Nets: textures in their memory order, and Phi."""
+    textures = as_batch([frame.textures for frame in frames]).contiguous(memory_format=torch.channels_last)
+    where = as_batch([frame.root_translation for frame in frames])
+    return textures, None if phi is None else phi(where.squeeze(0))
 
 
 class Decoders(nn.Module):
@@ -213,12 +235,15 @@ class Decoders(nn.Module):
 
     def forward(self, conditions: Conditions) -> Float[Tensor, "n o"]:
         """Decode one frame."""
-        x = conditions.textures[None].contiguous(memory_format=torch.channels_last)
-        phi = self.phi(conditions.root_translation) if self.phi is not None else None
+        return self.together([conditions])[0]
+
+    def together(self, conditions: Sequence[Conditions]) -> Sequence[Float[Tensor, "n o"]]:
+        """Decode several frames as one batch."""
+        x, phi = seen_together(conditions, self.phi)
         seen_by = [None] * (len(self.nets) - 1) + [phi]  # E_geo does not see Phi, unless the trunk is shared.
         nets = cast(Iterable[UNet], self.nets)
         decoded = [net.picked(x, features, self.texels) for net, features in zip(nets, seen_by, strict=True)]
-        return decoded[0] if len(decoded) == 1 else torch.cat(decoded, 1)
+        return apart(decoded[0] if len(decoded) == 1 else torch.cat(decoded, -1))
 
 
 class TexelRows(nn.Module):

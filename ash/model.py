@@ -1,6 +1,6 @@
 """The ASH avatar, in the paper's order: template, textures, decoders, skinning, splatting. START READING HERE."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ash.capture.dataset import Camera, Pose
 from ash.config import ModelConfig
+from ash.decoders import Decoders
 from ash.devices import MovingModule, finish
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted, splat
@@ -97,6 +98,13 @@ class AshModel(MovingModule):
         if self.static is not None and conditions.trust < 1:
             raw = self.static.lerp(raw, conditions.trust)
         return raw
+
+    def decode_together(self, frames: Sequence[Conditions]) -> list[Float[Tensor, "n o"]]:
+        """`decode` of several frames, by U-Nets in one batch; by what decodes in another way frame by frame."""
+        if len(frames) == 1 or not isinstance(self.decoders, Decoders):
+            return [self.decode(seen) for seen in frames]
+        decoded = zip(frames, self.decoders.together(frames), strict=True)
+        return [self.decode(seen, decoders=lambda _, of_frame=of_frame: of_frame) for seen, of_frame in decoded]
 
     def corrections(self, decoded: Float[Tensor, "n o"]) -> Float[Tensor, "n o"]:
         """What of the decoders' output counts: all of it, or all but the offsets."""

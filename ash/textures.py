@@ -1,8 +1,9 @@
 """Stg.2: the texel lattice and the motion-aware textures (ASH Sec. 3.2, Eq. 4)."""
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -79,16 +80,25 @@ def build_lattice(mesh: TemplateMesh, resolution: int) -> TexelLattice:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Conditions:
-    """What Stg.1 and Stg.2 hand to the decoders for one frame; nothing in it is learned with the avatar."""
+class SeenFrame:
+    """What U-Nets see of one frame; nothing in it is learned with the avatar."""
 
     textures: Float[Tensor, "c r r"]  # motion-aware textures
-    trust: float  # in 0..1: how much of the decoders' output counts in this frame
-    motion: Float[Tensor, "k d"]  # the normalised motion window, newest frame first
+    trust: float  # in 0..1: how much of what is decoded counts in this frame
     root_translation: Float[Tensor, " 3"]  # metres
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Conditions(SeenFrame):
+    """What Stg.1 and Stg.2 hand to the decoders for one frame."""
+
+    motion: Float[Tensor, "k d"]  # the normalised motion window, newest frame first
     canonical: Float[Tensor, "n 3"]  # texel positions on the canonical template, Eq. 4
     normals: Float[Tensor, "n 3"]  # unit, world
     transforms: RigidTransforms  # texel-wise T of Eq. 5
+
+
+Seen = TypeVar("Seen", bound=SeenFrame)
 
 
 @torch.no_grad()
@@ -135,6 +145,15 @@ def unsettled(textures: Float[Tensor, "c r r"], sigma: float, *, seed: int, step
     if sigma == 0 or not torch.is_grad_enabled():
         return textures
     return textures + sigma * smooth_noise(textures.shape, (seed, 3, step)).to(textures.device)
+
+
+def unsettled_frames(frames: Sequence[Seen], sigma: float, *, seed: int, step: int) -> list[Seen]:
+    """`unsettled` for the frames of a step, each with the noise that it would have in a step of its own."""
+    own_steps = range(step * len(frames), (step + 1) * len(frames))
+    return [
+        replace(seen, textures=unsettled(seen.textures, sigma, seed=seed, step=own))
+        for seen, own in zip(frames, own_steps, strict=True)
+    ]
 
 
 def smooth_noise(shape: torch.Size, seed: tuple[int, ...]) -> Float[Tensor, "c h w"]:

@@ -6,6 +6,7 @@ surface point a pixel sees; texture and light are learned through perspective-co
 coverage, and so is where its vertices lie: one displacement for all frames, and their deformation networks.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ import ash.native.shading
 from ash.capture.dataset import Camera, Capture, Pose, TemplateMesh
 from ash.checkpoints import contiguous_state, load_module, read_safetensors
 from ash.config import AshConfig, AtlasConfig, TemplateConfig, TrainingConfig, check_device, one_of
-from ash.decoders import GLOBAL_FEATURES, GlobalFeatures, UNet, decoding_in, decoding_precision
+from ash.decoders import GLOBAL_FEATURES, GlobalFeatures, UNet, apart, decoding_in, decoding_precision, seen_together
 from ash.devices import CPU, MovingModule, device_named, moved
 from ash.files import InputError, write_atomic
 from ash.gaussians.initialising import initial_texture
@@ -35,7 +36,7 @@ from ash.searching import Build, Candidate, Choice, at_size, brief_training, suf
 from ash.template.template import PosedTemplate, Template
 from ash.template_learning.learning import template_of, with_template
 from ash.template_learning.refining import MotionRefinement, Refinement
-from ash.textures import TextureDrawer, build_lattice, unsettled
+from ash.textures import SeenFrame, TextureDrawer, build_lattice, unsettled_frames
 from ash.training.batches import over
 from ash.training.images import load_training_images
 from ash.training.loop import fit
@@ -67,6 +68,7 @@ class DdcConfig:
         if self.texture < 1 or self.texture % self.model.decoded_texels:
             raise InputError(f"texture: expected a multiple of {self.model.decoded_texels}, got {self.texture}")
         check_device(self.device)
+        self.training.check_norm(self.model.norm)
         one_of("refine", self.refine, ("none", "static", "motion"))
         if self.vertices_every < 1:
             raise InputError(f"vertices_every: expected at least 1, got {self.vertices_every}")
@@ -91,12 +93,9 @@ def ddc_config(ash: AshConfig, *, seed: int, template: TemplateConfig) -> DdcCon
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class MeshConditions:
-    """What the networks see of a frame; nothing in it is learned with the avatar."""
+class MeshConditions(SeenFrame):
+    """What the networks see of a frame."""
 
-    textures: Float[Tensor, "c r r"]  # motion-aware textures
-    trust: float  # in 0..1: how much of what follows the motion counts
-    root_translation: Float[Tensor, " 3"]  # metres
     window: list[RigidTransforms]  # for the vertices' networks
 
 
@@ -113,8 +112,7 @@ class DdcModel(MovingModule):
         self.uvs = torch.from_numpy(mesh.uvs).float()
         self.topology = topology_of(template.faces)
         self.texture = nn.Parameter(initial.clone(), requires_grad=config.model.base)
-        # What counts far from the training motion.
-        self.static_texture = nn.Parameter(initial.clone()) if config.model.fade else None
+        self.static_texture = nn.Parameter(initial.clone()) if config.model.fade else None  # far from training motion
         self.refinement: Refinement | MotionRefinement | None = None
         if config.refine == "motion":
             self.refinement = MotionRefinement(config.template, mesh, template.skeleton)
@@ -147,23 +145,22 @@ class DdcModel(MovingModule):
         trust = conditions.trust
         if self.static_texture is not None and trust == 0:
             return self.static_texture
-        texture = self.corrected_texture(conditions)
+        (texture,) = self.corrected_textures([conditions])
         return texture if self.static_texture is None or trust == 1 else self.static_texture.lerp(texture, trust)
 
-    def corrected_texture(self, conditions: MeshConditions) -> Float[Tensor, "3 t t"]:
-        """The texture with what the network adds."""
+    def corrected_textures(self, frames: Sequence[MeshConditions]) -> list[Float[Tensor, "3 t t"]]:
+        """The texture with what the network adds in each frame; frames are decoded together."""
+        factor, decoded = self.config.shuffle, self._decoded(frames)
         if self.texture.dtype == torch.float32 and self.texture.device.type == "cpu":
-            return ash.native.shading.add_shuffled(self.texture, self._decoded(conditions), self.config.shuffle)
-        return self.texture + self.correction(conditions)
+            return [ash.native.shading.add_shuffled(self.texture, added, factor) for added in decoded]
+        return [self.texture + nn.functional.pixel_shuffle(added, factor) for added in decoded]
 
     def correction(self, conditions: MeshConditions) -> Float[Tensor, "3 t t"]:
         """What the network adds: decoded at the resolution of the motion-aware textures and shuffled up."""
-        return nn.functional.pixel_shuffle(self._decoded(conditions), self.config.shuffle)
+        return nn.functional.pixel_shuffle(self._decoded([conditions])[0], self.config.shuffle)
 
-    def _decoded(self, conditions: MeshConditions) -> Float[Tensor, "o r r"]:
-        seen = conditions.textures[None].contiguous(memory_format=torch.channels_last)
-        phi = self.phi(conditions.root_translation) if self.phi is not None else None
-        return self.network(seen, phi).squeeze(0)  # type: ignore[no-any-return]
+    def _decoded(self, frames: Sequence[MeshConditions]) -> Sequence[Float[Tensor, "o r r"]]:
+        return apart(self.network(*seen_together(frames, self.phi)))
 
     def see(self, posed: PosedTemplate, cameras: list[Camera]) -> list[MeshView]:
         """What cameras of one size see of the posed mesh, whatever its texture."""
@@ -258,9 +255,11 @@ class DdcAvatar:
         groups = (nets, training.learning_rate), (static, training.base_learning_rate)
         return [{"params": group, "lr": rate} for group, rate in groups]
 
-    def draw_training_views(self, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
+    def draw_training_views(
+        self, frame: int, cameras: list[Camera], background: Tensor, step: int, decoded: Tensor | None = None
+    ) -> Tensor:
         """The texture of the frame, drawn into each camera; the static texture alone while the warm-up lasts."""
-        texture = self._training_texture(frame, step)
+        texture = self.decode_together([frame], step)[0] if decoded is None else decoded
         with torch.set_grad_enabled(torch.is_grad_enabled() and step % self.config.vertices_every == 0):
             posed = self._refined(frame)
         views = self.module.see(posed, cameras)
@@ -295,14 +294,15 @@ class DdcAvatar:
     def _refined(self, frame: int) -> PosedTemplate:
         return self.module.refined(self._posed[frame], self._conditions[frame])
 
-    def _training_texture(self, frame: int, step: int) -> Float[Tensor, "3 t t"]:
+    def decode_together(self, frames: Sequence[int], step: int) -> list[Float[Tensor, "3 t t"]]:
+        """The textures of a step's frames."""
         training = self.config.training
         if step < training.static_steps:
-            return self.module.texture
-        conditions = self._conditions[frame]
-        noisy = unsettled(conditions.textures, training.texture_noise, seed=self.config.seed, step=step)
+            return [self.module.texture] * len(frames)
+        seen = [self._conditions[frame] for frame in frames]
+        noisy = unsettled_frames(seen, training.texture_noise, seed=self.config.seed, step=step)
         with decoding_in(self._precision, self.device):
-            return self.module.corrected_texture(replace(conditions, textures=noisy)).float()
+            return [texture.float() for texture in self.module.corrected_textures(noisy)]
 
     @property
     def _precision(self) -> str:

@@ -1,5 +1,6 @@
 """A reference: the exact surface with the best static texture, which is what geometry alone would give."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -32,7 +33,13 @@ class OracleTexture(DdcAvatar):
         """The texture and the light."""
         return [{"params": list(self.module.parameters()), "lr": self.config.training.base_learning_rate}]
 
-    def draw_training_views(self, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
+    def decode_together(self, frames: Sequence[int], step: int) -> list[Float[Tensor, "3 t t"]]:
+        """There is nothing to decode."""
+        return [self.module.texture] * len(frames)
+
+    def draw_training_views(
+        self, frame: int, cameras: list[Camera], background: Tensor, step: int, decoded: Tensor | None = None
+    ) -> Tensor:
         """The texture, drawn into each camera."""
         if frame not in self._surfaces:
             self._surfaces[frame] = self.template.pose(Pose(self._motion, frame))

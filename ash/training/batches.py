@@ -19,7 +19,7 @@ CROP_MARGIN = 12  # Pixels around the subject, so that a Gaussian that strays ou
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Batch:
-    """One step's work: several views of one frame, cropped alike."""
+    """A step's work on one frame: several views of it, cropped alike."""
 
     frame: int
     cameras: list[Camera]
@@ -70,6 +70,15 @@ def draw_ahead(ahead: ReadAhead, images: TrainingImages, config: TrainingConfig,
     """`draw_batch`, while the images of the next steps are read."""
     views = ahead.of_step(step, lambda later: sampled(images, config, seed, later).views)
     return draw_batch(replace(images, views=views), config, seed, step)
+
+
+def draw_step(ahead: ReadAhead, images: TrainingImages, config: TrainingConfig, seed: int, step: int) -> list[Batch]:
+    """What a step of `frames_per_step` frames shows: what as many steps of one frame would.
+
+    So every frame is seen as often as the others. Where the epoch's end divides a step, the next epoch begins in it.
+    """
+    first = step * config.frames_per_step
+    return [draw_ahead(ahead, images, config, seed, first + index) for index in range(config.frames_per_step)]
 
 
 def in_studio(batch: Batch, images: TrainingImages) -> Batch:

@@ -8,7 +8,7 @@ import json
 import math
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -28,7 +28,7 @@ from ash.files import InputError, write_atomic
 from ash.native.library import keep_freed_memory
 from ash.protocol import TrainingOutcome
 from ash.training.adam import Adam
-from ash.training.batches import Batch, cut_batch, draw_ahead
+from ash.training.batches import Batch, cut_batch, draw_step
 from ash.training.images import READERS, ReadAhead, TrainingImages
 from ash.training.losses import exact_target, l1_ssim_loss
 from ash.training.stopping import (
@@ -66,7 +66,12 @@ class Trainable(Protocol):
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Adam's groups, each with its own `lr`."""
 
-    def draw_training_views(self, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
+    def decode_together(self, frames: Sequence[int], step: int) -> Sequence[Any]:
+        """What `draw_training_views` takes as `decoded`, of all frames of a step that shows more than one."""
+
+    def draw_training_views(
+        self, frame: int, cameras: list[Camera], background: Tensor, step: int, decoded: Any = None
+    ) -> Tensor:
         """Differentiable rgb `[c, h, w, 3]` over `background`, for cameras of one size.
 
         Raises:
@@ -111,8 +116,7 @@ def fit(
     ahead = ReadAhead(images.views, readers=0 if images.device == CPU else READERS)
     with closing(ahead), _sigterm() as asked_to_stop:
         while not run.has_ended or not run.save():  # What cannot be saved was rolled back: on from there.
-            batch = draw_ahead(ahead, images, config, seed, run.step)
-            run.advance(batch)
+            run.advance(draw_step(ahead, images, config, seed, run.step))
             if asked_to_stop():
                 run.save()
                 raise Interrupted(f"stopped at step {run.step} of {config.steps}; run again to go on")
@@ -120,10 +124,23 @@ def fit(
     return run.finish()
 
 
-def view_loss(images: Float[Tensor, "c h w 3"], batch: Batch, config: TrainingConfig) -> Tensor:
-    """ASH Eq. 9, mean over the views."""
+def draw_training_step(learner: Trainable, batches: Sequence[Batch], step: int) -> list[Float[Tensor, "_ _ _ 3"]]:
+    """The views of each batch; the frames of several are decoded together."""
+    decoded = learner.decode_together([batch.frame for batch in batches], step) if len(batches) > 1 else ()
+    given: list[tuple[Any, ...]] = [(of_frame,) for of_frame in decoded] or [()]
+    return [
+        learner.draw_training_views(batch.frame, batch.cameras, batch.background, step, *of_frame)
+        for batch, of_frame in zip(batches, given, strict=True)
+    ]
+
+
+def view_loss(
+    drawn: Sequence[Float[Tensor, "_ _ _ 3"]], batches: Sequence[Batch], config: TrainingConfig
+) -> Float[Tensor, ""]:
+    """ASH Eq. 9, mean over the views of all batches."""
     losses = [
         l1_ssim_loss(image, exact_target(target), l1_weight=config.l1_weight, ssim_weight=config.ssim_weight)
+        for images, batch in zip(drawn, batches, strict=True)
         for image, target in zip(images, batch.targets, strict=True)
     ]
     return torch.stack(losses).mean()
@@ -158,7 +175,7 @@ class _Run:
             self.average = {name: value.detach().clone() for name, value in learned.items()}
             self.averaged = [value.detach() for value in learned.values()]
 
-    def advance(self, batch: Batch) -> None:
+    def advance(self, batches: Sequence[Batch]) -> None:
         """One step of Adam."""
         factor = rate_factor(self.course, self.config, step=self.step) * self.rate_scale
         for group, rate in zip(self.optimiser.groups, self.initial_rates, strict=True):
@@ -166,18 +183,17 @@ class _Run:
         self.optimiser.zero_grad()
         if self.step == self.config.static_steps:
             self.learner.end_warmup()
-        shown = (batch.frame, batch.cameras, batch.background)
         with_static = self.step >= self.config.static_steps and self.step % STATIC_EVERY == 0
         try:
-            drawn = self.learner.draw_training_views(*shown, self.step)
-            static = self.learner.draw_static_views(*shown) if with_static else None
+            drawn = draw_training_step(self.learner, batches, self.step)
+            static = self._static_views(batches) if with_static else []
         except FloatingPointError as error:
             self._roll_back(str(error))
             return
-        loss = view_loss(drawn, batch, self.config)
+        loss = view_loss(drawn, batches, self.config)
         loss.backward()  # type: ignore[no-untyped-call]
-        if static is not None:
-            view_loss(static, batch, self.config).backward()  # type: ignore[no-untyped-call]
+        if static:
+            view_loss(static, batches, self.config).backward()  # type: ignore[no-untyped-call]
         if not (math.isfinite(loss.item()) and self.optimiser.step()):
             self._roll_back("loss or gradient not finite")
             return
@@ -187,6 +203,10 @@ class _Run:
             torch._foreach_lerp_(list(self.average.values()), self.averaged, weight)
         self.step += 1
         self._look(loss)
+
+    def _static_views(self, batches: Sequence[Batch]) -> list[Tensor]:
+        found = [self.learner.draw_static_views(batch.frame, batch.cameras, batch.background) for batch in batches]
+        return [views for views in found if views is not None]
 
     def _look(self, loss: Tensor) -> None:
         """Score the reserved views where it is time to, decide what follows from it, and write the log."""

@@ -6,7 +6,7 @@ that the count is a lower bound. On the CPU it says little about a GPU, because 
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 from unittest.mock import patch
@@ -16,7 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from ash.config import TrainingConfig
 from ash.training.adam import Adam
 from ash.training.batches import Batch
-from ash.training.loop import Trainable, view_loss
+from ash.training.loop import Trainable, draw_training_step, view_loss
 
 LAUNCH_US = 5.0  # Of a kernel, on the processor: the order of magnitude that is usual for torch; not measured here.
 NOTHING_LAUNCHED = frozenset(
@@ -74,13 +74,13 @@ def launches() -> Iterator[LaunchCount]:
         yield count
 
 
-def launches_of_step(learner: Trainable, batch: Batch, training: TrainingConfig, optimiser: Adam) -> int:
-    """Of the second step through the decoders: the first also makes what is kept for the next. The batch is there."""
+def launches_of_step(learner: Trainable, batches: Sequence[Batch], training: TrainingConfig, optimiser: Adam) -> int:
+    """Of the second step through the decoders: the first also makes what is kept for the next. Batches are there."""
     for _ in range(2):
         optimiser.zero_grad()
         with launches() as count:
-            drawn = learner.draw_training_views(batch.frame, batch.cameras, batch.background, training.static_steps)
-            view_loss(drawn, batch, training).backward()  # type: ignore[no-untyped-call]
+            drawn = draw_training_step(learner, batches, training.static_steps)
+            view_loss(drawn, batches, training).backward()  # type: ignore[no-untyped-call]
             optimiser.step()
     return count.total
 

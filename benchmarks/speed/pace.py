@@ -61,7 +61,7 @@ def steps_per_second(preset: PacedPreset, device: torch.device, *, seconds: floa
         run = ash.training.loop._Run(avatar, training, replace(images, reserved=()), Path(folder) / "run")
         start, first = time.perf_counter(), 0
         while run.step <= FIRST_STEPS or time.perf_counter() - start < seconds:
-            run.advance(draw_batch(images, training, 0, run.step))
+            run.advance([draw_batch(images, training, 0, run.step)])
             if run.step == FIRST_STEPS:
                 finish(avatar.device)
                 start, first = time.perf_counter(), run.step

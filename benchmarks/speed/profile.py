@@ -111,7 +111,7 @@ def _tensors_in(result: Any) -> list[Tensor]:
         return [getattr(result, name) for name in result.__slots__]
     if isinstance(result, Splatted):
         return [result.rgb]
-    return [result] if isinstance(result, Tensor) else []
+    return [result] if isinstance(result, Tensor) else result if isinstance(result, list) else []
 
 
 def profile_step(
@@ -145,7 +145,7 @@ def _profiled_steps(
             parts = _Parts(learner.device)
             start = parts.now()
             with _watched(parts, learner, run):
-                run.advance(parts.timed("batch", draw_batch)(images, config, 0, run.step))
+                run.advance([parts.timed("batch", draw_batch)(images, config, 0, run.step)])
             whole = parts.now() - start
             if number < warm:
                 continue
@@ -163,7 +163,7 @@ def _watched(parts: _Parts, learner: AshAvatar | DdcAvatar, run: ash.training.lo
         drawing = [(learner, "_decode", "decode"), (learner.module, "pose", "pose"), (learner.module, "draw", "draw")]
     else:
         drawing = [
-            (learner, "_training_texture", "decode"),
+            (learner, "decode_together", "decode"),
             (learner.module, "refined", "pose"),
             (learner.module, "see", "draw"),
             (learner.module, "draw", "draw"),
@@ -198,7 +198,7 @@ def _launches(learner: AshAvatar | DdcAvatar, images: TrainingImages) -> int:
         return 0
     training = learner.config.training
     batch = draw_batch(images, training, 0, 0)
-    return launches_of_step(learner, batch, training, Adam(learner.parameter_groups(), eps=1e-15))
+    return launches_of_step(learner, [batch], training, Adam(learner.parameter_groups(), eps=1e-15))
 
 
 def print_profile(profile: list[PartTime]) -> None:

@@ -150,8 +150,35 @@ def test_texels_picked_by_the_native_network_are_those_of_the_definition(shuffle
     truth = value_and_gradients(exact, texture.double(), features.double(), lambda t, f: exact.picked(t, f, rows))
     found = value_and_gradients(net, texture, features, lambda t, f: net.picked(t, f, rows))
     assert net._takes_natively(texture) and not exact._takes_natively(texture.double())
-    assert found[0].shape == (len(LATTICE.texels), 7)
+    assert found[0].shape == (1, len(LATTICE.texels), 7)
     assert max(relative_error(a, b) for a, b in zip(found, truth, strict=True)) < 1e-5
+
+
+@pytest.mark.parametrize("shared_trunk", [True, False])
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])  # by native kernels, and as a batch of the definition
+def test_frames_decoded_together_are_those_decoded_alone(shared_trunk, kind):
+    decoders = Decoders(config(shared_trunk=shared_trunk, shuffle=2), LATTICE)
+    for net in decoders.nets:
+        torch.nn.init.normal_(net.head.weight, generator=torch.manual_seed(1))
+    decoders = decoders.to(kind)
+    numbers = torch.Generator().manual_seed(2)
+    frames = [
+        replace(
+            conditions(torch.randn(12, 8, 8, generator=numbers).to(kind)),
+            root_translation=torch.randn(3, generator=numbers).to(kind),
+        )
+        for _ in range(3)
+    ]
+    together = torch.stack(list(decoders.together(frames)))
+    alone = torch.stack([decoders(frame) for frame in frames])
+    assert decoders.nets[0]._takes_natively(frames[0].textures[None]) == (kind == torch.float32)
+    assert not torch.allclose(alone[0], alone[1])
+    weights = torch.randn(alone.shape, generator=numbers).to(kind)
+    found, expected = (
+        torch.autograd.grad((raw * weights).sum(), list(decoders.parameters())) for raw in (together, alone)
+    )
+    for a, b in zip((together, *found), (alone, *expected), strict=True):
+        assert relative_error(a, b) < (1e-5 if kind == torch.float32 else 1e-12)
 
 
 @pytest.mark.parametrize("factor", [0.0, 0.5])
@@ -197,7 +224,6 @@ def test_what_the_kernels_do_not_know_goes_the_way_of_the_definition():
     net, texture, _ = network_and_inputs(SHAPES["narrow"])
     assert net._takes_natively(texture)
     assert not net._takes_natively(texture.double())
-    assert not net._takes_natively(texture.expand(2, -1, -1, -1))
     assert not net._takes_natively(texture.clone().requires_grad_())
     assert not UNet(6, 4, width=8, levels=3, norm="instance")._takes_natively(texture)
     assert not UNet(6, 4, width=64, levels=3, norm="none")._takes_natively(texture)

@@ -132,7 +132,7 @@ def test_the_weights_of_the_loss_weigh_its_two_parts(capture):
     drawn = batch.targets + 0.1 * torch.randn(batch.targets.shape, generator=torch.Generator().manual_seed(0))
     weights = {"paper": (0.1, 0.9), "official": (0.9, 0.1), "l1": (1.0, 0.0), "ssim": (0.0, 1.0)}
     losses = {
-        name: float(view_loss(drawn, batch, replace(small(named("ci")).training, l1_weight=a, ssim_weight=b)))
+        name: float(view_loss([drawn], [batch], replace(small(named("ci")).training, l1_weight=a, ssim_weight=b)))
         for name, (a, b) in weights.items()
     }
     for name in ("paper", "official"):
@@ -202,9 +202,9 @@ def test_bfloat16_is_a_matter_of_the_decoders_alone(capture):
     for net in avatar.module.decoders.nets:
         torch.nn.init.normal_(net.head.weight, std=0.1)
     conditions = avatar._conditions_of(1)
-    exact = avatar._decode(conditions).detach()
+    exact = avatar._decode([conditions])[0].detach()
     avatar.config = replace(avatar.config, training=replace(avatar.config.training, precision="bfloat16"))
-    rough = avatar._decode(conditions).detach()
+    rough = avatar._decode([conditions])[0].detach()
     assert rough.dtype == torch.float32
     assert 0 < float((rough - exact).abs().max()) < 0.05 * float((exact - avatar.module.base.detach()).abs().max())
 

@@ -162,13 +162,13 @@ def batches(s: Subject) -> str:
 def loss(s: Subject) -> str:
     training = s.avatar.config.training
     batch = draw_batch(load_training_images(s.capture), presets.named("ci").training, 0, 0)
-    return fingerprint(view_loss(numbers(*batch.targets.shape, seed=10).sigmoid(), batch, training))
+    return fingerprint(view_loss([numbers(*batch.targets.shape, seed=10).sigmoid()], [batch], training))
 
 
 def noise(s: Subject) -> str:
     """What decoders see while they learn, beyond what they are given."""
     avatar, seen = s.avatar, []
-    decode, avatar._decode = avatar._decode, lambda c: (seen.append(c.textures), decode(c))[1]
+    decode, avatar._decode = avatar._decode, lambda c: (seen.append(c[0].textures), decode(c))[1]
     step = avatar.config.training.static_steps + 1
     avatar.draw_training_views(2, [s.capture.cameras["cam1"]], torch.zeros(3), step)
     avatar._decode = decode

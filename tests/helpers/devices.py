@@ -57,10 +57,10 @@ def step_of(avatar: Any, capture: Capture, device: torch.device) -> list[Tensor]
     batch = draw_batch(load_training_images(capture, device), training, 0, 0)
     optimiser = Adam(avatar.parameter_groups(), eps=1e-15)
     shown = (batch.frame, batch.cameras, batch.background)
-    view_loss(avatar.draw_training_views(*shown, 0), batch, training).backward()
+    view_loss([avatar.draw_training_views(*shown, 0)], [batch], training).backward()
     static = avatar.draw_static_views(*shown)
     if static is not None:
-        view_loss(static, batch, training).backward()
+        view_loss([static], [batch], training).backward()
     assert optimiser.step()
     return [parameter for parameter in optimiser.parameters if parameter.grad is not None]
 

@@ -44,7 +44,7 @@ def test_where_a_mask_is_too_large_the_studio_explains_what_it_shows(capture):
     # What nobody covers looks as the image does: no loss, wherever the mask ends.
     nothing = over(torch.zeros_like(batch.targets), torch.zeros_like(mask), batch.background)
     grown = replace(batch, targets=nothing)
-    assert float(view_loss(nothing, grown, training)) == pytest.approx(0, abs=1e-6)
+    assert float(view_loss([nothing], [grown], training)) == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize("method", ["ash", "ddc", "oracle_texture"])

@@ -69,16 +69,17 @@ def stop_before_end_of(avatar: AshAvatar, step: int) -> None:
     """Send SIGTERM while the given step is drawn."""
     draw = avatar.draw_training_views
 
-    def draw_then_signal(frame, cameras, background, at):
+    def draw_then_signal(frame, cameras, background, at, *decoded):
         if at == step:
             os.kill(os.getpid(), signal.SIGTERM)
-        return draw(frame, cameras, background, at)
+        return draw(frame, cameras, background, at, *decoded)
 
     avatar.draw_training_views = draw_then_signal
 
 
-def test_a_run_stopped_at_ten_random_steps_ends_with_the_same_bits(capture, tmp_path):
-    settings = config(steps=24, ema=0.9)
+@pytest.mark.parametrize("frames", [1, 2])
+def test_a_run_stopped_at_ten_random_steps_ends_with_the_same_bits(frames, capture, tmp_path):
+    settings = config(steps=24, ema=0.9, frames_per_step=frames)
     undisturbed = AshAvatar(settings, capture)
     undisturbed.fit(capture, folder=tmp_path / "whole")
     stops = sorted(np.random.default_rng(5).choice(24, 10, replace=False))
