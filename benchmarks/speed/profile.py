@@ -111,7 +111,8 @@ def _tensors_in(result: Any) -> list[Tensor]:
         return [getattr(result, name) for name in result.__slots__]
     if isinstance(result, Splatted):
         return [result.rgb]
-    return [result] if isinstance(result, Tensor) else result if isinstance(result, list) else []
+    parts = result if isinstance(result, list) else [result]
+    return [part for part in parts if isinstance(part, Tensor)]
 
 
 def profile_step(

@@ -88,9 +88,9 @@ def test_doctor_says_what_the_gpu_can_do(monkeypatch: pytest.MonkeyPatch, tmp_pa
 def test_steps_are_timed_by_the_function_that_a_gpu_is_timed_by(monkeypatch: pytest.MonkeyPatch) -> None:
     now, advance = [100.0], pace.ash.training.loop._Run.advance
 
-    def counted(run: Any, batch: Any) -> None:
-        assert float(batch.foreground.mean()) > 0.1, "somebody is seen"
-        advance(run, batch)
+    def counted(run: Any, batches: Any) -> None:
+        assert float(batches[0].foreground.mean()) > 0.1, "somebody is seen"
+        advance(run, batches)
         now[0] += 5.0 if run.step <= pace.FIRST_STEPS else 0.25  # The first steps compile.
 
     monkeypatch.setattr(pace, "time", SimpleNamespace(perf_counter=lambda: now[0]))
