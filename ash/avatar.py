@@ -135,14 +135,14 @@ class AshAvatar:
         return [{"params": group, "lr": rate} for group, rate in learned if group]
 
     def draw_training_views(
-        self, frame: int, cameras: list[Camera], background: Tensor, step: int, decoded: DecodedFrame | None = None
+        self, frame: int, cameras: list[Camera], background: Tensor, step: int, decoded: DecodedFrame
     ) -> Tensor:
-        """Stages 3 and 4 on cached conditions; the base alone while the static warm-up lasts."""
-        raw, conditions = decoded or self.decode_together([frame], step)[0]
+        """Stage 4."""
+        raw, conditions = decoded
         return self._drawn(raw, conditions, cameras, background)
 
     def decode_together(self, frames: Sequence[int], step: int) -> list[DecodedFrame]:
-        """Stage 3 of a step's frames."""
+        """Stage 3 of a step's frames, on cached conditions; the base alone while the static warm-up lasts."""
         training, conditions = self.config.training, [self._conditions_of(frame) for frame in frames]
         if step < training.static_steps:
             return [(self.module.base, seen) for seen in conditions]

@@ -256,15 +256,14 @@ class DdcAvatar:
         return [{"params": group, "lr": rate} for group, rate in groups]
 
     def draw_training_views(
-        self, frame: int, cameras: list[Camera], background: Tensor, step: int, decoded: Tensor | None = None
+        self, frame: int, cameras: list[Camera], background: Tensor, step: int, decoded: Tensor
     ) -> Tensor:
-        """The texture of the frame, drawn into each camera; the static texture alone while the warm-up lasts."""
-        texture = self.decode_together([frame], step)[0] if decoded is None else decoded
+        """The texture of the frame, drawn into each camera."""
         with torch.set_grad_enabled(torch.is_grad_enabled() and step % self.config.vertices_every == 0):
             posed = self._refined(frame)
         views = self.module.see(posed, cameras)
         self._seen = posed.vertices.detach(), cameras, [replace(v, corners=v.corners.detach()) for v in views]
-        return self._drawn(texture, posed, views, background)
+        return self._drawn(decoded, posed, views, background)
 
     def draw_static_views(self, frame: int, cameras: list[Camera], background: Tensor) -> Tensor | None:
         """Views with the texture that counts far from the training motion; its vertices are not its own."""
@@ -295,7 +294,7 @@ class DdcAvatar:
         return self.module.refined(self._posed[frame], self._conditions[frame])
 
     def decode_together(self, frames: Sequence[int], step: int) -> list[Float[Tensor, "3 t t"]]:
-        """The textures of a step's frames."""
+        """The textures of a step's frames; the static texture alone while the warm-up lasts."""
         training = self.config.training
         if step < training.static_steps:
             return [self.module.texture] * len(frames)

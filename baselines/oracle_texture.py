@@ -38,13 +38,13 @@ class OracleTexture(DdcAvatar):
         return [self.module.texture] * len(frames)
 
     def draw_training_views(
-        self, frame: int, cameras: list[Camera], background: Tensor, step: int, decoded: Tensor | None = None
+        self, frame: int, cameras: list[Camera], background: Tensor, step: int, decoded: Tensor
     ) -> Tensor:
         """The texture, drawn into each camera."""
         if frame not in self._surfaces:
             self._surfaces[frame] = self.template.pose(Pose(self._motion, frame))
         posed = self._surfaces[frame]
-        return self._drawn(self.module.texture, posed, self.module.see(posed, cameras), background)
+        return self._drawn(decoded, posed, self.module.see(posed, cameras), background)
 
     def corrections(self, frame: int) -> None:
         """There is nothing that could differ between frames."""

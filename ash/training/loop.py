@@ -67,10 +67,10 @@ class Trainable(Protocol):
         """Adam's groups, each with its own `lr`."""
 
     def decode_together(self, frames: Sequence[int], step: int) -> Sequence[Any]:
-        """What `draw_training_views` takes as `decoded`, of all frames of a step that shows more than one."""
+        """What `draw_training_views` takes as `decoded`, of each frame of a step."""
 
     def draw_training_views(
-        self, frame: int, cameras: list[Camera], background: Tensor, step: int, decoded: Any = None
+        self, frame: int, cameras: list[Camera], background: Tensor, step: int, decoded: Any
     ) -> Tensor:
         """Differentiable rgb `[c, h, w, 3]` over `background`, for cameras of one size.
 
@@ -125,12 +125,11 @@ def fit(
 
 
 def draw_training_step(learner: Trainable, batches: Sequence[Batch], step: int) -> list[Float[Tensor, "_ _ _ 3"]]:
-    """The views of each batch; the frames of several are decoded together."""
-    decoded = learner.decode_together([batch.frame for batch in batches], step) if len(batches) > 1 else ()
-    given: list[tuple[Any, ...]] = [(of_frame,) for of_frame in decoded] or [()]
+    """The views of each batch; their frames are decoded together."""
+    decoded = learner.decode_together([batch.frame for batch in batches], step)
     return [
-        learner.draw_training_views(batch.frame, batch.cameras, batch.background, step, *of_frame)
-        for batch, of_frame in zip(batches, given, strict=True)
+        learner.draw_training_views(batch.frame, batch.cameras, batch.background, step, of_frame)
+        for batch, of_frame in zip(batches, decoded, strict=True)
     ]
 
 
@@ -252,7 +251,7 @@ class _Run:
         for name, frame in self.images.reserved:
             view = cut_batch(self.images, frame, [name], torch.zeros(3, device="cpu"))
             try:
-                drawn = self.learner.draw_training_views(frame, view.cameras, view.background, self.step)
+                (drawn,) = draw_training_step(self.learner, [view], self.step)
             except FloatingPointError:
                 return math.nan
             errors.append((drawn.clamp(0, 1) - view.targets)[view.foreground > 0.5].square().flatten())

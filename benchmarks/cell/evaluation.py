@@ -140,6 +140,7 @@ def _timing(cell: Cell, capture: Capture, host: Host, views: list[View]) -> Timi
     references, agreements = [], []
     for index in range(WARM_UP_FRAMES + TIMED_FRAMES):
         view = views[index % len(views)]
+        host.time(replace(view, frame=max(0, view.frame - 1)))  # As in playback: the history of a frame is known.
         frames.append(host.time(view))
         shown = metrics.quantise(host.draw(view, capture.cameras[view.camera], "shown"))
         agreements.append(_agreement(shown, stored_prediction(cell, capture, view)))

@@ -51,10 +51,13 @@ def evaluated_views(capture: Capture) -> tuple[View, ...]:
 
 
 def playback(views: tuple[View, ...]) -> list[View]:
-    """One camera's views of the held-out motion (of the last split, where there is none): every frame is new, as in
-    playback, and only its history is not.
+    """One camera's views of motion that training did not show, as near to it as the capture has.
+
+    A method that does less in poses far from training's, because it trusts what it learned less there, is timed where
+    it does all.
     """
-    split = "novel_pose" if any(view.split == "novel_pose" for view in views) else views[-1].split
+    splits = {view.split for view in views}
+    split = next((name for name in ("near_pose", "novel_pose") if name in splits), views[-1].split)
     first = next(view.camera for view in views if view.split == split)
     return [view for view in views if view.split == split and view.camera == first]
 

@@ -58,7 +58,7 @@ GLOSSARY = {
     "novel view": "Another name for held-out views.",
     "novel pose": "Another name for held-out motion.",
     "training view": "Images that the method was trained on.",
-    "frame time": "Milliseconds to draw one frame on one core: the median over frames after warm-up.",
+    "frame time": "Milliseconds to draw one frame of near motion on one core: the median over frames after warm-up.",
     "Stg.1": "The paper's first stage: the template is posed and deformed.",
     "Stg.2": "The paper's second stage: the motion-aware textures are made.",
     "Stg.3": "The paper's third stage: decoders turn textures into Gaussians, or into a texture.",

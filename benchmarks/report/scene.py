@@ -120,7 +120,8 @@ QUALITY_NOTE = (
     "the values stands instead."
 )
 COST_NOTE = (
-    "A frame and its stages: median over frames after warm-up, one core, while other cells may run beside it. "
+    "A frame and its stages: median over frames of near held-out motion (of new motion, where a capture has no near "
+    "one) after warm-up, one core, while other cells may run beside it. "
     "Training on one core: seconds by the clock, and the CPU time that was counted from outside. Memory: the peak of "
     "the cell's process, Python and libraries included."
 )

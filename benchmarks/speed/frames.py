@@ -26,6 +26,7 @@ from ash.protocol import StageClock
 from ash.training.adam import Adam
 from ash.training.batches import Batch, draw_batch
 from ash.training.images import load_training_images
+from ash.training.loop import draw_training_step
 from ash.training.losses import l1_ssim_loss, l1_ssim_loss_naive, ssim_target
 from benchmarks.speed.rows import SpeedRow, as_json, row_of
 
@@ -231,7 +232,7 @@ def _step(avatar: AshAvatar, batch: Batch, optimiser: Adam, *, naive: bool) -> N
         raw = avatar.module.decode(conditions)
         drawn = _splatted_by_definition(avatar.module, raw, conditions, batch.cameras, batch.background).rgb
     else:
-        drawn = avatar.draw_training_views(batch.frame, batch.cameras, batch.background, training.steps)
+        (drawn,) = draw_training_step(avatar, [batch], training.steps)
     loss = l1_ssim_loss_naive if naive else l1_ssim_loss
     losses = [
         loss(image, ssim_target(target), l1_weight=training.l1_weight, ssim_weight=training.ssim_weight)

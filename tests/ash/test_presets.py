@@ -5,6 +5,7 @@ from dataclasses import asdict, replace
 import pytest
 import torch
 from helpers.captures import tube_model_config, write_tube_capture
+from helpers.learning import training_views
 
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Pose
@@ -168,9 +169,9 @@ def seen_by_steps(capture, tmp_path, **training) -> list[tuple]:
     avatar = AshAvatar(config, capture)
     seen, draw = [], avatar.draw_training_views
 
-    def watch(frame, cameras, background, step):
+    def watch(frame, cameras, background, step, decoded):
         seen.append((frame, [c.name for c in cameras], cameras[0].width, cameras[0].height, background.tolist()))
-        return draw(frame, cameras, background, step)
+        return draw(frame, cameras, background, step, decoded)
 
     avatar.draw_training_views = watch
     images = replace(load_training_images(capture), reserved=())
@@ -216,9 +217,9 @@ def test_noise_in_the_textures_is_for_learning_alone_and_another_one_in_every_st
     for avatar in (noisy, plain):
         torch.nn.init.normal_(avatar.module.decoders.nets[0].head.weight, std=0.1, generator=torch.manual_seed(1))
         camera = [capture.cameras["cam1"]]
-        draw = [avatar.draw_training_views(0, camera, torch.zeros(3), step).detach() for step in (2, 2, 3, 1)]
+        draw = [training_views(avatar, 0, camera, torch.zeros(3), step).detach() for step in (2, 2, 3, 1)]
         with torch.no_grad():
-            draw.append(avatar.draw_training_views(0, camera, torch.zeros(3), 2))
+            draw.append(training_views(avatar, 0, camera, torch.zeros(3), 2))
         seen.append(draw)
     (first, again, later, warm_up, still), (clean, _, _, clean_warm_up, _) = seen
     assert torch.equal(first, again) and not torch.equal(first, later)

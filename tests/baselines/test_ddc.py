@@ -6,6 +6,7 @@ import pytest
 import torch
 from helpers.captures import write_tube_capture
 from helpers.figures import front_camera, tube_motion
+from helpers.learning import training_views
 
 import ash.mesh.drawing
 from ash.capture.dataset import Camera, Pose, image_path
@@ -98,9 +99,9 @@ def test_noise_in_the_textures_is_for_learning_alone(capture):
     for parameter in avatar.module.network.parameters():
         parameter.data += 0.05 * torch.randn(parameter.shape, generator=torch.manual_seed(0))
     cameras = [capture.cameras["cam1"]]
-    learned = [avatar.draw_training_views(0, cameras, torch.zeros(3), step).detach() for step in (2, 3)]
+    learned = [training_views(avatar, 0, cameras, torch.zeros(3), step).detach() for step in (2, 3)]
     with torch.no_grad():
-        still = [avatar.draw_training_views(0, cameras, torch.zeros(3), step) for step in (2, 3)]
+        still = [training_views(avatar, 0, cameras, torch.zeros(3), step) for step in (2, 3)]
     assert not torch.equal(*learned) and torch.equal(*still)
 
 
@@ -143,7 +144,7 @@ def test_static_views_are_drawn_into_what_the_training_views_saw(capture, monkey
         assert mesh.module.refinement.rough.grad is None
         return drawn, mesh.module.static_texture.grad
 
-    assert mesh.draw_training_views(1, cameras, background, step=0).requires_grad
+    assert training_views(mesh, 1, cameras, background, step=0).requires_grad
     assert mesh.module.refinement is not None
     shared = static_and_gradient(cameras)
     assert len(seen) == 2, "the two views are found once"

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.captures import tiny_preset, write_tube_capture
+from helpers.learning import training_views
 
 from ash import presets
 from ash.avatar import AshAvatar
@@ -170,7 +171,7 @@ def noise(s: Subject) -> str:
     avatar, seen = s.avatar, []
     decode, avatar._decode = avatar._decode, lambda c: (seen.append(c[0].textures), decode(c))[1]
     step = avatar.config.training.static_steps + 1
-    avatar.draw_training_views(2, [s.capture.cameras["cam1"]], torch.zeros(3), step)
+    training_views(avatar, 2, [s.capture.cameras["cam1"]], torch.zeros(3), step)
     avatar._decode = decode
     return fingerprint(not torch.equal(seen[0], avatar._conditions_of(2).textures))
 

@@ -32,7 +32,7 @@ from ash.template.graph import NeighbourMean
 from ash.training.adam import Adam
 from ash.training.batches import draw_batch
 from ash.training.images import load_training_images
-from ash.training.loop import view_loss
+from ash.training.loop import draw_training_step, view_loss
 
 META = torch.device("meta")
 
@@ -56,9 +56,8 @@ def step_of(avatar: Any, capture: Capture, device: torch.device) -> list[Tensor]
     training = avatar.config.training
     batch = draw_batch(load_training_images(capture, device), training, 0, 0)
     optimiser = Adam(avatar.parameter_groups(), eps=1e-15)
-    shown = (batch.frame, batch.cameras, batch.background)
-    view_loss([avatar.draw_training_views(*shown, 0)], [batch], training).backward()
-    static = avatar.draw_static_views(*shown)
+    view_loss(draw_training_step(avatar, [batch], 0), [batch], training).backward()
+    static = avatar.draw_static_views(batch.frame, batch.cameras, batch.background)
     if static is not None:
         view_loss([static], [batch], training).backward()
     assert optimiser.step()

@@ -10,6 +10,7 @@ import pytest
 import safetensors.torch
 import torch
 from helpers.captures import tube_model_config, write_tube_capture
+from helpers.learning import training_views
 
 from ash import presets
 from ash.avatar import AshAvatar
@@ -69,10 +70,10 @@ def stop_before_end_of(avatar: AshAvatar, step: int) -> None:
     """Send SIGTERM while the given step is drawn."""
     draw = avatar.draw_training_views
 
-    def draw_then_signal(frame, cameras, background, at, *decoded):
+    def draw_then_signal(frame, cameras, background, at, decoded):
         if at == step:
             os.kill(os.getpid(), signal.SIGTERM)
-        return draw(frame, cameras, background, at, *decoded)
+        return draw(frame, cameras, background, at, decoded)
 
     avatar.draw_training_views = draw_then_signal
 
@@ -187,7 +188,7 @@ def test_the_average_of_the_weights_is_the_result_and_nothing_else_changes(captu
     draw = last.draw_training_views
 
     def draw_and_keep(*arguments):
-        if arguments[-1] == len(passed):  # The curve's views are drawn besides.
+        if arguments[-2] == len(passed):  # The curve's views are drawn besides.
             passed.append(last.module.base.detach().clone())
         return draw(*arguments)
 
@@ -237,8 +238,8 @@ def test_nan_rolls_back_once_and_then_ends_the_run(capture, tmp_path):
     avatar = AshAvatar(config(), capture)
     draw, spoiled = avatar.draw_training_views, []
 
-    def spoil(frame, cameras, background, step):
-        image = draw(frame, cameras, background, step)
+    def spoil(frame, cameras, background, step, decoded):
+        image = draw(frame, cameras, background, step, decoded)
         spoiled.append(step == 6)
         return image * float("nan") if step == 6 and sum(spoiled) <= times else image
 
@@ -253,17 +254,17 @@ def test_nan_rolls_back_once_and_then_ends_the_run(capture, tmp_path):
 
 
 def poison(avatar: AshAvatar, *, at: set[int], times: int) -> None:
-    """Spoil a weight before the given steps are drawn, `times` times in all."""
-    draw, left = avatar.draw_training_views, [times]
+    """Spoil a weight before the given steps are decoded, `times` times in all."""
+    decode, left = avatar.decode_together, [times]
 
-    def draw_poisoned(frame, cameras, background, step):
+    def decode_poisoned(frames, step):
         if step in at and left[0] > 0:
             left[0] -= 1
             with torch.no_grad():
                 avatar.module.base[0, 3] = float("nan")
-        return draw(frame, cameras, background, step)
+        return decode(frames, step)
 
-    avatar.draw_training_views = draw_poisoned
+    avatar.decode_together = decode_poisoned
 
 
 def test_a_weight_that_is_nan_rolls_back_once_and_then_ends_the_run_as_diverged(capture, tmp_path):
@@ -353,9 +354,9 @@ def test_a_crop_draws_what_the_full_image_shows_there(capture):
     batch = cut_batch(images, 1, ["cam1", "cam2"], torch.tensor([0.2, 0.4, 0.6]))
     avatar = AshAvatar(config(), capture)
     background = torch.tensor([0.2, 0.4, 0.6])
-    cropped = avatar.draw_training_views(1, batch.cameras, background, 0)
+    cropped = training_views(avatar, 1, batch.cameras, background, 0)
     for view, (name, camera) in enumerate(zip(["cam1", "cam2"], batch.cameras, strict=True)):
-        full = avatar.draw_training_views(1, [capture.cameras[name]], background, 0)[0]
+        full = training_views(avatar, 1, [capture.cameras[name]], background, 0)[0]
         left, top = (capture.cameras[name].K[:2, 2] - camera.K[:2, 2]).astype(int)
         window = full[top : top + camera.height, left : left + camera.width]
         torch.testing.assert_close(cropped[view], window, atol=2e-5, rtol=0)
