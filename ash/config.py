@@ -105,6 +105,7 @@ class TrainingConfig:
     views_per_step: int  # images of one frame that share one decoding
     warmup: str  # "static": the base alone first; "analytic": as released; "fitted": the paper's per-frame fits; "none"
     warmup_steps: int
+    static_every: int = 2  # steps, of which one also teaches what counts far from the training motion
     l1_weight: float  # lambda_pix
     ssim_weight: float  # lambda_str
     learning_rate: float  # of the networks
@@ -140,6 +141,8 @@ class TrainingConfig:
         one_of("precision", self.precision, ("float32", "bfloat16"))
         if not 0 <= self.ema < 1:
             raise InputError(f"ema: expected a decay of at least 0 and below 1, got {self.ema}")
+        if self.static_every < 1:
+            raise InputError(f"static_every: expected at least 1, got {self.static_every}")
         if not self.seconds > 0:
             raise InputError(f"seconds: expected more than 0, got {self.seconds}")
         if not 0 <= self.texture_noise < math.inf:

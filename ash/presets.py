@@ -27,7 +27,7 @@ def ci() -> AshConfig:
         shuffle=2,
         sh_degree=0,
         standardise=True,
-        fade=0.4,
+        fade=0.7,
         base=True,
         anchor="surface",
         light=True,
@@ -47,9 +47,9 @@ def ci() -> AshConfig:
 
 
 def cpu() -> AshConfig:
-    """4,000 steps, or less where nothing more is learned: some minutes of one core. The default, at 256x256.
+    """4,000 steps, some minutes of one core: the default, at 256x256.
 
-    A limit in steps: what comes out does not depend on how fast the machine is.
+    What comes out does not depend on how fast the machine is, and all methods make equally many steps.
     """
     base = ci()
     training = replace(base.training, steps=4000, warmup_steps=200, learning_rate=1e-3, base_learning_rate=2e-2)

@@ -142,7 +142,7 @@ class TrainingOutcome:
 
     steps: int
     seconds: float  # CPU time
-    ended_by: str  # "plateau": the last third of the steps gained less than 0.1 dB; "steps", "seconds": a limit was met
+    ended_by: str  # "steps", "seconds": a limit was met; "plateau": the last third had gained less than 0.1 dB by then
     gained: float | None = None  # over the last third of the steps, dB; None: too short to tell
     reserved_psnr: float | None = None  # at the end; None: the capture is too small to reserve views
     choice: str = ""  # of a search for what the scene needs, and the CPU seconds that it took when it was made

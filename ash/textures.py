@@ -26,7 +26,8 @@ from ash.template.template import Template
 NOISE_GRID = 4
 POOL = 4  # Texels per side that are one when frames are compared: poses differ over limbs, not over texels.
 COMPARED_FRAMES = 512  # Training frames, evenly taken, that a new frame is compared with.
-LEAST_TRUST = 0.02  # Of exp(-(novelty / fade)^2): below it nothing that is decoded counts, and nothing need be decoded.
+STEEPNESS = 8  # Halfway between decoded and static is worse than either: 0.9 at 3/4 of the fade, 0.1 at 11/10 of it.
+LEAST_TRUST = 0.02  # Of exp(-(novelty / fade)^8): below it nothing that is decoded counts, and nothing need be decoded.
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -219,13 +220,14 @@ class TextureDrawer(MovingModule):
     def trust(self, textures: Float[Tensor, "c r r"]) -> float:
         """How much of what is decoded from these textures counts: 1 in training frames, fading with their novelty to 0.
 
-        t = exp(-(novelty / fade)^2), of which the least part is cut off without a step: (t - LEAST_TRUST) / (1 -
+        t = exp(-(novelty / fade)^8), of which the least part is cut off without a step: (t - LEAST_TRUST) / (1 -
         LEAST_TRUST), at least 0. What decoders learned from some poses is false far from them, where a static avatar is
         better. Not in the paper.
         """
         if not self.fade:
             return 1.0
-        whole = math.exp(-((self.novelty(textures) / self.fade) ** 2))
+        ratio = min(self.novelty(textures) / self.fade, 2.0)  # Farther out nothing is left, and powers overflow.
+        whole = math.exp(-(ratio**STEEPNESS))
         return max(0.0, (whole - LEAST_TRUST) / (1 - LEAST_TRUST))
 
     def _coarse(self, textures: Float[Tensor, "c r r"]) -> Float[Tensor, " d"]:

@@ -42,7 +42,6 @@ from ash.training.stopping import (
 )
 
 LOG_EVERY = 50
-STATIC_EVERY = 4  # Steps in which what counts far from the training motion learns, too.
 COMPARED_FRAMES = 40  # Training frames, evenly taken, over which the decoders' output is averaged and compared.
 SNAPSHOT_SECONDS = tuple(round(30 * 2 ** (i / 2)) for i in range(13))  # Half a minute to half an hour of CPU time.
 
@@ -182,7 +181,7 @@ class _Run:
         self.optimiser.zero_grad()
         if self.step == self.config.static_steps:
             self.learner.end_warmup()
-        with_static = self.step >= self.config.static_steps and self.step % STATIC_EVERY == 0
+        with_static = self.step >= self.config.static_steps and self.step % self.config.static_every == 0
         try:
             drawn = draw_training_step(self.learner, batches, self.step)
             static = self._static_views(batches) if with_static else []

@@ -1,7 +1,8 @@
 """When training ends: views that no step sees are scored on a schedule, and where they stop gaining, rates decay.
 
 The length of a training is not known in advance. Learning rates rise over a few steps, stay, and fall along a cosine
-over the last fifth, which begins when the scores lie on a plateau, or when four fifths of a limit are spent.
+over the last fifth, which begins when the scores lie on a plateau, or when four fifths of a limit are spent. A method
+that learns slowly looks as if it rested for a while: up to some thousand steps all of them go on.
 """
 
 import json
@@ -12,7 +13,8 @@ from ash.capture.typed import from_json
 from ash.config import TrainingConfig
 
 FIRST_MARK = 64  # Steps after which views are scored for the first time; twice on the way to half as many more, ...
-LEAST_STEPS = 1000  # Before that a lull is chance: static Gaussians rest at 200 steps and gain 0.5 dB afterwards.
+LULL_STEPS = 1000  # Before that a lull is chance: static Gaussians rest at 200 steps and gain 0.5 dB afterwards.
+LEAST_STEPS = 4000  # Before that no plateau ends a training: the mesh lay on one at 1,368 and then gained 0.5 dB.
 GAIN_DB = 0.1  # Less than that, gained over the last third of the steps at two marks in a row, is a plateau.
 RAMP_STEPS = 20  # Over which the learning rates rise.
 DECAY = 0.25  # Of the steps before they fall, hence the last fifth of all.
@@ -69,19 +71,20 @@ def gain_of_last_third(scores: tuple[ReservedScore, ...], *, since: int = 0) -> 
 def decided(course: TrainingCourse, config: TrainingConfig, *, step: int, seconds: float) -> TrainingCourse:
     """The course after a step: whether the rates begin to fall now, and for what.
 
-    A plateau counts once the warm-up is less than half of the steps that are compared. `seconds`: CPU time so far.
+    A plateau counts once the warm-up is less than half of the steps that are compared; where a limit is met on one, it
+    is told before the limit. `seconds`: CPU time so far.
     """
     if course.decay_from is not None:
         return course
     share = 1.0 if config.schedule == "constant" else 1 / (1 + DECAY)
-    if step >= share * config.steps:
-        return replace(course, decay_from=step, ended_by="steps")
-    if seconds >= share * config.seconds:
-        return replace(course, decay_from=step, ended_by="seconds")
+    spent = {"steps": step >= share * config.steps, "seconds": seconds >= share * config.seconds}
+    limits = [limit for limit, is_met in spent.items() if is_met]
     scored = step >= LEAST_STEPS and course.scores and course.scores[-1].step == step
-    if scored and rests(course.scores, since=2 * config.warmup_steps):
+    if not (limits or scored):
+        return course
+    if step >= LULL_STEPS and rests(course.scores, since=2 * config.warmup_steps):
         return replace(course, decay_from=step, ended_by="plateau")
-    return course
+    return replace(course, decay_from=step, ended_by=limits[0]) if limits else course
 
 
 def rests(scores: tuple[ReservedScore, ...], *, since: int) -> bool:

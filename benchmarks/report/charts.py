@@ -352,9 +352,11 @@ def _log_domain(values: pd.Series, room: float) -> tuple[float, float]:
 
 
 def _log_ticks(domain: tuple[float, float]) -> list[float]:
-    """1, 2, 5 of every decade; of many decades 1 only."""
+    """1, 2, 5 of every decade; of many decades 1 only, and more within a single one."""
     low, high = (math.log10(value) for value in domain)
-    steps = (1, 2, 5) if high - low < 2.5 else (1,)
+    steps: tuple[float, ...] = (1, 2, 5) if high - low < 2.5 else (1,)
+    if high - low < 1:
+        steps = (1, 1.5, 2, 3, 4, 5, 7)
     ticks = [step * 10.0**power for power in range(math.floor(low), math.ceil(high) + 1) for step in steps]
     return [tick for tick in ticks if domain[0] <= tick <= domain[1]]
 

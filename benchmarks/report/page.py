@@ -34,7 +34,7 @@ def write_report(run: Run) -> list[str]:
     scores = scores_of(results, {cell.config.key: cell.capture_folder.name for cell in run.cells})
     album = Album()
     scenes = {scene: scene_report(_scene(run, scores, album, scene)) for scene in scores.scenes}
-    findings = [*sections.spent(results), *sections.novelties(scores), *sections.margins(scores)]
+    findings, novelties = [*sections.spent(results), *sections.margins(scores)], sections.novelties(scores)
     report = Report(
         title=f"Report of suite {run.suite}",
         sections=(
@@ -43,6 +43,7 @@ def write_report(run: Run) -> list[str]:
             *sections.stabilities(scores),
             *findings,
             *(section for scene in scenes.values() for section in scene.sections),
+            *novelties,
             *sections.beside_the_paper(scores, run.suite),
             *sections.failed_cells(results, len(run.cells) - len(results)),
             sections.provenance(results, run.command),
@@ -59,7 +60,7 @@ def write_report(run: Run) -> list[str]:
     }
     for name, data in files.items():
         write_atomic(run.folder / name, data)
-    return [*_told(scores, findings), f"report: {run.folder / 'report.html'}"]
+    return [*_told(scores, [*findings, *novelties]), f"report: {run.folder / 'report.html'}"]
 
 
 def publish(run: Path, folder: Path) -> None:

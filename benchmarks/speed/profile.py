@@ -2,8 +2,8 @@
 
 The step is the loop's own. Its parts are timed from outside: a part's forward pass as it is called, its backward pass
 from the moment when the gradients of all that it returned are there until those of the part before it are. Time is the
-thread's CPU time, in which waiting for a core does not count. Every fourth step draws static views or learns vertices
-besides; it is timed as a whole, and its parts are not.
+thread's CPU time, in which waiting for a core does not count. A step that draws static views or learns vertices
+besides is timed as a whole, and its parts are not.
 """
 
 import statistics
@@ -34,16 +34,16 @@ from ash.native.library import has_tiles
 from ash.training.adam import Adam
 from ash.training.batches import draw_batch
 from ash.training.images import TrainingImages, load_training_images
-from ash.training.loop import STATIC_EVERY
 from baselines.ddc import DdcAvatar, ddc
 from benchmarks.speed.frames import captured
 from benchmarks.speed.launches import LAUNCH_US, launches_of_step, launching_ms
 
-FOURTH = "fourth step"
+STATIC, VERTICES = "step with static views", "step with vertices"  # The mesh learns these in some of those.
 FORWARD = ("batch", "decode", "pose", "draw", "loss")
 BACKWARD = ("loss backward", "draw backward", "pose backward", "decode backward")
-PARTS = (*FORWARD, *BACKWARD, "adam", "rest", "step", FOURTH)  # "step": the whole; "rest": what no other part holds
-ROUNDS = 20  # of four steps
+PARTS = (*FORWARD, *BACKWARD, "adam", "rest", "step")  # "step": the whole; "rest": what no other part holds
+KINDS = (*PARTS, STATIC, VERTICES)
+STEPS = 80
 SUBJECTS = (
     ("ash", "cpu", "float32"),
     ("ash", "cpu", "bfloat16"),
@@ -116,11 +116,11 @@ def _tensors_in(result: Any) -> list[Tensor]:
 
 
 def profile_step(
-    method: str, learner: AshAvatar | DdcAvatar, images: TrainingImages, preset: str, *, rounds: int
+    method: str, learner: AshAvatar | DdcAvatar, images: TrainingImages, preset: str, *, steps: int
 ) -> list[PartTime]:
-    """The parts of `rounds` times four steps, after an epoch that is not counted. The learner learns meanwhile."""
+    """The parts of so many steps, after an epoch that is not counted. The learner learns meanwhile."""
     config = replace(learner.config.training, warmup="none", warmup_steps=0, steps=10**9)
-    samples = list(_profiled_steps(learner, images, config, rounds))
+    samples = list(_profiled_steps(learner, images, config, steps))
     return [
         PartTime(
             method=method,
@@ -130,18 +130,19 @@ def profile_step(
             min_ms=1e3 * min(sample[part] for sample in samples if part in sample),
             median_ms=1e3 * statistics.median(sample[part] for sample in samples if part in sample),
         )
-        for part in PARTS
+        for part in KINDS
+        if any(part in sample for sample in samples)
     ]
 
 
 def _profiled_steps(
-    learner: AshAvatar | DdcAvatar, images: TrainingImages, config: TrainingConfig, rounds: int
+    learner: AshAvatar | DdcAvatar, images: TrainingImages, config: TrainingConfig, steps: int
 ) -> Iterator[dict[str, float]]:
     first = learner.config.training.warmup_steps  # Before, decoders do not take part.
     warm = len(images.frames)  # An epoch: each frame's template is posed once.
     with tempfile.TemporaryDirectory() as folder:
         run = ash.training.loop._Run(learner, config, images, Path(folder))
-        for number in range(STATIC_EVERY * rounds + warm):
+        for number in range(steps + warm):
             run.step = first + number
             parts = _Parts(learner.device)
             start = parts.now()
@@ -150,11 +151,18 @@ def _profiled_steps(
             whole = parts.now() - start
             if number < warm:
                 continue
-            if (first + number) % STATIC_EVERY == 0:
-                yield {FOURTH: whole}
+            if kind := _what_else(learner, first + number):
+                yield {kind: whole}
             else:
                 parts.split_backward()
                 yield parts.spent | {"rest": whole - sum(parts.spent.values()), "step": whole}
+
+
+def _what_else(learner: AshAvatar | DdcAvatar, step: int) -> str:
+    """What a step learns besides; empty: nothing."""
+    if isinstance(learner, DdcAvatar) and step % learner.config.vertices_every == 0:
+        return VERTICES
+    return STATIC if step % learner.config.training.static_every == 0 else ""
 
 
 @contextmanager
@@ -188,7 +196,7 @@ def profiles(capture: Capture, device: torch.device = CPU) -> Iterator[tuple[lis
             recipe: presets.Recipe[Any] = presets.ash if method == "ash" else ddc
             make = recipe.but({"training.precision": precision, "device": str(device)})
             learner: AshAvatar | DdcAvatar = make(capture, seed=0, preset=preset)
-            yield profile_step(method, learner, images, preset, rounds=ROUNDS), _launches(learner, images)
+            yield profile_step(method, learner, images, preset, steps=STEPS), _launches(learner, images)
     finally:
         torch.set_num_threads(before)
 

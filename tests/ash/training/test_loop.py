@@ -100,7 +100,7 @@ def test_a_run_stopped_at_ten_random_steps_ends_with_the_same_bits(frames, captu
 
 def test_a_run_stopped_before_and_in_its_decay_decides_nothing_anew(capture, tmp_path, monkeypatch):
     """Its end is found by scores: a run that is stopped at any step finds the same end, and ends with the same bits."""
-    for name, value in (("FIRST_MARK", 8), ("LEAST_STEPS", 0), ("GAIN_DB", 99.0)):
+    for name, value in (("FIRST_MARK", 8), ("LULL_STEPS", 0), ("LEAST_STEPS", 0), ("GAIN_DB", 99.0)):
         monkeypatch.setattr(stopping, name, value)
     settings = config(steps=200, warmup="none", warmup_steps=0)
     undisturbed = AshAvatar(settings, capture)

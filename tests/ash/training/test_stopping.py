@@ -44,10 +44,10 @@ def test_marks_come_twice_on_the_way_to_half_as_many_steps_more():
 
 
 def test_training_ends_a_quarter_after_the_scores_stop_gaining():
-    """A decibel per e-fold until 3,000 steps, then nothing: the plateau shows at the third mark after that."""
-    course, factors = train(lambda step: 20 + math.log(min(step, 3000)), CONFIG)
+    """A decibel per e-fold until 6,000 steps, then nothing: the plateau shows at the third mark after that."""
+    course, factors = train(lambda step: 20 + math.log(min(step, 6000)), CONFIG)
     assert course.ended_by == "plateau"
-    assert 3000 < course.decay_from < 3000 * 1.5**2
+    assert 6000 < course.decay_from < 6000 * 1.5**2
     assert len(factors) == pytest.approx(course.decay_from / 0.8, abs=1)
     before = [score for score in course.scores if score.step <= course.decay_from]
     assert gain_of_last_third(tuple(before)) < 0.1
@@ -57,8 +57,8 @@ def test_training_ends_a_quarter_after_the_scores_stop_gaining():
 
 def test_one_score_that_strays_is_no_plateau():
     steady = 0.15 / math.log(1.5)
-    course, _ = train(lambda step: steady * math.log(step) - 0.06 * (1500 < step < 1700), CONFIG)
-    assert any(score.step == 1640 for score in course.scores)
+    course, _ = train(lambda step: steady * math.log(step) - 0.06 * (6700 < step < 6900), CONFIG)
+    assert any(score.step == 6780 for score in course.scores)
     assert course.ended_by == "steps"
 
 
@@ -70,13 +70,22 @@ def test_a_curve_that_gains_a_tenth_in_every_third_never_ends_by_itself():
 
 def test_a_level_warm_up_is_no_plateau():
     """While the base alone is trained nothing is learned about motion: twice the warm-up passes before it counts."""
-    course, _ = train(lambda step: 20.0, replace(CONFIG, warmup_steps=1000))
-    assert course.decay_from >= 3 * 1000 * 0.99
+    course, _ = train(lambda step: 20.0, replace(CONFIG, warmup_steps=2000))
+    assert course.decay_from >= 3 * 2000 * 0.99
 
 
-def test_a_lull_of_the_first_thousand_steps_is_no_plateau():
+def test_no_lull_ends_a_training_of_less_than_some_thousand_steps():
     course, _ = train(lambda step: 20.0, CONFIG)
     assert course.ended_by == "plateau" and LEAST_STEPS <= course.decay_from < 1.25 * LEAST_STEPS
+
+
+@pytest.mark.parametrize(("steps", "told"), [(1000, "steps"), (3000, "plateau")])
+def test_a_limit_that_is_met_on_a_plateau_says_so(steps, told):
+    """But not after so few steps that a lull is chance."""
+    course, factors = train(lambda step: 20.0, replace(CONFIG, steps=steps))
+    assert (course.ended_by, course.decay_from, len(factors)) == (told, 0.8 * steps, steps)
+    course, _ = train(lambda step: step / 100, replace(CONFIG, steps=steps))
+    assert course.ended_by == "steps"
 
 
 def test_a_limit_in_seconds_leaves_a_fifth_of_them_for_the_decay():
