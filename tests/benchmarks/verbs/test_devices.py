@@ -78,7 +78,7 @@ def test_doctor_says_what_the_gpu_can_do(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert [(preset.name, str(device)) for preset, device in timed] == [("cpu", "cuda"), ("paper", "cuda")]
     assert "paper at 1285x940 makes 8 steps per second" in training.found
     assert training.consequence == (
-        "cpu trains for at most 1,600 steps, 0.056 hours; paper trains for at most 2,000,000 steps, 69 hours"
+        "cpu trains for at most 4,000 steps, 0.14 hours; paper trains for at most 2,000,000 steps, 69 hours"
     )
     monkeypatch.setattr(doctor.provenance, "gpu_name", gpu_name)
     if gpu_name() is None:
