@@ -38,7 +38,7 @@ from baselines.ddc import DdcAvatar, ddc
 from benchmarks.speed.frames import captured
 from benchmarks.speed.launches import LAUNCH_US, launches_of_step, launching_ms
 
-STATIC, VERTICES = "step with static views", "step with vertices"  # The mesh learns these in some of those.
+STATIC, VERTICES = "step with static views", "step with vertices"  # Both at once in the mesh: the latter.
 FORWARD = ("batch", "decode", "pose", "draw", "loss")
 BACKWARD = ("loss backward", "draw backward", "pose backward", "decode backward")
 PARTS = (*FORWARD, *BACKWARD, "adam", "rest", "step")  # "step": the whole; "rest": what no other part holds

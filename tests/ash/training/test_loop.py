@@ -157,6 +157,22 @@ def test_without_decoders_there_is_nothing_to_carry(capture, tmp_path):
     assert not avatar.outcome().carries_nothing
 
 
+def test_the_static_avatar_learns_in_every_so_many_steps_after_the_warm_up(capture, tmp_path, monkeypatch):
+    settings = config(steps=12, warmup_steps=4, static_every=3)
+    avatar = AshAvatar(replace(settings, model=replace(settings.model, standardise=True, fade=0.5)), capture)
+    move, learned = Adam.step, []
+
+    def step(optimiser):
+        learned.append(avatar.module.static.grad is not None)
+        return move(optimiser)
+
+    monkeypatch.setattr(Adam, "step", step)
+    avatar.fit(capture, folder=tmp_path)
+    assert [number for number, did in enumerate(learned) if did] == [6, 9]
+    with pytest.raises(InputError, match="static_every: expected at least 1, got 0"):
+        config(static_every=0)
+
+
 def test_far_from_training_a_static_avatar_is_what_counts(capture, tmp_path):
     """Where trust is 0 nothing of the decoders counts; in training frames their own word does."""
     settings = config(steps=60)
