@@ -22,7 +22,13 @@ DRAWN_BY = {
 def headline(scores: Scores, scene: str) -> str:
     """The finding of a scene: who is ahead, by how much, where it changes; and who had not finished learning."""
     short = _told(scores, scene, "not finished")
-    return _finding(scores, scene) + (f" Not at their plateau when training ended: {short}." if short else "")
+    left = _sentence(f" Not at their plateau when training ended: {short}") if short else ""
+    return _finding(scores, scene) + left
+
+
+def _sentence(text: str) -> str:
+    """Closed by one full stop, also where it ends with a name such as `w/o mot.`."""
+    return text.removesuffix(".") + "."
 
 
 def _finding(scores: Scores, scene: str) -> str:
@@ -33,7 +39,9 @@ def _finding(scores: Scores, scene: str) -> str:
         return f"On {scene}, no method was ranked on held-out views."
     (best, most), *others = ranked
     text = f"On {scene}, {look_of(best).title} is best on held-out views with {most:.1f} dB"
-    return text + (f", {most - others[0][1]:.1f} dB ahead of {look_of(others[0][0]).title}." if others else ".")
+    if others:
+        text += f", {most - others[0][1]:.1f} dB ahead of {look_of(others[0][0]).title}"
+    return _sentence(text)
 
 
 def remarks(scores: Scores, scene: str) -> list[str]:
@@ -44,9 +52,9 @@ def remarks(scores: Scores, scene: str) -> list[str]:
     found.append(f"What a search found to suffice: {'; '.join(said)}." if said else "")
     found.append(_supervision(scores, scene))
     dead = _told(scores, scene, "dead")
-    found.append(f"Decoders carry nothing, the same output in every frame: {dead}." if dead else "")
+    found.append(_sentence(f"Decoders carry nothing, the same output in every frame: {dead}") if dead else "")
     failed = [look_of(method).title for method in scores.methods(scene) if scores.failed(scene, method)]
-    found.append(f"Failed, and scored with the worst value: {', '.join(failed)}." if failed else "")
+    found.append(_sentence(f"Failed, and scored with the worst value: {', '.join(failed)}") if failed else "")
     if not scores.repeated(scene):
         found.append("One seed: a difference of a few tenths of a dB may be chance; --seeds 3 gives intervals.")
     elif scores.captures(scene) == 1:

@@ -246,6 +246,8 @@ def test_a_training_cut_short_and_dead_decoders_are_told_of() -> None:
     results = [replace(scored("ash", view=27.0, pose=20.0), training=short), scored("ddc", view=25.0, pose=19.0)]
     scores = scores_of(results)
     assert sentences.headline(scores, "loose").endswith("Not at their plateau when training ended: ASH.")
+    alone = scores_of([replace(scored("wo_mot", view=27.0, pose=20.0), training=short)])
+    assert sentences.headline(alone, "loose").endswith("Not at their plateau when training ended: w/o mot.")
     assert any("Decoders carry nothing" in remark and "ASH" in remark for remark in sentences.remarks(scores, "loose"))
 
 
