@@ -73,17 +73,23 @@ def speed_figure(scores: Scores, scene: str) -> Figure | None:
         tuple(looks.values()),
         notes=notes,
     )
-    caption = (
-        "Up and to the left is better. Hollow: given the exact surface, a bound and no competitor; the dashed "
-        "line joins it "
-        "with the honest method, so its length is what the template's error costs. Grey staircase: the front of "
-        "those that "
-        "no other beats in both."
-    )
-    if scores.repeated(scene):
-        caption += f" Whiskers: 95 % interval over {scores.unit(scene)}. Ringed: the smallest sufficient method."
+    caption = _speed_caption(exact=bool(links), over=scores.unit(scene) if scores.repeated(scene) else "")
     title = "Accuracy against speed"
     return Figure(name=scene, title=title, caption=caption, panels=panels, series=tuple(looks.values()), named=named)
+
+
+def _speed_caption(*, exact: bool, over: str) -> str:
+    """What the chart shows, and no mark that it has not. `over`: what its whiskers are over; empty without them."""
+    caption = "Up and to the left is better."
+    if exact:
+        caption += (
+            " Hollow: given the exact surface, a bound and no competitor; the dashed line joins it with the honest "
+            "method, so its length is what the template's error costs."
+        )
+    caption += " Grey staircase: the front of those that no other beats in both."
+    if over:
+        caption += f" Whiskers: 95 % interval over {over}. Ringed: the smallest sufficient method."
+    return caption
 
 
 def _pair(scores: Scores, scene: str, method: str, split: str) -> tuple[Score | None, Score | None]:

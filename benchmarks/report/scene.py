@@ -95,7 +95,8 @@ def scene_report(data: SceneData) -> SceneReport:
     more = _more_tables(scores, scene)
     compared = contrasts.contrasts(scores, scene)
     beside = contrasts.contrasts(scores, scene, splits=tuple(s for s in MOTION_SPLITS if s not in RANKED_SPLITS))
-    quality_note = f"{QUALITY_NOTE} {established.note(scores, scene, compared)}"
+    apart = (APART_NOTE,) if any(row.apart for row in quality.rows) else ()
+    quality_note = " ".join((QUALITY_NOTE, *apart, VALUES_NOTE, established.note(scores, scene, compared)))
     picture_sections, sheets = _picture_sections(data, capture, shown, trouble)
     sections = [
         Section(title=scene, headline=sentences.headline(scores, scene), blocks=tuple(_opening(data, capture))),
@@ -113,11 +114,12 @@ def scene_report(data: SceneData) -> SceneReport:
 
 QUALITY_NOTE = (
     "Quality on the foreground, LPIPS on the whole frame, IoU on the silhouette. Best and second best are marked "
-    "among the "
-    "methods that see only training views; those below the line were given the exact surface, and are not "
-    "ranked. n/a: not "
-    "measured (LPIPS needs the user's AlexNet weights). Where an interval would reach below zero, the range of "
-    "the values stands instead."
+    "among the methods that see only training views."
+)
+APART_NOTE = "Those below the line were given the exact surface, and are not ranked."
+VALUES_NOTE = (
+    "n/a: not measured (LPIPS needs the user's AlexNet weights). Where an interval would reach below zero, the range "
+    "of the values stands instead."
 )
 COST_NOTE = (
     "A frame and its stages: median over frames of near held-out motion (of new motion, where a capture has no near "

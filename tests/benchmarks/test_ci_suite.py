@@ -17,6 +17,7 @@ def results(ci_run: Path) -> list[CellResult]:
     assert (run / "report.html").stat().st_size > 100_000
     assert (run / "worst_mannequin.png").exists()
     assert "of the squared error on" in (run / "report.md").read_text()
+    assert (run / "report.md").read_text().count("given the exact surface") == 2, "below the chart and below the table"
     return results_of(read_run(run))
 
 

@@ -20,6 +20,7 @@ from benchmarks.analysis.scores import Quantity, scores_of
 from benchmarks.cell.cells import CellResult, Summary, failed_result
 from benchmarks.cell.metrics import PROTOCOL
 from benchmarks.report import sentences, tables
+from benchmarks.report.figures import speed_figure
 from benchmarks.report.page import publish, write_report
 from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells
 from benchmarks.suites.progress import Progress
@@ -108,6 +109,17 @@ def test_the_charts_are_valid_svg_and_adapt_to_dark_pages(run: Run) -> None:
     assert ElementTree.fromstring(text).tag == "{http://www.w3.org/2000/svg}svg"
     assert "prefers-color-scheme:dark" in text
     assert "fake_good" in text and "nan" not in text.replace("fake_nan", "").lower()
+
+
+def test_no_caption_tells_of_marks_that_are_not_there(run: Run) -> None:
+    told = "given the exact surface"
+    assert told not in (run.folder / "report.md").read_text()
+    captions = []
+    for methods in (("ash", "ddc"), ("ash", "ash_truth")):
+        figure = speed_figure(scores_of([scored(m, view=27.0, pose=20.0) for m in methods]), "loose")
+        assert figure is not None
+        captions.append(figure.caption)
+    assert [told in caption for caption in captions] == [False, True]
 
 
 def test_markdown_and_latex_say_the_same_as_the_page(run: Run) -> None:
