@@ -59,12 +59,13 @@ def _picture(matrix: Matrix) -> Figure:
         ]
     )
     words = SPLIT_NAMES[matrix.split].words
+    framed = " Framed: expected to be needed." if any(need.expected for need in matrix.needs) else ""
     return Figure(
         name=f"needs_{matrix.split}",
         title=f"What each scene needs, {words}",
         caption=f"Foreground PSNR lost without the part, {words}: blue where something is lost, orange where the scene "
-        f"is better off without, deepest from {LIMIT_DB:g} dB on. Below: the 95 % interval. Bold: needed, or harmful. "
-        "Framed: expected to be needed.",
+        f"is better off without, deepest from {LIMIT_DB:g} dB on. Below: the 95 % interval. Bold: needed, or harmful."
+        f"{framed}",
         panels=heatmap(
             cells, rows=matrix.scenes, columns=[part.title for part in matrix.parts], limit=LIMIT_DB, title=words
         ),

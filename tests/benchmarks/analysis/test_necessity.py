@@ -143,8 +143,16 @@ def test_the_matrix_is_a_picture_with_the_expected_cells_framed(ladder: Scores) 
     framed = [path for path in drawn.iter("{http://www.w3.org/2000/svg}path") if path.get("stroke-width") == "2.5"]
     expected = sum(need.expected for need in view(ladder).needs)
     assert len(framed) == expected == 5 - 1
+    assert "Framed" in figures["needs_novel_view"].caption
     assert figures["needs_novel_view"].specs()[0]["width"] == "container"
     assert "wrinkles" in "".join(ElementTree.fromstring(figures["doses_novel_view"].svg()).itertext())
+
+
+def test_where_nothing_is_expected_no_frame_is_told_of() -> None:
+    levels = {"ash": 27.0, "wo_mot": 26.0, "wo_offset": 25.0}
+    scores = scores_of(people("tight", levels) + people("loose", levels))
+    captions = [chart.figure.caption for chart in blocks_of(needs.sections(scores), Chart)]
+    assert captions and not any("Framed" in caption for caption in captions)
 
 
 def test_the_report_tells_surprises_and_doses_in_words(ladder: Scores) -> None:
