@@ -23,6 +23,7 @@ Verdict = Literal["needed", "not needed", "harmful", "unclear", "unknown"]
 
 WHOLE = "ash"  # the row that has every part
 REFERENCES = ("static", "nearest")  # They are less than ASH without one part.
+RIVAL = "ddc"  # a column of its own: what a mesh would lose in ASH's place
 # Of spherical harmonics ASH has degree 0 in our presets: what a degree is worth is told against degree 3.
 PAIRS = {"sh_3": ("sh_3", WHOLE), "sh_1": ("sh_3", "sh_1"), "sh_2": ("sh_3", "sh_2")}
 TITLES = {"sh_3": "SH 0, not 3", "sh_1": "SH 1, not 3", "sh_2": "SH 2, not 3"}
@@ -126,7 +127,7 @@ def matrix(scores: Scores, split: str) -> Matrix | None:
     """The necessity matrix of a run, or None where it has fewer than two scenes with ASH and an ablation of it."""
     scenes = tuple(scene for scene in scores.scenes if WHOLE in scores.methods(scene) and not _is_dose(scene))
     parts = parts_of(scores, scenes)
-    if len(scenes) < 2 or not parts:
+    if len(scenes) < 2 or all(part.row == RIVAL for part in parts):
         return None
     needs = [
         Need(scene=scene, part=part, loss=difference(scores, scene, part.within, part.without, split))

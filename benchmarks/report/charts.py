@@ -11,6 +11,7 @@ import pandas as pd
 from benchmarks.report.vega import DIM, INK, LINE, PAPER, Series
 
 FEW = 6  # Up to so many series are named where they are drawn, if there is room.
+APART = 0.06  # of an axis, at least, between two of its ticks
 WIDTH = 900  # pixels of a chart in a file
 REAL_TIME_MS = 1e3 / 30
 
@@ -362,10 +363,20 @@ def _log_ticks(domain: tuple[float, float]) -> list[float]:
 
 
 def _number_axis(values: pd.Series, title: str, *, log: bool) -> alt.X:
-    """An axis with a tick at every value; a logarithmic one has those of its decades."""
+    """An axis with ticks at its values, as far as they lie apart; a logarithmic one has those of its decades."""
     if log:
         domain = _log_domain(values, 1.1)
         scale = alt.Scale(type="log", domain=domain, nice=False)
         return alt.X("x:Q", title=title, scale=scale, axis=alt.Axis(values=_log_ticks(domain), format="~s"))
     scale = alt.Scale(padding=8, nice=False, zero=False)  # Room for the marks at both ends.
-    return alt.X("x:Q", title=title, scale=scale, axis=alt.Axis(values=sorted(values.unique()), format="~g"))
+    return alt.X("x:Q", title=title, scale=scale, axis=alt.Axis(values=_ticks_apart(values), format=".3~g"))
+
+
+def _ticks_apart(values: pd.Series) -> list[float]:
+    """Values that a label each has room for; of two that are too close, the rounder one."""
+    least = APART * float(values.max() - values.min())
+    ticks: list[float] = []
+    for value in sorted(values.unique(), key=lambda value: (len(f"{value:.3g}"), value)):
+        if all(abs(value - tick) >= least for tick in ticks):
+            ticks.append(float(value))
+    return sorted(ticks)

@@ -82,6 +82,8 @@ def test_one_scene_or_no_part_makes_no_matrix() -> None:
     assert matrix(scores_of(people("still", {"ash": 27.0, "wo_mot": 26.0})), "novel_view") is None
     alone = people("still", {"ash": 27.0, "ash_truth": 30.0}) + people("swing", {"ash": 27.0, "static": 20.0})
     assert matrix(scores_of(alone), "novel_view") is None
+    rivals = people("still", {"ash": 27.0, "ddc": 30.0}) + people("swing", {"ash": 27.0, "ddc": 20.0})
+    assert matrix(scores_of(rivals), "novel_view") is None
 
 
 def test_a_part_that_was_not_run_on_a_scene_is_unknown_there() -> None:
