@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from ash.blendshapes import LocalBlendshapes
-from ash.capture.dataset import Camera, Capture, Pose, fewer_views
+from ash.capture.dataset import Camera, Capture, Pose
 from ash.checkpoints import contiguous_state, load_module, read_safetensors
-from ash.config import AshConfig, ModelConfig, TrainingConfig
+from ash.config import AshConfig, ModelConfig
 from ash.decoders import Decoders, decoding_in, decoding_precision
 from ash.devices import device_named
 from ash.files import InputError, write_atomic
@@ -30,7 +30,7 @@ from ash.template_learning.refining import refined_template
 from ash.textures import Conditions, TexelLattice, TextureDrawer, build_lattice, unsettled_frames
 from ash.training.adam import Adam
 from ash.training.batches import draw_batch, over
-from ash.training.images import TrainingImages, load_training_images
+from ash.training.images import TrainingImages, load_training_images, training_part
 from ash.training.loop import fit, view_loss
 
 RELEASED_OPACITY_WEIGHT = 0.1  # In the release's warm-up.
@@ -52,7 +52,7 @@ class AshAvatar:
         template: Template | None = None,
     ) -> None:
         """`template`: one to stand on, where it exists already."""
-        capture = _seen(capture, config.training)
+        capture = training_part(capture, config.training)
         self.device = device_named(config.device)
         self.template = template or template_of(config.template, capture, seed=config.seed, device=self.device)
         self.choice: Choice | None = None
@@ -108,7 +108,7 @@ class AshAvatar:
 
     def fit(self, capture: Capture, *, folder: Path) -> None:
         """Warm up and train; see `ash.training.loop.fit`."""
-        images = load_training_images(_seen(capture, self.config.training), self.device)
+        images = load_training_images(training_part(capture, self.config.training), self.device)
         if self.choice is not None:
             write_choice(self.choice, folder / "log.jsonl")
         outcome = fit(
@@ -264,8 +264,15 @@ class AshAvatar:
         return self.gaussians(pose).means.cpu().numpy()
 
     @torch.no_grad()
-    def gaussians(self, pose: Pose, *, clock: StageClock | None = None, decoders: Decode | None = None) -> Gaussians:
-        """The posed Gaussians: world, metres, on its device; by other `decoders` than the model's own where given."""
+    def gaussians(self, pose: Pose) -> Gaussians:
+        """The posed Gaussians: world, metres, on its device; of a mixed picture, those with the larger share."""
+        return max(self.shared_gaussians(pose), key=lambda found: found[0])[1]
+
+    @torch.no_grad()
+    def shared_gaussians(
+        self, pose: Pose, *, clock: StageClock | None = None, decoders: Decode | None = None
+    ) -> list[tuple[float, Gaussians]]:
+        """All sets of posed Gaussians of which the picture is mixed, and their shares (`ash.model.mixed`)."""
         return self.module.gaussians(pose, clock, decoders=decoders)
 
     @property
@@ -289,11 +296,6 @@ class AshAvatar:
         """Read the weights that `save` wrote."""
         load_module(self.module, read_safetensors(path)[0], path)
         self.template.forget()
-
-
-def _seen(capture: Capture, training: TrainingConfig) -> Capture:
-    """The capture with as many views as the configuration trains on."""
-    return fewer_views(capture, cameras=training.camera_share, frames=training.frame_share)
 
 
 def _is_fitted(losses: Sequence[float], steps: int) -> bool:

@@ -32,9 +32,8 @@ class AtlasConfig:
     shuffle: int = 1  # decode at 1/shuffle of the lattice's resolution and shuffle pixels up; not in the paper
     standardise: bool = False  # decoders see deviations from the mean training texture, in its units; not in the paper
     bound: float = 3.0  # spreads at which those are cut off: what lies farther out was hardly ever learned from
-    fade: float = (
-        0.0  # novelty of a pose, in spreads, at which a static avatar has 1 - 1/e of it; 0: never; not in the paper
-    )
+    # novelty of a pose, in spreads, at which half of its picture is a static avatar's; 0: never; not in the paper
+    fade: float = 0.0
     light: bool = False  # colour times exp(SH2 of the posed normal), 27 numbers; not in the paper
     base: bool = False  # learned static texels with the decoders as residual; not in the paper
     global_features: bool = True  # Phi, from the root translation, at the bottleneck of the U-Net that makes colours
@@ -61,7 +60,7 @@ class AtlasConfig:
         if self.fade and not (self.standardise and self.decoded_texels % 4 == 0):
             raise InputError("fade compares standardised textures: it needs standardise=True and 4 texels")
         if self.fade and not self.base:
-            raise InputError("fade lets static texels take over: it needs base=True")
+            raise InputError("fade mixes in a static avatar: it needs base=True")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -86,18 +87,9 @@ class AshModel(MovingModule):
         return self.base.new_zeros(0, 1, 1) if self.textures is None else self.textures(self.template, pose)
 
     def decode(self, conditions: Conditions, *, decoders: Decode | None = None) -> Float[Tensor, "n o"]:
-        """Stg.3: raw Gaussian parameters per texel; by other `decoders` than the model's own where they are given.
-
-        The less the textures are trusted (`TextureDrawer.trust`), the more the static avatar counts; where they are not
-        trusted at all, nothing is decoded. Not in the paper.
-        """
-        if self.static is not None and conditions.trust == 0:
-            return self.static
+        """Stg.3: raw Gaussian parameters per texel; by other `decoders` than the model's own where they are given."""
         decoders = decoders or self.decoders
-        raw = self.base if decoders is None else self.base + self.corrections(decoders(conditions))
-        if self.static is not None and conditions.trust < 1:
-            raw = self.static.lerp(raw, conditions.trust)
-        return raw
+        return self.base if decoders is None else self.base + self.corrections(decoders(conditions))
 
     def decode_together(self, frames: Sequence[Conditions]) -> list[Float[Tensor, "n o"]]:
         """`decode` of several frames, by U-Nets in one batch; by what decodes in another way frame by frame."""
@@ -133,18 +125,46 @@ class AshModel(MovingModule):
         decoders: Decode | None = None,
     ) -> Splatted:
         """Motion and camera to image: the whole of ASH, over black, on as many threads as torch is given."""
-        gaussians = self.gaussians(pose, clock, decoders=decoders)
+        shared = self.gaussians(pose, clock, decoders=decoders)
         with stage(clock, "stg4", self.base.device):
-            return self.draw(gaussians, [camera], None, torch.get_num_threads())
+            threads = torch.get_num_threads()
+            return mixed([(share, self.draw(gaussians, [camera], None, threads)) for share, gaussians in shared])
 
-    def gaussians(self, pose: Pose, clock: StageClock | None = None, *, decoders: Decode | None = None) -> Gaussians:
-        """Motion to posed Gaussians: everything that does not depend on the camera."""
+    def gaussians(
+        self, pose: Pose, clock: StageClock | None = None, *, decoders: Decode | None = None
+    ) -> list[tuple[float, Gaussians]]:
+        """Motion to posed Gaussians: everything that does not depend on the camera; sets as `shares` has them."""
         threads = torch.get_num_threads()
         conditions = self.conditions(pose, clock, threads)  # Stg.1, Stg.2
         with stage(clock, "stg3", self.base.device):
-            raw = self.decode(conditions, decoders=decoders)
+            shares = self.shares(self.decode(conditions, decoders=decoders), conditions)
         with stage(clock, "stg4", self.base.device):
-            return self.pose(raw, conditions, threads)
+            return [(share, self.pose(raw, conditions, threads)) for share, raw in shares]
+
+    def shares(self, decoded: Float[Tensor, "n o"], conditions: Conditions) -> list[tuple[float, Tensor]]:
+        """Raw parameters of which the picture is mixed, and their shares of it, the decoded ones first.
+
+        Of a pose that is not trusted whole (`TextureDrawer.trust`) the static avatar is shown, too. Not in the paper.
+        """
+        if self.static is None or conditions.trust == 1:
+            return [(1.0, decoded)]
+        return [(conditions.trust, decoded), (1 - conditions.trust, self.static)]
+
+
+def mixed(drawn: Sequence[tuple[float, Splatted]]) -> Splatted:
+    """One picture of several, by their shares, which add up to 1.
+
+    Pictures are mixed, not parameters: two avatars that learned apart err apart, so that their mean is nearer to the
+    truth than either, while Gaussians halfway between theirs are worse than both (docs/tuning.md).
+    """
+    if len(drawn) == 1:
+        return drawn[0][1]
+    shares, pictures = zip(*drawn, strict=True)
+
+    def mean(name: str) -> Tensor:
+        return torch.stack([s * getattr(picture, name) for s, picture in zip(shares, pictures, strict=True)]).sum(0)
+
+    return replace(pictures[0], rgb=mean("rgb"), alpha=mean("alpha"), depth=mean("depth"))
 
 
 def image_of(drawn: Splatted) -> np.ndarray:

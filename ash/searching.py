@@ -26,7 +26,7 @@ from ash.textures import TextureDrawer
 
 SEARCH_STEPS = 600
 LEFT_OUT_VIEWS = 24
-FADES = (0.35, 0.5, 0.7, 1.0, 1.4)  # Novelties at which decoders count 1/e, in spreads.
+FADES = (0.35, 0.5, 0.7, 1.0, 1.4)  # Novelties at which half of a picture is decoded, in spreads.
 SUFFICIENT_DB = 0.1
 
 

@@ -1,6 +1,5 @@
 """Stg.2: the texel lattice and the motion-aware textures (ASH Sec. 3.2, Eq. 4)."""
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -26,8 +25,6 @@ from ash.template.template import Template
 NOISE_GRID = 4
 POOL = 4  # Texels per side that are one when frames are compared: poses differ over limbs, not over texels.
 COMPARED_FRAMES = 512  # Training frames, evenly taken, that a new frame is compared with.
-STEEPNESS = 8  # Halfway between decoded and static is worse than either: 0.9 at 3/4 of the fade, 0.1 at 11/10 of it.
-LEAST_TRUST = 0.02  # Of exp(-(novelty / fade)^8): below it nothing that is decoded counts, and nothing need be decoded.
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -85,7 +82,7 @@ class SeenFrame:
     """What U-Nets see of one frame; nothing in it is learned with the avatar."""
 
     textures: Float[Tensor, "c r r"]  # motion-aware textures
-    trust: float  # in 0..1: how much of what is decoded counts in this frame
+    trust: float  # in 0..1: the share of the frame's picture that is decoded
     root_translation: Float[Tensor, " 3"]  # metres
 
 
@@ -218,17 +215,15 @@ class TextureDrawer(MovingModule):
         return float((nearest / covered).sqrt())
 
     def trust(self, textures: Float[Tensor, "c r r"]) -> float:
-        """How much of what is decoded from these textures counts: 1 in training frames, fading with their novelty to 0.
+        """The share of a picture that is decoded from these textures, the rest a static avatar's: 1 in training frames.
 
-        t = exp(-(novelty / fade)^8), of which the least part is cut off without a step: (t - LEAST_TRUST) / (1 -
-        LEAST_TRUST), at least 0. What decoders learned from some poses is false far from them, where a static avatar is
-        better. Not in the paper.
+        1 / (1 + (novelty / fade)^2): far from the training poses decoders are no better than a static avatar, and the
+        two err apart. Not in the paper.
         """
         if not self.fade:
             return 1.0
-        ratio = min(self.novelty(textures) / self.fade, 2.0)  # Farther out nothing is left, and powers overflow.
-        whole = math.exp(-(ratio**STEEPNESS))
-        return max(0.0, (whole - LEAST_TRUST) / (1 - LEAST_TRUST))
+        ratio = self.novelty(textures) / self.fade
+        return 1 / (1 + ratio * ratio)  # A power would overflow where a product is infinite.
 
     def _coarse(self, textures: Float[Tensor, "c r r"]) -> Float[Tensor, " d"]:
         return nn.functional.avg_pool2d(textures[:6], POOL).flatten()

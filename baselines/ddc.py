@@ -38,7 +38,7 @@ from ash.template_learning.learning import template_of, with_template
 from ash.template_learning.refining import MotionRefinement, Refinement
 from ash.textures import SeenFrame, TextureDrawer, build_lattice, unsettled_frames
 from ash.training.batches import over
-from ash.training.images import load_training_images
+from ash.training.images import load_training_images, training_part
 from ash.training.loop import fit
 from baselines.display import MeshDisplay, texture_gain
 
@@ -141,12 +141,9 @@ class DdcModel(MovingModule):
         )
 
     def dynamic_texture(self, conditions: MeshConditions) -> Float[Tensor, "3 t t"]:
-        """The texture of a frame; far from the training motion a static one counts (`TextureDrawer.trust`)."""
-        trust = conditions.trust
-        if self.static_texture is not None and trust == 0:
-            return self.static_texture
+        """The texture of a frame; of a pose not trusted whole, mixed with a static one (`TextureDrawer.trust`)."""
         (texture,) = self.corrected_textures([conditions])
-        return texture if self.static_texture is None or trust == 1 else self.static_texture.lerp(texture, trust)
+        return texture if self.static_texture is None else self.static_texture.lerp(texture, conditions.trust)
 
     def corrected_textures(self, frames: Sequence[MeshConditions]) -> list[Float[Tensor, "3 t t"]]:
         """The texture with what the network adds in each frame; frames are decoded together."""
@@ -190,6 +187,7 @@ class DdcAvatar:
 
     def __init__(self, config: DdcConfig, capture: Capture, *, template: Template | None = None) -> None:
         """`template`: one to stand on, where it exists already."""
+        capture = training_part(capture, config.training)
         self.device = device_named(config.device)
         self.template = template or template_of(config.template, capture, seed=config.seed, device=self.device)
         self.choice: Choice | None = None
@@ -236,7 +234,7 @@ class DdcAvatar:
 
     def fit(self, capture: Capture, *, folder: Path) -> None:
         """Train texture and network on the training images; see `ash.training.loop.fit`."""
-        images = load_training_images(capture, self.device)
+        images = load_training_images(training_part(capture, self.config.training), self.device)
         if self.choice is not None:
             write_choice(self.choice, folder / "log.jsonl")
         outcome = fit(self, images, self.config.training, seed=self.config.seed, folder=folder)

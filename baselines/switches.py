@@ -51,7 +51,7 @@ smpl = replace(ash, build=_on_bare_body).but({"template": TemplateConfig(kind="s
 
 # Without learned texels, as the paper has its method: all that is drawn comes out of the decoders.
 ash_wo_base = ash.but({**WITHOUT_BASE, "training.warmup": "fitted"})
-ddc_wo_base = ddc.but(WITHOUT_BASE)
+ddc_wo_base = ddc.but({**WITHOUT_BASE, "training.warmup": "none", "training.warmup_steps": 0})
 
 # What lightness costs: the model of the preset `frugal` in any other.
 ash_frugal = ash.but({"model": lambda _: frugal().model})

@@ -15,8 +15,9 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from ash.capture.dataset import Camera, Capture
+from ash.capture.dataset import Camera, Capture, fewer_views
 from ash.capture.manifest import Split
+from ash.config import TrainingConfig
 from ash.devices import CPU
 from ash.files import InputError
 from ash.kept import MAX_BYTES, Kept
@@ -90,6 +91,11 @@ class TrainingImages:
         """What a batch has to show of a view."""
         camera = self.cameras[view[0]]
         return (0, 0, camera.width, camera.height) if self.whole else self.views[view].box
+
+
+def training_part(capture: Capture, training: TrainingConfig) -> Capture:
+    """The capture with as many views as a configuration trains on."""
+    return fewer_views(capture, cameras=training.camera_share, frames=training.frame_share)
 
 
 def load_training_images(

@@ -18,7 +18,7 @@ from ash.files import InputError, link_or_copy
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted, splat
 from ash.inference import Player
-from ash.model import image_of, views_of
+from ash.model import image_of, mixed, views_of
 from ash.protocol import Avatar, PosedGeometry, PosesGaussians, StageClock
 from benchmarks.analysis.names import look_of
 from benchmarks.cell.cells import CHECKPOINT, Cell, is_trained, read_cell
@@ -26,6 +26,8 @@ from benchmarks.cell.methods import is_oracle
 from benchmarks.cell.process import load_avatar
 from benchmarks.play.cameras import first_camera
 from benchmarks.suites.runs import RUN_FILE, read_run
+
+Shared = list[tuple[float, Gaussians]]  # sets of Gaussians of which a picture is mixed, and their shares
 
 KEPT_POSES = 48  # Playing a short motion again, or turning the camera, decodes nothing anew.
 NOT_FINITE = "the rendered image holds NaN or infinity"
@@ -37,7 +39,7 @@ class Actor:
 
     def __init__(self, cell: Cell, title: str, avatar: Avatar, capture: Capture) -> None:
         self.cell, self.title, self.avatar = cell, title, avatar
-        self._kept: OrderedDict[tuple[bytes, int], Gaussians] = OrderedDict()
+        self._kept: OrderedDict[tuple[bytes, int], Shared] = OrderedDict()
         self._decoders = None
         if isinstance(avatar, AshAvatar):
             engine = Player(avatar, capture.motion, first_camera(capture)).engine
@@ -48,18 +50,18 @@ class Actor:
         """Premultiplied RGBA, float32 `[h, w, 4]`."""
         if not isinstance(self.avatar, PosesGaussians):
             return self.avatar.render(pose, camera, clock=clock)
-        gaussians = self.gaussians(pose, clock)
+        shared = self.gaussians(pose, clock)
         with clock.stage("stg4"):
-            return image_of(self._splat(gaussians, camera, None))
+            return image_of(self._splat(shared, camera, None))
 
     @torch.no_grad()
     def view(self, pose: Pose, camera: Camera, clock: StageClock, behind: tuple[int, int, int]) -> np.ndarray:
         """The picture over a colour, uint8 `[h, w, 3]`: what is shown, at less cost than what is scored."""
         if not isinstance(self.avatar, PosesGaussians):
             return on_colour(self.picture(pose, camera, clock), behind)
-        gaussians = self.gaussians(pose, clock)
+        shared = self.gaussians(pose, clock)
         with clock.stage("stg4"):
-            return self._over(gaussians, camera, behind)
+            return self._over(shared, camera, behind)
 
     @torch.no_grad()
     def ellipsoids(self, pose: Pose, camera: Camera, clock: StageClock, behind: tuple[int, int, int]) -> np.ndarray:
@@ -70,12 +72,14 @@ class Actor:
         """
         if not isinstance(self.avatar, PosesGaussians):
             raise InputError(f"{self.title} has no Gaussians to show as ellipsoids")
-        full = self.gaussians(pose, clock)
-        shown = replace(full, scales=THIN * full.scales, opacities=(full.opacities > 0.1).float())
+        shown = [
+            (share, replace(full, scales=THIN * full.scales, opacities=(full.opacities > 0.1).float()))
+            for share, full in self.gaussians(pose, clock)
+        ]
         with clock.stage("stg4"):
             return self._over(shown, camera, behind)
 
-    def gaussians(self, pose: Pose, clock: StageClock) -> Gaussians:
+    def gaussians(self, pose: Pose, clock: StageClock) -> Shared:
         """The posed Gaussians of an avatar that has any."""
         assert isinstance(self.avatar, PosesGaussians)
         key = (pose.motion.dofs[pose.window(8)].tobytes(), pose.frame)
@@ -83,9 +87,9 @@ class Actor:
             self._kept.move_to_end(key)
             return self._kept[key]
         if isinstance(self.avatar, AshAvatar):
-            posed = self.avatar.gaussians(pose, clock=clock, decoders=self._decoders)
+            posed = self.avatar.shared_gaussians(pose, clock=clock, decoders=self._decoders)
         else:
-            posed = self.avatar.gaussians(pose)
+            posed = [(1.0, self.avatar.gaussians(pose))]
         self._kept[key] = posed
         if len(self._kept) > KEPT_POSES:
             self._kept.popitem(last=False)
@@ -98,16 +102,16 @@ class Actor:
         vertices = self.avatar.template_vertices(pose)
         return vertices if len(vertices) else None
 
-    def _over(self, gaussians: Gaussians, camera: Camera, behind: tuple[int, int, int]) -> np.ndarray:
-        rgb = self._splat(gaussians, camera, torch.tensor(behind) / 255).rgb[0]
+    def _over(self, shared: Shared, camera: Camera, behind: tuple[int, int, int]) -> np.ndarray:
+        rgb = self._splat(shared, camera, torch.tensor(behind) / 255).rgb[0]
         if not math.isfinite(float(rgb.sum())):
             raise FloatingPointError(NOT_FINITE)
         return rgb.mul_(255).add_(0.5).clamp_(0, 255).to(torch.uint8).cpu().numpy()
 
-    def _splat(self, gaussians: Gaussians, camera: Camera, behind: torch.Tensor | None) -> Splatted:
+    def _splat(self, shared: Shared, camera: Camera, behind: torch.Tensor | None) -> Splatted:
         assert isinstance(self.avatar, PosesGaussians)
-        dilation, threads = self.avatar.dilation, torch.get_num_threads()
-        return splat(gaussians, **views_of([camera]), background=behind, dilation=dilation, threads=threads)
+        how = {**views_of([camera]), "dilation": self.avatar.dilation, "threads": torch.get_num_threads()}
+        return mixed([(share, splat(gaussians, background=behind, **how)) for share, gaussians in shared])
 
 
 def on_colour(premultiplied: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:

@@ -11,7 +11,6 @@ from ash.rotations import RigidTransforms, rotvec_to_unitquat
 from ash.template.motion import normalised_motion
 from ash.template.template import RestDeformation, Template
 from ash.textures import (
-    LEAST_TRUST,
     TexelLattice,
     TextureDrawer,
     build_lattice,
@@ -184,10 +183,11 @@ def test_trust_is_whole_in_training_frames_and_fades_with_novelty(template):
         dofs[3, 6:] += bend
         textures = drawer(template, Pose(Motion(dofs=dofs, sequence=motion.sequence, fps=motion.fps), 3))
         novelty = drawer.novelty(textures)
-        whole = np.exp(-((novelty / 0.5) ** 8))
-        assert drawer.trust(textures) == pytest.approx(max(0.0, (whole - LEAST_TRUST) / (1 - LEAST_TRUST)))
+        assert drawer.trust(textures) == pytest.approx(1 / (1 + (novelty / 0.5) ** 2))
         bends.append(novelty)
     assert bends[0] == 0 and sorted(bends) == bends and bends[-1] > 0.5
+    drawer.fade = bends[-1]
+    assert drawer.trust(textures) == pytest.approx(0.5)
     drawer.fade = 1e-300  # A ratio whose power is beyond floats.
     assert drawer.trust(textures) == 0
     always = TextureDrawer(build_lattice(template.mesh, RESOLUTION), window=1, yaw_normalise=True, standardise=True)

@@ -173,23 +173,32 @@ def test_the_static_avatar_learns_in_every_so_many_steps_after_the_warm_up(captu
         config(static_every=0)
 
 
-def test_far_from_training_a_static_avatar_is_what_counts(capture, tmp_path):
-    """Where trust is 0 nothing of the decoders counts; in training frames their own word does."""
+def test_far_from_training_a_static_avatar_has_its_share_of_the_picture(capture, tmp_path, monkeypatch):
+    """Pictures are mixed by trust, not parameters; of training frames all is decoded."""
     settings = config(steps=60)
     model = replace(settings.model, standardise=True, fade=0.5)
     avatar = AshAvatar(replace(settings, model=model), capture)
     avatar.fit(capture, folder=tmp_path)
     with torch.no_grad():
         added = [avatar.corrections(frame) for frame in range(4)]
-        static = avatar.module.static
+        static, camera = avatar.module.static, next(iter(capture.cameras.values()))
         for frame in range(4):
-            near = avatar.module.conditions(Pose(capture.motion, frame))
+            pose = Pose(capture.motion, frame)
+            near = avatar.module.conditions(pose)
             assert near.trust == 1
-            torch.testing.assert_close(avatar.module.decode(near), avatar.module.base + added[frame])
-            far, between = (avatar.module.decode(replace(near, trust=trust)) for trust in (0.0, 0.25))
-            assert torch.equal(far, static)
-            assert torch.equal(avatar.module.decode(replace(near, trust=0.0), decoders=pytest.fail), static), "needless"
-            torch.testing.assert_close(between, 0.75 * static + 0.25 * (avatar.module.base + added[frame]))
+            decoded = avatar.module.decode(near)
+            torch.testing.assert_close(decoded, avatar.module.base + added[frame])
+            sets = [avatar.module.pose(raw, near) for raw in (decoded, static)]
+            alone = [avatar.module.draw(gaussians, [camera], None) for gaussians in sets]
+            assert not torch.equal(alone[0].rgb, alone[1].rgb)
+            for trust, larger in ((1.0, 0), (0.75, 0), (0.25, 1)):
+                with monkeypatch.context() as patched:
+                    patched.setattr(avatar.texture_drawer(), "trust", lambda textures, trust=trust: trust)
+                    drawn, kept = avatar.module(pose, camera), avatar.gaussians(pose)
+                for name in ("rgb", "alpha", "depth"):
+                    wanted = trust * getattr(alone[0], name) + (1 - trust) * getattr(alone[1], name)
+                    torch.testing.assert_close(getattr(drawn, name), wanted)
+                assert torch.equal(kept.means, sets[larger].means), "one set alone: that of the larger share"
     assert not torch.equal(added[0], added[2])
     assert not torch.equal(static, avatar.module.base), "each has learned for itself since the warm-up"
     avatar.save(tmp_path / "weights.safetensors")
