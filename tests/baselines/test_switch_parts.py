@@ -1,13 +1,13 @@
-"""Every switch and every row changes what it names, and nothing else.
+"""Every switch, every row and every field changes what it names, and nothing else.
 
-An avatar is taken apart: each part is fed with the same inputs, whatever the others do, and leaves a fingerprint. What
-a switch may change is written down here, by hand; all other fingerprints must be those of ASH as it stands.
+What each may change is written down here, by hand; all other parts (`helpers.parts`) must be, bit for bit, those of
+the avatar without the change. A field that has no case, no row and no test of its own fails.
 """
 
-import hashlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from functools import cache, partial
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
@@ -15,276 +15,326 @@ import numpy as np
 import pytest
 import torch
 from helpers.captures import tiny_preset, write_tube_capture
-from helpers.learning import training_views
+from helpers.figures import tube_mesh
+from helpers.parts import differing, taken_apart
 
-from ash import presets
-from ash.avatar import AshAvatar
-from ash.capture.dataset import Capture, Pose, fewer_views
-from ash.gaussians.gaussians import Gaussians
-from ash.gaussians.texels import pose
-from ash.rotations import RigidTransforms
-from ash.textures import Conditions
-from ash.training.batches import draw_batch
-from ash.training.images import TrainingImages, load_training_images
-from ash.training.loop import _Run, view_loss
-from benchmarks.cell.methods import configured, find_method
+from ash import presets, searching
+from ash.capture.dataset import Capture, Pose
+from ash.config import AshConfig, AtlasConfig, ModelConfig, TemplateConfig, TrainingConfig
+from ash.fields import changed, replaced
+from ash.files import write_arrays
+from ash.searching import at_size
+from ash.template.template import skinned_template
+from baselines.ddc import DdcConfig, ddc
+from benchmarks.cell.methods import configured, find_method, offered
 from benchmarks.suites.files import find_suite
 
-TEXELS, CHANNELS = 40, 14
-
-
-def fingerprint(*values: Any) -> str:
-    """Of tensors, arrays and plain values."""
-    digest = hashlib.sha256()
-    for value in values:
-        if isinstance(value, torch.Tensor | np.ndarray):
-            array = np.ascontiguousarray(torch.as_tensor(value).detach().float().numpy())
-            digest.update(repr(array.shape).encode() + array.tobytes())
-        else:
-            digest.update(repr(value).encode())
-    return digest.hexdigest()
-
-
-@dataclass(frozen=True)
-class Subject:
-    """An avatar taken apart, with the views that it learns from."""
-
-    avatar: AshAvatar
-    capture: Capture
-    folder: Path
-
-    @property
-    def images(self) -> TrainingImages:
-        training = self.avatar.config.training
-        return load_training_images(
-            fewer_views(self.capture, cameras=training.camera_share, frames=training.frame_share)
-        )
-
-
-def numbers(*shape: int, seed: int = 0) -> torch.Tensor:
-    """The same random numbers for the same shape."""
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
-
-
-def fixed_conditions(avatar: AshAvatar) -> Conditions:
-    """What decoders and posing are given, whatever Stg.1 and Stg.2 make of the motion."""
-    model = avatar.config.model
-    texels = len(avatar.lattice.texels)
-    unit = torch.nn.functional.normalize(numbers(texels, 4), dim=1)
-    return Conditions(
-        textures=numbers(6 * model.window, model.decoded_texels, model.decoded_texels, seed=1),
-        trust=1.0,
-        motion=avatar._conditions_of(0).motion,
-        root_translation=numbers(3, seed=2),
-        canonical=0.1 * numbers(texels, 3, seed=3),
-        normals=torch.nn.functional.normalize(numbers(texels, 3, seed=4), dim=1),
-        transforms=RigidTransforms(quats=unit, translations=0.1 * numbers(texels, 3, seed=5)),
-    )
-
-
-def template(s: Subject) -> str:
-    return fingerprint(*(s.avatar.template.pose(Pose(s.capture.motion, f)).vertices for f in (0, 3)))
-
-
-def places(s: Subject) -> str:
-    made = s.avatar._conditions_of(2)
-    return fingerprint(made.canonical, made.normals, made.transforms.quats, made.transforms.translations)
-
-
-def textures(s: Subject) -> str:
-    """Of a pose that was learned from, and of one that was not."""
-    drawer, last = s.avatar.module.textures, len(s.capture.motion.dofs) - 1
-    unseen = None if drawer is None else drawer(s.avatar.template, Pose(s.capture.motion, last))
-    return fingerprint(s.avatar._conditions_of(2).textures, unseen)
-
-
-def trust(s: Subject) -> str:
-    drawer = s.avatar.module.textures
-    return fingerprint(None if drawer is None else drawer.fade)
-
-
-def decoding(s: Subject) -> str:
-    """Structure of the decoders, and what they make of fixed textures with fixed weights."""
-    decoders = s.avatar.module.decoders
-    if decoders is None:
-        return fingerprint("none")
-    weights = {name: 0.3 * numbers(*p.shape, seed=len(name)) for name, p in decoders.named_parameters()}
-    with torch.no_grad():
-        for name, parameter in decoders.named_parameters():
-            parameter.copy_(weights[name])
-        return fingerprint(sorted(weights), decoders(fixed_conditions(s.avatar)))
-
-
-def counting(s: Subject) -> str:
-    """What of the decoders' output counts."""
-    return fingerprint(s.avatar.module.corrections(numbers(TEXELS, CHANNELS))[:, :CHANNELS])
-
-
-def start(s: Subject) -> str:
-    module = s.avatar.module
-    return fingerprint(module.base[:, :CHANNELS], module.base.requires_grad)
-
-
-def spread(s: Subject) -> str:
-    """How the view changes colours: coefficients per Gaussian."""
-    return fingerprint(s.avatar.module.base.shape[1])
-
-
-def posing(s: Subject) -> str:
-    avatar, conditions = s.avatar, fixed_conditions(s.avatar)
-    raw = torch.zeros(len(conditions.canonical), avatar.module.base.shape[1])
-    raw[:, :CHANNELS] = numbers(len(raw), CHANNELS, seed=6)
-    made = pose(raw, conditions, avatar.config.model, None)
-    return fingerprint(made.means, made.quats, made.scales, made.opacities, made.sh[:, :1])
-
-
-def light(s: Subject) -> str:
-    return fingerprint(s.avatar.module.light is None)
-
-
-def drawing(s: Subject) -> str:
-    camera = s.capture.cameras["cam1"]
-    means = 0.1 * numbers(TEXELS, 3, seed=7) + torch.tensor([0.0, 0.5, 0.0])
-    known = Gaussians(
-        means=means,
-        quats=numbers(TEXELS, 4, seed=8),
-        scales=torch.full((TEXELS, 3), 0.02),
-        opacities=torch.full((TEXELS,), 0.7),
-        sh=numbers(TEXELS, 1, 3, seed=9),
-    )
-    return fingerprint(s.avatar.module.draw(known, [camera], None).rgb)
-
-
-def batches(s: Subject) -> str:
-    made = [draw_batch(s.images, s.avatar.config.training, 0, step) for step in range(6)]
-    return fingerprint(*(value for b in made for value in (b.frame, b.targets, b.background)))
-
-
-def loss(s: Subject) -> str:
-    training = s.avatar.config.training
-    batch = draw_batch(load_training_images(s.capture), presets.named("ci").training, 0, 0)
-    return fingerprint(view_loss([numbers(*batch.targets.shape, seed=10).sigmoid()], [batch], training))
-
-
-def noise(s: Subject) -> str:
-    """What decoders see while they learn, beyond what they are given."""
-    avatar, seen = s.avatar, []
-    decode, avatar._decode = avatar._decode, lambda c: (seen.append(c[0].textures), decode(c))[1]
-    step = avatar.config.training.static_steps + 1
-    training_views(avatar, 2, [s.capture.cameras["cam1"]], torch.zeros(3), step)
-    avatar._decode = decode
-    return fingerprint(not torch.equal(seen[0], avatar._conditions_of(2).textures))
-
-
-def warm_up(s: Subject) -> str:
-    """What is done before or beside the loop: steps of the static texels alone, and what decoders are regressed to."""
-    avatar = s.avatar
-    kind = avatar.config.training.warmup if avatar.module.decoders is not None else "none"
-    return fingerprint(kind, avatar.config.training.static_steps if avatar.module.decoders is not None else 0)
-
-
-def average(s: Subject) -> str:
-    return fingerprint(bool(_Run(s.avatar, s.avatar.config.training, s.images, s.folder).average))
-
-
-PARTS: dict[str, Callable[[Subject], str]] = {
-    part.__name__: part
-    for part in (
-        template, places, textures, trust, counting, start, spread, posing, light, drawing, batches, loss, noise,
-        warm_up, average, decoding,
-    )
-}  # fmt: skip
+Parts = dict[str, str]
+Changes = Mapping[str, Any]
+Apart = Callable[[str, Changes], Parts]
+METHODS: dict[str, Any] = {"ash": presets.ash, "ddc": ddc}
+BULGE_M = 0.01  # of the true surface where the tube is straight, and as much more per radian
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
+    """The tube with a bulge that follows its bend: there is something to learn for a template that sees the truth."""
+    made = write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
+    rest, posed = tube_mesh().vertices, []
+    for frame, dofs in enumerate(made.motion.dofs):
+        bulged = torch.from_numpy(rest + (1 + dofs[6]) * BULGE_M * rest * [1, 0, 1] / 0.1).float()
+        posed.append(skinned_template(made).pose(Pose(made.motion, frame)).transforms.apply(bulged).numpy())
+    write_arrays(made.folder / "truth" / "template.npz", vertices=np.stack(posed))
+    return made
 
 
 @pytest.fixture(autouse=True, scope="module")
 def tiny() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(presets.PRESETS, "ci", partial(tiny_preset, steps=20, warmup_steps=8))
+        patch.setitem(presets.PRESETS, "ci", partial(tiny_preset, steps=10, warmup_steps=3))
         yield
 
 
-def taken_apart(avatar: AshAvatar, capture: Capture, folder: Path) -> dict[str, str]:
-    return {name: part(Subject(avatar, capture, folder)) for name, part in PARTS.items()}
-
-
 @pytest.fixture(scope="module")
-def plain(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """ASH as it stands."""
-    avatar = presets.ash(capture.training_only(), seed=0, preset="ci")
-    return taken_apart(avatar, capture, tmp_path_factory.mktemp("plain"))
+def apart(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Apart:
+    """The parts of a method with some fields changed; each avatar is made once."""
+
+    @cache
+    def made(method: str, changes: tuple[tuple[str, Any], ...]) -> Parts:
+        config = replaced(METHODS[method].config("ci"), changes, of=method)
+        avatar = METHODS[method](capture, seed=config.seed, preset="ci", config=config)
+        return taken_apart(avatar, capture, tmp_path_factory.mktemp("apart"))
+
+    return lambda method, changes: made(method, tuple(sorted(changes.items())))
 
 
+DECODERS = {"decoding", "weights"}
+SURFACE = {"template", "places", "start", "textures"}  # the template, and all that is drawn from it
 SWITCHES = {row.name: row for row in find_suite("switches").methods if row.changes}
 CHANGED_BY_SWITCH = {
-    "warm_up_paper": {"warm_up"},
-    "warm_up_released": {"warm_up"},
-    "warm_up_none": {"warm_up"},
+    "warm_up_paper": {"warm_up", "turns"},
+    "warm_up_released": {"warm_up", "turns"},
+    "warm_up_none": {"warm_up", "turns"},
     "loss_paper": {"loss"},
     "loss_released": {"loss"},
-    "norm_released": {"decoding"},
-    "norm_instance": {"decoding"},
+    "norm_released": DECODERS,
+    "norm_instance": DECODERS,
     "world_rotations": {"posing"},
-    "released_phi": {"decoding"},
-    "wo_phi": {"decoding"},
-    "sh_3": {"decoding", "spread"},
+    "released_phi": DECODERS,
+    "wo_phi": DECODERS,
+    "sh_3": DECODERS | {"spread"},
     "wide_dilation": {"drawing"},
-    "wo_base": {"start", "trust", "warm_up"},  # Without static texels nothing could take over far from training.
+    "wo_base": {"start", "rates", "trust", "warm_up", "turns"},  # Nothing static could take over far from training.
     "blended_anchor": {"places"},
-    "wo_light": {"light"},
-    "wo_light_and_motion": {"light", "decoding", "textures", "trust", "warm_up"},  # No motion: no decoders at all.
-    "wo_standardise": {"textures", "trust"},  # Novelty is told in units of the standardised textures.
+    "wo_light": {"light", "rates"},
+    "wo_light_and_motion": DECODERS | {"light", "rates", "textures", "trust", "warm_up"},  # No motion: no decoders.
+    "wo_standardise": {"textures", "trust", "rates"},  # Novelty is told in units of the standardised textures.
     "wo_bound": {"textures"},
     "wo_heading": {"textures"},
-    "two_trunks": {"decoding"},
+    "two_trunks": DECODERS,
     "noisy_textures": {"noise"},
     "last_weights": {"average"},
-    "blendshapes": {"decoding", "textures", "trust"},  # They see no textures.
-    "learned_template": {"template", "places", "start", "textures"},  # All that is drawn from it.
+    "blendshapes": DECODERS | {"textures", "trust", "rates"},  # They see no textures.
+    "learned_template": SURFACE | {"deformation"},
 }
 
 
 @pytest.mark.parametrize("name", SWITCHES)
 def test_a_switch_changes_what_it_names_and_nothing_else(
-    name: str, capture: Capture, tmp_path: Path, plain: dict[str, str]
+    name: str, capture: Capture, tmp_path: Path, apart: Apart
 ) -> None:
     row = SWITCHES[name]
     factory = find_method(row.of or row.name).load()
     avatar = factory(capture.training_only(), seed=0, preset="ci", config=configured(row.of, "ci", row.changes))
-    made = taken_apart(avatar, capture, tmp_path)
-    assert {part for part in PARTS if made[part] != plain[part]} == CHANGED_BY_SWITCH[name]
+    assert differing(apart("ash", {}), taken_apart(avatar, capture, tmp_path)) == CHANGED_BY_SWITCH[name]
 
 
 CAMERAS = {"batches", "start"}  # The first colours are means over the cameras.
-DECODERS = {"decoding", "textures", "trust", "warm_up"}  # No motion: no decoders, nothing that they would see.
-LATTICE = {"places", "start", "textures", "decoding", "posing"}  # Other texels: all that is one per texel.
+NO_MOTION = DECODERS | {"textures", "trust", "rates", "warm_up", "turns"}  # no decoders, nothing that they would see
+LATTICE = {"places", "start", "textures", "decoding", "posing"}  # other texels: all that is one per texel
+UNLEARNED = {"start", "trust", "rates", "warm_up", "turns"}  # no learned texels
 CHANGED_BY_ROW = {
     "wo_disp": {"counting"},
     "wo_motion_offset": {"counting"},
     "wo_offset": {"posing"},
-    "wo_mot": DECODERS,
-    "wo_mot_truncated": DECODERS | {"batches", "start"},
-    "ash_wo_base": {"start", "trust", "warm_up"},
-    "mlp": {"decoding", "start", "trust", "warm_up"},
-    "mlp_base": {"decoding"},
+    "wo_mot": NO_MOTION,
+    "wo_mot_truncated": NO_MOTION | {"batches", "start"},
+    "ash_wo_base": UNLEARNED,
+    "mlp": UNLEARNED | DECODERS,
+    "mlp_base": DECODERS,
     "res_128": LATTICE,
     "res_512": LATTICE,
     "cams_12": CAMERAS,
     "cams_30": CAMERAS,
     "cams_60": CAMERAS,
-    "ash_truth": {"template", "places", "start", "textures"},
-    "ash_frugal": LATTICE | {"trust"},
+    "ash_truth": SURFACE | {"deformation"},
+    "ash_frugal": LATTICE | {"weights", "trust", "rates"},
+    "ddc_wo_base": {"start", "trust", "rates", "turns", "warm_up"},
+    "ddc_truth": (SURFACE - {"places"}) | {"deformation", "refinement", "pulls", "rates"},  # Exact: it is not moved.
 }
 
 
 @pytest.mark.parametrize("name", CHANGED_BY_ROW)
 def test_a_row_changes_what_it_names_and_nothing_else(
-    name: str, capture: Capture, tmp_path: Path, plain: dict[str, str]
+    name: str, capture: Capture, tmp_path: Path, apart: Apart
 ) -> None:
-    seen = capture if name == "ash_truth" else capture.training_only()
+    seen = capture if name.endswith("truth") else capture.training_only()
     made = taken_apart(find_method(name).load()(seen, seed=0, preset="ci"), capture, tmp_path)
-    assert {part for part in PARTS if made[part] != plain[part]} == CHANGED_BY_ROW[name]
+    assert differing(apart("ddc" if name.startswith("ddc") else "ash", {}), made) == CHANGED_BY_ROW[name]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Another value of a field, the parts that it may change, and what both avatars have besides so that it counts."""
+
+    value: Any
+    parts: set[str]
+    on: Changes = field(default_factory=dict)
+
+
+UNFADING = {"model.fade": 0.0}
+BLENDSHAPES = {"model.head": "blendshapes", **UNFADING}
+FITTED = {"training.warmup": "fitted"}
+PLANTED = {
+    "template.kind": "exact",
+    "template.error_mm": 8.0,
+    "template.error_static": 0.4,
+    "template.error_lag": 0.2,
+}
+FROM_IMAGES = {"template.kind": "learned", "template.passes": 1}
+NETS = {
+    "template.kind": "learned",
+    "template.supervision": "vertices",
+    "template.network": "graph",
+    "template.skinning": "graph",
+    "template.width": 4,
+    "template.blocks": 1,
+    "template.steps": 20,
+}
+MOVED = {"refine": "motion", "template.width": 4, "template.blocks": 1}
+# The networks that move a template are drawn before the decoders: where they are others, so are the decoders' weights.
+MOVING = {"refinement", "weights"}
+OF_BOTH = {
+    "seed": Case(1, {"batches", "weights"}),
+    "model.window": Case(3, DECODERS | {"textures"}),
+    "model.width": Case(8, DECODERS),
+    "model.levels": Case(1, DECODERS),
+    "model.shuffle": Case(2, DECODERS | {"textures"}),
+    "model.standardise": Case(False, {"textures"}, UNFADING),
+    "model.fade": Case(0.35, {"trust"}),
+    "model.base": Case(False, {"start", "rates"}, {**UNFADING, "training.warmup": "none"}),
+    "training.steps": Case(9, {"course"}),
+    "training.views_per_step": Case(1, {"batches"}),
+    "training.warmup_steps": Case(5, {"warm_up", "turns"}),
+    "training.static_every": Case(3, {"turns"}),
+    "training.l1_weight": Case(0.5, {"loss"}),
+    "training.ssim_weight": Case(0.5, {"loss"}),
+    "training.learning_rate": Case(1e-3, {"rates"}),
+    "training.base_learning_rate": Case(1e-3, {"rates"}),
+    "training.background": Case("black", {"batches"}),
+    "training.frames_per_step": Case(2, {"batches"}),
+    "training.schedule": Case("constant", {"course"}),
+    "training.crop": Case(False, {"batches"}),
+    "training.precision": Case("bfloat16", {"precision"}, {"model.width": 16}),
+    "training.seconds": Case(140.0, {"course"}),
+    "training.snapshots": Case(True, {"files"}),
+    "training.checkpoint_seconds": Case(30.0, {"files"}),
+}
+OF_ASH = {
+    "model.motion": Case(False, NO_MOTION - {"turns"}),
+    "model.head": Case("blendshapes", DECODERS | {"textures", "trust"}, UNFADING),
+    "model.rank": Case(3, DECODERS, BLENDSHAPES),
+    "model.refine": Case(True, SURFACE | MOVING | {"rates"}),  # It starts at nothing, but for the last bit.
+    "training.frame_share": Case(0.5, {"batches", "start", "textures"}),  # Standardised by what is seen.
+    "template.error_mm": Case(4.0, SURFACE, PLANTED),
+    "template.error_static": Case(0.9, SURFACE, PLANTED),
+    "template.error_lag": Case(0.9, SURFACE, PLANTED),
+    "template.passes": Case(2, SURFACE, FROM_IMAGES),
+    "template.supervision": Case("scans", SURFACE, NETS),
+    "template.network": Case("linear", SURFACE | {"deformation"}, NETS),
+    "template.skinning": Case("direct", SURFACE | {"skinning"}, NETS),
+    "template.nodes": Case(25, SURFACE | {"deformation", "skinning"}, NETS),
+    "template.window": Case(3, SURFACE | {"deformation"}, NETS),
+    "template.weights": Case("per-node", SURFACE | {"deformation"}, NETS),
+    "template.dense": Case(True, SURFACE | {"deformation"}, NETS),
+    "template.width": Case(5, SURFACE | {"deformation"}, NETS),
+    "template.blocks": Case(2, SURFACE | {"deformation"}, NETS),
+    "template.steps": Case(10, SURFACE, NETS),
+}
+OF_THE_MESH = {
+    "texture": Case(64, DECODERS | {"start"}),
+    "refine": Case("motion", MOVING | {"rates"}),
+    "vertices_every": Case(2, {"pulls"}),
+    "model.texels": Case(8, DECODERS | {"textures"}),
+    "model.yaw_normalise": Case(False, {"textures"}),
+    "model.norm": Case("instance", DECODERS),
+    "model.bound": Case(float("inf"), {"textures"}),
+    "model.light": Case(False, {"light", "drawing", "rates"}),
+    "model.global_features": Case(False, DECODERS | {"rates"}),
+    "model.global_mlp": Case("released", DECODERS),
+    "training.warmup": Case("none", {"warm_up", "turns"}),
+    "training.ema": Case(0.0, {"average"}),
+    "training.texture_noise": Case(0.5, {"noise"}),
+    "training.camera_share": Case(0.5, {"batches", "start"}),
+    "training.frame_share": Case(0.5, {"batches", "start", "textures"}),
+    "training.fitted_every": Case(2, set(), FITTED),  # A mesh has no Gaussians that could be fitted.
+    "training.fitted_steps": Case(3, set(), FITTED),
+    "template.nodes": Case(25, {"refinement"}, MOVED),
+    "template.window": Case(3, MOVING, MOVED),
+    "template.weights": Case("per-node", MOVING, MOVED),
+    "template.dense": Case(True, MOVING, MOVED),
+    "template.width": Case(5, MOVING, MOVED),
+    "template.blocks": Case(2, MOVING, MOVED),
+}
+CASES = {"ash": OF_BOTH | OF_ASH, "ddc": OF_BOTH | OF_THE_MESH}
+
+
+@pytest.mark.parametrize(("method", "name"), [(method, name) for method in CASES for name in CASES[method]])
+def test_a_field_changes_what_it_names_and_nothing_else(method: str, name: str, apart: Apart) -> None:
+    case = CASES[method][name]
+    assert differing(apart(method, case.on), apart(method, {**case.on, name: case.value})) == case.parts
+
+
+@pytest.mark.parametrize("on", [PLANTED, FROM_IMAGES, NETS], ids=["planted", "images", "nets"])
+def test_the_mesh_stands_on_the_template_that_ash_gets(on: Changes, apart: Apart) -> None:
+    """Whichever field of the template has another value than by default."""
+    splats, mesh = apart("ash", on), apart("ddc", on)
+    assert all(splats[part] == mesh[part] for part in ("template", "skinning", "deformation", "textures"))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_search_decides_what_candidates_differ_in_and_nothing_else(
+    method: str, capture: Capture, tmp_path: Path, apart: Apart, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever its candidates learned before, the avatar is the one whose configuration says that size."""
+    monkeypatch.setattr(searching, "SEARCH_STEPS", 1)
+    monkeypatch.setattr(searching, "FADES", (0.5,))
+    monkeypatch.setattr(searching, "smallest_sufficient", lambda tried: tried[-1])
+    config = METHODS[method].config("ci")
+    searched = replaced(config, {"search": True}, of=method)
+    avatar = METHODS[method](capture.training_only(), seed=0, preset="ci", config=searched)
+    sized = at_size(config, avatar.choice.candidate, avatar.choice.fade)
+    made = taken_apart(avatar, capture, tmp_path)
+    assert not differing(made, apart(method, dict(changed(config, sized))))
+    assert {*DECODERS, "noise"} <= differing(made, apart(method, {}))
+
+
+ELSEWHERE = {
+    "ash": {
+        "model.offset_unit_m": ("ash/test_presets.py", "test_the_offsets_unit_scales_the_offset_alone"),
+        "training.fitted_every": ("ash/training/test_warm_up.py", "test_every_so_manyth_frame_is_fitted_and_no_other"),
+        "training.fitted_steps": ("ash/training/test_warm_up.py", "test_a_fit_ends_where_nothing_is_gained"),
+        "device": ("ash/test_devices.py", "test_a_training_step_stays_on_its_device"),
+    },
+    "ddc": {"device": ("baselines/test_baseline_devices.py", "test_a_training_step_stays_on_its_device")},
+}
+OF_THE_TEMPLATE = (
+    "kind",
+    "error_mm",
+    "error_static",
+    "error_lag",
+    "supervision",
+    "passes",
+    "network",
+    "skinning",
+    "steps",
+)
+HERE: dict[str, dict[str, Callable[..., None]]] = {
+    "ash": {"search": test_a_search_decides_what_candidates_differ_in_and_nothing_else},
+    "ddc": {
+        "search": test_a_search_decides_what_candidates_differ_in_and_nothing_else,
+        **{f"template.{name}": test_the_mesh_stands_on_the_template_that_ash_gets for name in OF_THE_TEMPLATE},
+    },
+}
+ROWS_OF_ASH = [
+    *(row.changes for row in SWITCHES.values()),
+    *(changed(presets.ci(), offered(name, "ci")) for name in CHANGED_BY_ROW if not name.startswith("ddc")),
+]
+BY_A_ROW = {"ash": {key for changes in ROWS_OF_ASH for key, _ in changes if len(changes) == 1}, "ddc": set[str]()}
+
+
+def all_fields(whole: type, **parts: type) -> list[str]:
+    """The dotted keys of a configuration."""
+    own = [one.name for one in fields(whole) if one.name not in parts]  # type: ignore[arg-type]
+    return own + [f"{part}.{one.name}" for part, kind in parts.items() for one in fields(kind)]  # type: ignore[arg-type]
+
+
+FIELDS = {
+    "ash": all_fields(AshConfig, model=ModelConfig, training=TrainingConfig, template=TemplateConfig),
+    "ddc": all_fields(DdcConfig, model=AtlasConfig, training=TrainingConfig, template=TemplateConfig),
+}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_field_is_tested_once(method: str) -> None:
+    tested = [*CASES[method], *BY_A_ROW[method], *ELSEWHERE[method], *HERE[method]]
+    assert sorted(tested) == sorted(FIELDS[method])
+
+
+@pytest.mark.parametrize(("file", "name"), sorted(place for places in ELSEWHERE.values() for place in places.values()))
+def test_what_is_tested_elsewhere_is_there(file: str, name: str) -> None:
+    spec = spec_from_file_location(name, Path(__file__).parents[1] / file)
+    assert spec is not None and spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert callable(getattr(module, name))

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from helpers.captures import tiny_preset, write_tube_capture
 
 from ash import presets
@@ -13,6 +14,7 @@ from ash.capture.dataset import Capture, Pose
 from ash.config import TemplateConfig
 from ash.protocol import StageClock
 from baselines import switches
+from baselines.mlp import mlp
 from benchmarks.cell.methods import ORACLES, configured, find_method, is_oracle
 from benchmarks.suites.files import find_suite
 from benchmarks.suites.suites import MethodSpec
@@ -78,6 +80,24 @@ def require_a_way(avatar: AshAvatar, unlearned: bool, capture: Capture, folder: 
     avatar.fit(capture, folder=folder)
     assert np.isfinite(avatar.render(Pose(capture.motion, 3), capture.cameras["cam0"], clock=StageClock())).all()
     assert (avatar.config.template, avatar.config.model.refine) != (TemplateConfig(kind="learned"), False)
+
+
+@pytest.mark.parametrize(("rate", "dead"), [(2e-3, False), (0.0, True)])
+def test_the_mlp_tells_frames_apart_and_learns_no_texels_beneath(
+    rate: float, dead: bool, capture: Capture, tmp_path: Path
+) -> None:
+    """All that it draws comes out of its decoder; a decoder that does not learn draws what it started from."""
+    changes = {"training.learning_rate": rate, "training.steps": 24, "training.fitted_steps": 4}
+    avatar = mlp(capture.training_only(), seed=0, preset="ci", config=mlp.but(changes).config("ci"))
+    started, learned = avatar.module.base.clone(), {id(p) for g in avatar.parameter_groups() for p in g["params"]}
+    avatar.fit(capture.training_only(), folder=tmp_path)
+    outcome = avatar.outcome()
+    assert outcome is not None and outcome.carries_nothing == dead
+    assert (outcome.correction_spread == 0) == dead
+    assert avatar.module.static is None and not avatar.module.base.requires_grad
+    assert id(avatar.module.base) not in learned and torch.equal(avatar.module.base, started)
+    assert (started == started[0]).all(), "grey texels, all alike"
+    assert {id(p) for p in avatar.module.decoders.parameters()} <= learned
 
 
 def test_the_suites_have_them_as_rows() -> None:

@@ -7,9 +7,10 @@ import torch
 from helpers.captures import tube_model_config
 from helpers.figures import tube_mesh, tube_motion, tube_skeleton
 
-from ash.capture.dataset import Pose
+from ash.capture.dataset import Motion, Pose
+from ash.gaussians import texels
 from ash.gaussians.gaussians import Gaussians, raw_channels
-from ash.gaussians.texels import place, place_naive, pose, pose_naive
+from ash.gaussians.texels import Placed, place, place_naive, pose, pose_naive
 from ash.rotations import RigidTransforms
 from ash.template.template import PosedTemplate, RestDeformation, Template
 from ash.textures import Conditions, TexelLattice, build_lattice
@@ -19,8 +20,8 @@ pytestmark = pytest.mark.usefixtures("instructions")
 LATTICE = build_lattice(tube_mesh(), 70)  # 3,969 texels: two ranges, and no multiple of any vector's width
 
 
-def posed_tube(frame: int = 4) -> PosedTemplate:
-    return Template(tube_mesh(), tube_skeleton(), RestDeformation(tube_mesh())).pose(Pose(tube_motion(), frame))
+def posed_tube(motion: Motion | None = None) -> PosedTemplate:
+    return Template(tube_mesh(), tube_skeleton(), RestDeformation(tube_mesh())).pose(Pose(motion or tube_motion(), 4))
 
 
 def conditions(lattice: TexelLattice = LATTICE) -> Conditions:
@@ -52,6 +53,35 @@ def test_texels_are_placed_as_defined():
         torch.testing.assert_close(normals, expected_normals, atol=2e-6, rtol=0)
         torch.testing.assert_close(transforms.quats, expected.quats, atol=1e-6, rtol=0)
         torch.testing.assert_close(transforms.translations, expected.translations, atol=2e-6, rtol=0)
+
+
+def bent(angle: float) -> Motion:
+    """The tube's motion, the joint in its middle bent by so many radians."""
+    motion = tube_motion()
+    motion.dofs[:, 6:9] = (angle, 0.0, 0.0)
+    return motion
+
+
+def farthest_from_the_triangles(posed: PosedTemplate, placed: Placed) -> float:
+    """How far the posed texels lie from where the mesh has them on its posed triangles, metres."""
+    canonical, _, transforms = placed
+    corners = posed.vertices[LATTICE.corners].double()
+    on_triangles = (LATTICE.barycentric.double()[..., None] * corners).sum(1)
+    return float((transforms.apply(canonical) - on_triangles).norm(dim=1).max())
+
+
+@pytest.mark.parametrize("angle", [0.3, 1.5, 2.5])
+def test_anchored_at_the_surface_texels_lie_on_the_posed_triangles(angle, monkeypatch):
+    """Also where a joint is bent far; with blended transforms they do not."""
+    posed = posed_tube(bent(angle))
+    naive = {anchor: place_naive(LATTICE, posed, anchor) for anchor in ("surface", "blended")}
+    monkeypatch.setattr(texels, "place_naive", pytest.fail)
+    native = {anchor: place(LATTICE, posed, anchor) for anchor in ("surface", "blended")}
+    for placed in (naive, native):
+        assert farthest_from_the_triangles(posed, placed["surface"]) < 1e-5
+        assert farthest_from_the_triangles(posed, placed["blended"]) > 1e-4
+        assert torch.equal(placed["surface"][0], placed["blended"][0])
+        assert torch.equal(placed["surface"][2].quats, placed["blended"][2].quats), "moved, not turned"
 
 
 def test_opposite_quaternions_of_neighbours_are_the_same_rotation():
