@@ -3,16 +3,17 @@
 import math
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ash.avatar import AshAvatar
-from ash.capture.dataset import Camera, Capture, Pose
+from ash.capture.dataset import Camera, Capture, Motion, Pose
 from ash.capture.formats import load_capture
 from ash.config import AshConfig
 from ash.devices import CPU, finish, moved
@@ -20,7 +21,7 @@ from ash.files import write_json
 from ash.gaussians.splatting import Splatted, splat_naive
 from ash.gaussians.texels import place_naive, pose_naive
 from ash.inference import Player, psnr
-from ash.model import AshModel, views_of
+from ash.model import AshModel, image_of, mixed, views_of
 from ash.presets import named
 from ash.protocol import StageClock
 from ash.training.adam import Adam
@@ -29,6 +30,8 @@ from ash.training.images import load_training_images
 from ash.training.loop import draw_training_step
 from ash.training.losses import l1_ssim_loss, l1_ssim_loss_naive, ssim_target
 from benchmarks.speed.rows import SpeedRow, as_json, row_of
+
+Samples = dict[tuple[str, int], list[float]]  # milliseconds, by stage or "frame", and threads
 
 STAGES = ("stg1", "stg2", "stg3", "stg4")
 # ASH, appendix "Runtime Analysis": milliseconds on an A100 at 1285x940, by texels per side.
@@ -65,6 +68,15 @@ def subjects() -> tuple[TimedAvatar, ...]:
     return (*small, frugal, TimedAvatar(name="paper", config=named("paper"), width=1285, height=940))
 
 
+@runtime_checkable
+class Agreement(Protocol):
+    """How far the images that are played are from those by the definitions; its fields are those of the JSON."""
+
+    def told(self) -> str:
+        """In one line."""
+        ...
+
+
 @dataclass(frozen=True, kw_only=True)
 class PictureAgreement:
     """How far the image that is played is from the one by the definitions, which the avatar was trained against."""
@@ -73,6 +85,11 @@ class PictureAgreement:
     gaussians: int
     psnr_db: float
     engine: str  # of the decoders, on one thread
+
+    def told(self) -> str:
+        """In one line."""
+        about = f"{self.gaussians:,} Gaussians, decoders in {self.engine}"
+        return f"{self.preset}: {about}; agrees with the definitions to {self.psnr_db:.1f} dB"
 
 
 def speed_frame(
@@ -98,17 +115,22 @@ def speed_frame(
             avatar = AshAvatar(replace(config, template=replace(config.template, steps=1)), capture)
             _wake(avatar)
             camera = scaled_camera(next(iter(capture.cameras.values())), subject.width, subject.height)
-            players = {}
-            for count in threads:
-                torch.set_num_threads(count)
-                players[count] = Player(avatar, capture.motion, camera)
-            torch.set_num_threads(1)
+            players = players_of(avatar, capture.motion, camera, threads)
             yield agreement(avatar, players[threads[0]], subject.name, capture, camera)
             yield _time_frames(avatar, players, subject.name, capture, camera, rounds=few)
             if subject.trains:
                 yield _time_steps(avatar, subject.name, capture, rounds=rounds)
     finally:
         torch.set_num_threads(before)
+
+
+def players_of(avatar: AshAvatar, motion: Motion, camera: Camera, threads: tuple[int, ...]) -> dict[int, Player]:
+    """A player for each number of threads, whose engines were measured on as many."""
+    players = {}
+    for count in threads:
+        torch.set_num_threads(count)
+        players[count] = Player(avatar, motion, camera)
+    return players
 
 
 def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
@@ -130,14 +152,15 @@ def _wake(avatar: AshAvatar) -> None:
 
 
 @torch.no_grad()
-def frame_by_definition(model: AshModel, capture: Capture, frame: int, camera: Camera) -> Tensor:
-    """The image of a frame by the definitions alone, rgb `[h, w, 3]`."""
-    posed = model.template.pose(Pose(capture.motion, frame))
+def frame_by_definition(model: AshModel, pose: Pose, camera: Camera) -> np.ndarray:
+    """The image of a frame by the definitions alone, on one thread: premultiplied RGBA, float32 `[h, w, 4]`."""
+    torch.set_num_threads(1)
+    posed = model.template.pose(pose)
     canonical, normals, transforms = place_naive(model.lattice, posed, model.config.anchor)
-    conditions = replace(
-        model.conditions(Pose(capture.motion, frame)), canonical=canonical, normals=normals, transforms=transforms
-    )
-    return _splatted_by_definition(model, model.decode(conditions), conditions, [camera], None).rgb[0]
+    conditions = replace(model.conditions(pose), canonical=canonical, normals=normals, transforms=transforms)
+    shares = model.shares(model.decode(conditions), conditions)
+    drawn = [(share, _splatted_by_definition(model, raw, conditions, [camera], None)) for share, raw in shares]
+    return image_of(mixed(drawn))
 
 
 def _splatted_by_definition(
@@ -151,11 +174,41 @@ def _splatted_by_definition(
 def agreement(avatar: AshAvatar, player: Player, preset: str, capture: Capture, camera: Camera) -> PictureAgreement:
     """Foreground PSNR between the image of a frame as it is played and the one by the definitions."""
     frame = capture.splits["train"].frames[-1]
-    drawn = player.draw(frame, camera)
-    truth = frame_by_definition(avatar.module, capture, frame, camera).clamp(0, 1).cpu().numpy()
+    defined = frame_by_definition(avatar.module, Pose(capture.motion, frame), camera)
+    agrees = agreement_db(player.draw(frame, camera), defined)
     engine = player.engine.name if player.engine else "none"
-    agrees = psnr(drawn[..., :3], truth, drawn[..., 3])
     return PictureAgreement(preset=preset, gaussians=avatar.gaussian_count(), psnr_db=agrees, engine=engine)
+
+
+def agreement_db(drawn: np.ndarray, defined: np.ndarray) -> float:
+    """PSNR between two premultiplied RGBA images `[h, w, 4]` in dB, on the foreground of the one by the definitions."""
+    return psnr(drawn[..., :3], defined[..., :3], defined[..., 3])
+
+
+def timed_frame(player: Player, frame: int, camera: Camera, threads: int) -> dict[str, float]:
+    """Milliseconds of a frame's stages and of the whole, played on so many threads."""
+    torch.set_num_threads(threads)
+    clock, start = StageClock(), time.perf_counter()
+    player.draw(frame, camera, clock=clock)
+    elapsed = (time.perf_counter() - start) * 1e3
+    return {stage: clock.ms[stage] for stage in STAGES} | {"frame": elapsed}
+
+
+def frame_rows(
+    samples: Samples,
+    defined_ms: list[float],
+    name: str,
+    camera: Camera,
+    device: torch.device,
+) -> list[SpeedRow]:
+    """Rows of the frame by the definitions, then of every stage and the whole frame by threads."""
+    size = f"{camera.width}x{camera.height}"
+    reference = min(defined_ms)
+    rows = [row_of("frame", size, "forward", 1, f"{name}-naive", defined_ms, reference, device)]
+    for (what, count), taken in samples.items():
+        beside = reference if what == "frame" else math.nan
+        rows.append(row_of(what, size, "forward", count, name, taken, beside, device))
+    return rows
 
 
 def _time_frames(
@@ -165,29 +218,18 @@ def _time_frames(
     threads = tuple(players)
     frames = capture.splits["train"].frames
     start = time.perf_counter()
-    torch.set_num_threads(1)
-    frame_by_definition(avatar.module, capture, frames[0], camera)
-    finish(avatar.device)
-    naive_ms = (time.perf_counter() - start) * 1e3
-    samples: dict[tuple[str, int], list[float]] = defaultdict(list)
+    frame_by_definition(avatar.module, Pose(capture.motion, frames[0]), camera)
+    defined_ms = [(time.perf_counter() - start) * 1e3]
+    samples: Samples = defaultdict(list)
     for number in range(rounds + 1):
         for count in threads:
-            torch.set_num_threads(count)
             # Another motion frame every time, and the history of each posed already, as in playback.
             frame = frames[(1 + number * len(threads) + threads.index(count)) % len(frames)]
-            clock, start = StageClock(), time.perf_counter()
-            players[count].draw(frame, camera, clock=clock)
-            elapsed = (time.perf_counter() - start) * 1e3
+            ms = timed_frame(players[count], frame, camera, count)
             if number:
-                for stage in STAGES:
-                    samples[stage, count].append(clock.ms[stage])
-                samples["frame", count].append(elapsed)
-    size = f"{camera.width}x{camera.height}"
-    row = partial(row_of, device=avatar.device)
-    rows = [row("frame", size, "forward", 1, f"{preset}-naive", [naive_ms], naive_ms)]
-    for (what, count), taken in samples.items():
-        rows.append(row(what, size, "forward", count, preset, taken, naive_ms if what == "frame" else math.nan))
-    return rows
+                for what, taken in ms.items():
+                    samples[what, count].append(taken)
+    return frame_rows(samples, defined_ms, preset, camera, avatar.device)
 
 
 def _time_steps(avatar: AshAvatar, preset: str, capture: Capture, *, rounds: int) -> list[SpeedRow]:
@@ -257,23 +299,26 @@ def captured(folder: Path | None) -> Capture:
 
 def main(json_path: Path | None, folder: Path | None = None, device: torch.device = CPU) -> int:
     """Print the table of a capture, and write it to `json_path`; returns the exit code."""
-    capture = captured(folder)
+    return print_table(speed_frame(captured(folder), device=device), json_path, device)
+
+
+def print_table(results: Iterable[list[SpeedRow] | Agreement], json_path: Path | None, device: torch.device) -> int:
+    """Print rows and agreements as they come, and write them to `json_path`; returns the exit code."""
     print(f"device {device}")
-    print(f"{'what':10} {'size':9} {'pass':17} th {'by':12} {'min ms':>9} {'median ms':>9} {'naive/min':>9} {'1/s':>6}")
+    print(f"{'what':10} {'size':9} {'pass':17} th {'by':18} {'min ms':>9} {'median ms':>9} {'naive/min':>9} {'1/s':>6}")
     rows: list[SpeedRow] = []
-    agreements: list[PictureAgreement] = []
-    for result in speed_frame(capture, device=device):
-        if isinstance(result, PictureAgreement):
+    agreements: list[Agreement] = []
+    for result in results:
+        if not isinstance(result, list):
             agreements.append(result)
-            about = f"{result.gaussians:,} Gaussians, decoders in {result.engine}"
-            print(f"  {result.preset}: {about}; agrees with the definitions to {result.psnr_db:.1f} dB", flush=True)
+            print(f"  {result.told()}", flush=True)
             continue
         rows += result
         for row in result:
             ratio = "" if math.isnan(row.ratio) else f"{row.ratio:9.1f}"
             rate = f"{1e3 / row.median_ms:6.1f}" if row.what in ("frame", "train_step") else ""
             print(
-                f"{row.what:10} {row.size:9} {row.pass_:17} {row.threads:2} {row.candidate:12}"
+                f"{row.what:10} {row.size:9} {row.pass_:17} {row.threads:2} {row.candidate:18}"
                 f" {row.min_ms:9.2f} {row.median_ms:9.2f} {ratio:>9} {rate:>6}",
                 flush=True,
             )

@@ -12,7 +12,7 @@ from typing import Literal
 from tyro.conf import FlagCreatePairsOff, Positional
 
 from ash.files import InputError
-from benchmarks.verbs.arguments import DONE, FAILED, File, Folder
+from benchmarks.verbs.arguments import DONE, FAILED, File, Folder, Trust
 from benchmarks.verbs.devices import CPU, DeviceName, DeviceNameIfAny, chosen_device
 
 PUBLIC = (
@@ -34,13 +34,16 @@ class SpeedVerb:
     what: Positional[Literal["kernels", "frame"]]  # kernels or frame
     profile: FlagCreatePairsOff[bool] = False  # frame: the parts of a training step, of ASH and the mesh
     capture: Folder | None = None  # frame: on this capture; default: the mannequin of the suite ci
+    avatar: Folder | None = None  # frame: this trained avatar in its held-out motion; a cell, or a run with one avatar
+    trust: Trust = False  # --avatar may be of a method that is not ours: its code runs here, without isolation
     device: DeviceName = CPU  # what is timed: cpu, cuda, cuda:1, or auto
     json: File | None = None  # write the rows there as well
 
     def __call__(self) -> int:
         """Measure and print."""
-        if (self.profile or self.capture) and self.what != "frame":
-            raise InputError(f"speed: --profile and --capture go with frame, got {self.what}")
+        self._require_flags_that_go_together()
+        if self.avatar:
+            return self._measure_avatar(self.avatar)
         from ash.devices import device_named
 
         device = device_named(chosen_device(self.device))
@@ -55,6 +58,25 @@ class SpeedVerb:
         from benchmarks.speed.kernels import main as measure
 
         return measure(self.json, device)
+
+    def _require_flags_that_go_together(self) -> None:
+        if (self.profile or self.capture or self.avatar) and self.what != "frame":
+            raise InputError(f"speed: --profile, --capture and --avatar go with frame, got {self.what}")
+        if self.avatar and (self.profile or self.capture):
+            raise InputError(
+                "speed: --avatar has its capture and trains nothing: expected neither --capture nor --profile"
+            )
+        if self.trust and not self.avatar:
+            raise InputError("speed: --trust goes with --avatar")
+
+    def _measure_avatar(self, folder: Path) -> int:
+        from benchmarks.play.actors import open_cast
+        from benchmarks.speed.playback import main as measure_playback
+
+        with open_cast(folder, device=chosen_device(self.device), trust=self.trust) as cast:
+            actor = cast.only()
+            config = actor.cell.config
+            return measure_playback(actor.avatar, cast.capture, f"{config.method}:{config.preset}", self.json)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,7 @@ import subprocess
 from types import SimpleNamespace
 
 import pytest
+from helpers.commands import refused
 
 from benchmarks import cli
 from benchmarks.verbs import arguments
@@ -23,3 +24,17 @@ def test_whichever_check_fails_fails_the_whole(failing: str, monkeypatch: pytest
     assert all(f"--- {name}\n" in told for name in ("ruff check", "ruff format", "import-linter", "mypy"))
     expected = {"": "all checks passed", "ruff": "failed: ruff check, ruff format"}.get(failing, f"failed: {failing}")
     assert told.splitlines()[-1] == f"--- {expected}"
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("kernels --avatar a-cell", "--profile, --capture and --avatar go with frame, got kernels"),
+        ("frame --avatar a-cell --profile", "expected neither --capture nor --profile"),
+        ("frame --avatar a-cell --capture a-capture", "expected neither --capture nor --profile"),
+        ("frame --trust", "--trust goes with --avatar"),
+        ("frame --avatar nowhere", "nowhere/run.json: cannot be read"),
+    ],
+)
+def test_flags_of_speed_that_do_not_go_together_are_refused(command: str, message: str, capsys) -> None:
+    assert message in refused(capsys, "speed", *command.split())
