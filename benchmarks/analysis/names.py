@@ -39,6 +39,7 @@ LOOKS = {
     "cams_12": Look(title="1/10 of the cameras", colour="#a0522d"),
     "cams_30": Look(title="1/4 of the cameras", colour="#b8860b"),
     "cams_60": Look(title="1/2 of the cameras", colour="#7a869a"),
+    "ash_studio": Look(title="ASH, empty studio known", colour="#5b8c2a"),
     "ash_frugal": Look(title="ASH, frugal", colour="#2a9d8f"),
     "window_1": Look(title="window 1", colour="#008fb3"),
     "unlearned": Look(title="template only skinned", colour="#b8860b"),
@@ -79,10 +80,16 @@ def look_of(method: str) -> Look:
 
 
 def is_ours(method: str) -> bool:
-    """Whether the method comes with the suite; a user's own stand first in reports."""
-    return (method.partition(".")[0] in DECIDING_PACKAGES) if ":" in method else method in _installed_ours()
+    """Whether the method comes with the suite, installed or as a variant that has a look here.
+
+    A user's own stand first in reports.
+    """
+    if ":" in method:
+        return method.partition(".")[0] in DECIDING_PACKAGES
+    return _installed().get(method, method in LOOKS)
 
 
 @cache
-def _installed_ours() -> frozenset[str]:
-    return frozenset(name for name, method in methods().items() if method.is_ours)
+def _installed() -> dict[str, bool]:
+    """Of each installed method, whether it is ours."""
+    return {name: method.is_ours for name, method in methods().items()}

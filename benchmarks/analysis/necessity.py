@@ -107,6 +107,11 @@ class Matrix:
     parts: tuple[Part, ...]
     needs: tuple[Need, ...]
 
+    @property
+    def has_intervals(self) -> bool:
+        """Whether a cell has one; without any, nothing can be told."""
+        return any(need.verdict != "unknown" for need in self.needs)
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Dose:

@@ -22,6 +22,7 @@ NOTE = (
     f"loss of more than {necessity.MARGIN_DB} dB that is sure at 5 %, corrected over all cells (Benjamini-Hochberg). "
     "Harmful: as sure and as large a gain. Not needed: surely less is lost. One seed on one capture tells nothing."
 )
+UNTOLD = "One seed on one capture: what is needed cannot be told; --seeds 3 or --subjects 8 can."
 MANY_ROWS = 6  # from which on it is worth asking which of them would suffice
 PARAMETERS = Quantity("memory", "", "params")
 
@@ -32,14 +33,16 @@ def sections(scores: Scores) -> list[Section]:
 
 
 def _matrix_section(scores: Scores) -> list[Section]:
+    """The matrix of each split, or in words that there is none, where losses without an interval are all there is."""
     found = [matrix for split in RANKED_SPLITS if (matrix := necessity.matrix(scores, split))]
-    if not found:
-        return []
     blocks: list[Block] = []
-    for matrix in found:
-        blocks += [Chart(figure=_picture(matrix)), *_surprises(matrix)]
-    tables_ = tuple(map(_table, found))
-    return [Section(title="What each scene needs", blocks=(*blocks, *tables_, Text(text=NOTE, note=True)))]
+    if told := [matrix for matrix in found if matrix.has_intervals]:
+        for matrix in told:
+            blocks += [Chart(figure=_picture(matrix)), *_surprises(matrix)]
+        blocks += [*map(_table, told), Text(text=NOTE, note=True)]
+    elif any(need.loss for matrix in found for need in matrix.needs):
+        blocks.append(Text(text=UNTOLD))
+    return [Section(title="What each scene needs", blocks=tuple(blocks))] if blocks else []
 
 
 def _picture(matrix: Matrix) -> Figure:

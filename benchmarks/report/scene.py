@@ -90,6 +90,7 @@ def scene_report(data: SceneData) -> SceneReport:
     capture, shown, trouble = _pictured(data)
     exposed = sentences.exposed(data.results)
     notes = [Text(text=doubt, note=True) for doubt in sentences.doubts(data.results)]
+    seen = [Text(text=sentence, note=True) for sentence in sentences.views_seen(scores, scene)]
     quality = tables.build(scores, scene, _quality_quantities(), title=f"Accuracy on {scene}", exposed=exposed)
     cost = tables.build(scores, scene, tables.cost_columns(COSTS), title=f"Cost on {scene}", exposed=exposed)
     more = _more_tables(scores, scene)
@@ -100,7 +101,7 @@ def scene_report(data: SceneData) -> SceneReport:
     picture_sections, sheets = _picture_sections(data, capture, shown, trouble)
     sections = [
         Section(title=scene, headline=sentences.headline(scores, scene), blocks=tuple(_opening(data, capture))),
-        Section(title=quality.title, blocks=(_untitled(quality), Text(text=quality_note, note=True), *notes)),
+        Section(title=quality.title, blocks=(_untitled(quality), *seen, Text(text=quality_note, note=True), *notes)),
         Section(title=cost.title, blocks=(_untitled(cost), Text(text=COST_NOTE, note=True), *notes)),
         *established.sections(scores, scene, compared, beside),
         *_exact(scores, scene),

@@ -149,9 +149,8 @@ def beside_the_paper(scores: Scores, suite: str) -> list[Section]:
     blocks: list[Block] = []
     for table, agreements in paper.tables_beside(scores):
         blocks.append(_paper_table(scores, table))
-        blocks.append(
-            Bullets(items=tuple(f"Kendall's tau, {SPLIT_NAMES[a.split].title.lower()}: {a.text}" for a in agreements))
-        )
+        taus = (f"Kendall's tau, {SPLIT_NAMES[a.split].title.lower()}: {a.text}" for a in agreements)
+        blocks.append(Bullets(items=(*taus, *(row.note for row in table.rows if row.note))))
     note = (
         "The paper: captured data at 1285x940 and weeks on a GPU, PSNR of the release's convention. Ours: "
         "foreground PSNR "

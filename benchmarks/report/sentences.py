@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from benchmarks.analysis import contrasts, pareto
+from benchmarks.analysis import contrasts, paper, pareto
 from benchmarks.analysis.names import EXACT, SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Scores, foreground
 from benchmarks.cell.cells import CellResult
@@ -60,6 +60,17 @@ def remarks(scores: Scores, scene: str) -> list[str]:
     elif scores.captures(scene) == 1:
         found.append("One capture: intervals are over seeds, and say nothing about other people; --subjects 8 does.")
     return [remark for remark in found if remark]
+
+
+def views_seen(scores: Scores, scene: str) -> tuple[str, ...]:
+    """What training saw, of rows that the paper trained on a part of its views: a sentence each."""
+    found = []
+    for method in scores.methods(scene):
+        counts = [_count_seen(scores, scene, method, what) for what in ("cameras", "frames")]
+        if method in paper.SEEN and all(counts):
+            seen = ", ".join(counts)
+            found.append(f"{look_of(method).title}: training saw {seen} (paper: {paper.SEEN[method]}).")
+    return tuple(found)
 
 
 def exposed(results: Sequence[CellResult]) -> tuple[str, ...]:
@@ -178,6 +189,15 @@ def _told(scores: Scores, scene: str, what: str) -> str:
     """The methods of which a cell tells so of its training."""
     methods = scores.outcomes.query(f"scene == @scene and {what}")["method"].unique()
     return ", ".join(look_of(method).title for method in scores.methods(scene) if method in methods)
+
+
+def _count_seen(scores: Scores, scene: str, method: str, what: str) -> str:
+    """How many cameras or frames a training saw, of those that ASH's saw; empty where either is unknown."""
+    seen, whole = (scores.get(scene, name, Quantity("speed", "", f"train_{what}")) for name in (method, "ash"))
+    if seen is None or whole is None:
+        return ""
+    count = dict.fromkeys(f"{value:.0f}" for value in (seen.least, seen.greatest))  # Captures may differ.
+    return f"{' to '.join(count)} of {whole.mean:.0f} {what}"
 
 
 def _noise(scores: Scores, scene: str) -> str:

@@ -12,7 +12,8 @@ from scipy import stats
 from benchmarks.analysis.necessity import EXPECTED, Matrix, Need, Part, corrected, doses, matrix
 from benchmarks.analysis.scores import Scores, scores_of
 from benchmarks.analysis.statistics import Difference, paired
-from benchmarks.cell.cells import CellResult, Summary
+from benchmarks.cell.cells import CellResult, Summary, failed_result
+from benchmarks.cell.methods import offered
 from benchmarks.report import needs
 from benchmarks.report.content import Bullets, Chart, Section, Table, Text
 from benchmarks.suites.captures import described
@@ -157,6 +158,21 @@ def test_where_nothing_is_expected_no_frame_is_told_of() -> None:
     assert captions and not any("Framed" in caption for caption in captions)
 
 
+def test_without_an_interval_there_is_no_matrix_but_a_sentence() -> None:
+    levels = {"ash": 27.0, "wo_mot": 26.0}
+    single = people("still", levels, dither=(0.0,)) + people("swing", levels, dither=(0.0,))
+    (section,) = needs.sections(scores_of(single))
+    (told,) = section.blocks
+    words = "One seed on one capture: what is needed cannot be told; --seeds 3 or --subjects 8 can."
+    assert section.title == "What each scene needs" and told == Text(text=words)
+    one_interval = people("still", levels) + people("swing", levels, dither=(0.0,))
+    assert len(blocks_of(needs.sections(scores_of(one_interval)), Chart)) == 2
+    rivals = people("still", {"ash": 27.0, "ddc": 26.0}, dither=(0.0,)) + people("swing", levels, dither=(0.0,))[:1]
+    assert needs.sections(scores_of(rivals)) == [], "no part to judge"
+    fallen = [failed_result(r.config, "crashed", "") if r.config.method == "wo_mot" else r for r in single]
+    assert needs.sections(scores_of(fallen)) == [], "no loss to judge"
+
+
 def test_the_report_tells_surprises_and_doses_in_words(ladder: Scores) -> None:
     sections = needs.sections(ladder)
     said = [item for bullets in blocks_of(sections, Bullets) for item in bullets.items]
@@ -211,3 +227,9 @@ def test_the_ladder_has_a_row_for_every_expected_part_and_doses_of_known_strengt
             expected = rung(of, size="rung", strength=strength)
             assert replace(captures[f"{of}{ending}"], name=of) == expected
     assert {f"{of}_half" for of in RUNGS} <= set(captures)
+
+
+def test_the_ladders_mlp_is_ash_but_for_its_decoders() -> None:
+    suite = find_suite("ladder")
+    (mlp,) = [row for row in suite.methods if "mlp" in row.name]
+    assert not mlp.changes and offered(mlp.name, suite.preset) == offered("ash", suite.preset)

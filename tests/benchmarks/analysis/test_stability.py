@@ -16,11 +16,14 @@ from ash.files import InputError
 from benchmarks.analysis import margin, stability
 from benchmarks.analysis.scores import scores_of
 from benchmarks.cell.cells import CellResult, failed_result
+from benchmarks.cell.methods import configured, offered
 from benchmarks.report import sections, vega
 from benchmarks.report.charts import _number_axis
 from benchmarks.report.content import Chart, Table
 from benchmarks.suites import captures
+from benchmarks.suites.dry_run import estimate
 from benchmarks.suites.files import find_suite
+from benchmarks.suites.runs import RunOptions
 from benchmarks.suites.stress import AXES, FOOTAGE_FRAMES, Stress
 from benchmarks.suites.suites import CaptureSpec
 
@@ -140,6 +143,33 @@ def test_charts_are_svg_with_a_mark_where_a_method_breaks() -> None:
         assert drawn.tag.endswith("svg") and len(crosses) == 1
     breakdowns = next(block for block in section.blocks if isinstance(block, Table))
     assert breakdowns.rows[0].entries[0].text == "50 (19.0 dB lost at worst)"
+
+
+def test_ash_that_knows_the_empty_studio_stands_beside_ash() -> None:
+    """A variant of a suite's file: named and placed as one of ours, and broken by itself."""
+    results = [cell("nearest", 10.0)]
+    for method, worst in {"ash": 12.0, "ash_studio": 29.0}.items():
+        results += [cell(method, 30.0), cell(method, worst, axis="mask_grown", severity=8.0)]
+    (section,) = sections.stabilities(scores_of(results))
+    breakdowns, reliability = (block for block in section.blocks if isinstance(block, Table))
+    assert [column.title for column in breakdowns.columns] == ["ASH", "ASH, empty studio known"]
+    assert [entry.text for entry in breakdowns.rows[0].entries] == [
+        "8 (18.0 dB lost at worst)",
+        "none (1.0 dB lost at worst)",
+    ]
+    assert "ASH, empty studio known" in [row.name for row in reliability.rows]
+    mine = scores_of([*results, cell("mine", 20.0)])
+    assert mine.methods("loose") == ("mine", "nearest", "ash", "ash_studio"), "a user's own first"
+
+
+def test_the_studio_is_all_that_the_row_knows_more_and_a_dry_run_counts_it(tmp_path: Path) -> None:
+    suite = find_suite("stability")
+    (row,) = [row for row in suite.methods if row.name == "ash_studio"]
+    plain = offered("ash", suite.preset)
+    studio = replace(plain, training=replace(plain.training, background="studio"))
+    assert configured(row.of, suite.preset, row.changes) == studio != plain
+    told = estimate(suite, RunOptions(out=tmp_path, data=tmp_path, workers=1))
+    assert told.count("· ash_studio:ci ·") == told.count("· ash:ci ·") == len(suite.captures) * suite.seeds
 
 
 @pytest.mark.parametrize("stress", [("cameras", 0.0), ("weather", 1.0), ("frames", float("inf"))])

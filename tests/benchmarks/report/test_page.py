@@ -20,8 +20,11 @@ from benchmarks.analysis.scores import Quantity, scores_of
 from benchmarks.cell.cells import CellResult, Summary, failed_result
 from benchmarks.cell.metrics import PROTOCOL
 from benchmarks.report import sentences, tables
+from benchmarks.report.content import Text
 from benchmarks.report.figures import speed_figure
 from benchmarks.report.page import publish, write_report
+from benchmarks.report.pictures import Album
+from benchmarks.report.scene import SceneData, scene_report
 from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells
 from benchmarks.suites.progress import Progress
 from benchmarks.suites.runs import Run, cell_for, read_run, write_run
@@ -272,6 +275,36 @@ def test_a_report_says_what_each_rows_template_was_learned_from() -> None:
     results = [on("ash", images), on("ash", images, 1), on("ddc", images), on("by_scans", scans), on("static", "")]
     remarks = sentences.remarks(scores_of(results), "loose")
     assert f"Templates: {images} (ASH, DDC); {scans} (by_scans)." in remarks
+
+
+def test_the_main_table_is_followed_by_what_training_saw_of_the_views() -> None:
+    def on(method: str, cameras: int, frames: int, subject: int = 0) -> CellResult:
+        found = scored(method, view=27.0, pose=20.0)
+        seen = {"train_cameras": cameras, "train_frames": frames}
+        rows = tuple(Summary(split="speed", region="", metric=name, value=float(count)) for name, count in seen.items())
+        own = replace(found.config, subject=subject)
+        return replace(found, config=own, summary=(*found.summary, *rows))
+
+    results = [on("ash", 20, 104), on("ash", 20, 104, 1), on("ddc", 20, 104), on("cams_12", 2, 37)]
+    results += [on("cams_60", 10, 97), on("cams_60", 10, 98, 1), on("wo_mot_truncated", 20, 4)]
+    results += [scored("cams_30", view=27.0, pose=20.0)]
+    data = SceneData(
+        run=Run(folder=Path("gone"), suite="t", about="", command="", cells=()),
+        scores=scores_of(results),
+        results=tuple(results),
+        scene="loose",
+        album=Album(),
+        room=0,
+        worst_frames=1,
+    )
+    main = next(section for section in scene_report(data).sections if section.title == "Accuracy on loose")
+    told = [block.text for block in main.blocks[1:] if isinstance(block, Text) and "training saw" in block.text]
+    assert told == [
+        "1/10 of the cameras: training saw 2 of 20 cameras, 37 of 104 frames (paper: 12 of 120 cameras).",
+        "1/2 of the cameras: training saw 10 of 20 cameras, 97 to 98 of 104 frames (paper: 60 of 120 cameras).",
+        "w/o mot., 1/27 of the frames: training saw 20 of 20 cameras, 4 of 104 frames (paper: 1,000 of 27,000 frames).",
+    ]  # Of 1/4 of the cameras nothing is known.
+    assert sentences.views_seen(scores_of([scored("ash", view=27.0, pose=20.0), on("cams_12", 2, 37)]), "loose") == ()
 
 
 @pytest.fixture(params=[(DESKTOP, "light"), (DESKTOP, "dark"), (PHONE, "light"), (PHONE, "dark")], ids=str)
