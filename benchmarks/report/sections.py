@@ -16,6 +16,7 @@ from benchmarks.report.tables import entry_of
 from benchmarks.report.vega import Figure, Series
 
 WHISKERS = "Whiskers: 95 % interval over seeds, or over captures where there are several."
+KEPT = "Avatars kept on the way, at learning rates that fall only at the end."
 
 
 def margins(scores: Scores) -> list[Section]:
@@ -73,7 +74,8 @@ def spent(results: Sequence[CellResult]) -> list[Section]:
     """Quality against training seconds and against training frames, where a suite made them."""
     found = []
     if len(table := anytime.curves(results)):
-        figure = _spent_figure(table, "budget", "Accuracy against training seconds", "seconds", "seconds of training")
+        title = "Accuracy against training seconds"
+        figure = _spent_figure(table, "budget", title, "seconds", "seconds of training", KEPT)
         found.append((figure, anytime.sentences(table)))
     if len(table := footage.curves(results)):
         title = "Held-out motion against the number of training frames"
@@ -113,7 +115,7 @@ def novelties(scores: Scores) -> list[Section]:
     return [Section(title=figure.title, blocks=(_chart(figure), Bullets(items=tuple(novelty.sentences(table)))))]
 
 
-def _spent_figure(table: pd.DataFrame, name: str, title: str, spent: str, x_title: str) -> Figure:
+def _spent_figure(table: pd.DataFrame, name: str, title: str, spent: str, x_title: str, told: str = "") -> Figure:
     """A panel per scene and split: a line with intervals per method, over the logarithm of what was spent."""
     methods = list(table["method"].unique())
     looks = vega.series_of(methods)
@@ -131,7 +133,7 @@ def _spent_figure(table: pd.DataFrame, name: str, title: str, spent: str, x_titl
         }
     )
     panels = charts.lines(samples, looks, y="foreground PSNR [dB]", size=(390, 240), log=True)
-    caption = f"Foreground PSNR. {WHISKERS}"
+    caption = " ".join(filter(None, ("Foreground PSNR.", told, WHISKERS)))
     return Figure(name=name, title=title, caption=caption, panels=panels, series=looks)
 
 
