@@ -159,12 +159,14 @@ def lines(
 ) -> tuple[alt.LayerChart, ...]:
     """Small charts that share the scale of y: `samples` has panel, x_title, series, x, y, low, high and crossed.
 
-    x is a number, or a text whose steps stand at even distances. `rules`: panel, y, text.
+    Where it has `scale`, too, panels of one value there share theirs. x is a number, or a text whose steps stand at
+    even distances. `rules`: panel, y, text.
     """
     rules = pd.DataFrame(columns=["panel", "y", "text"]) if rules is None else rules
-    span = _domain(pd.concat([samples, rules]), ["y", "low", "high"], pad=0.05)
     panels = []
     for panel, own in samples.groupby("panel", sort=False):
+        alike = samples[samples["scale"] == own["scale"].iloc[0]] if "scale" in samples else samples
+        span = _domain(pd.concat([alike, rules]), ["y", "low", "high"], pad=0.05)
         number = pd.api.types.is_numeric_dtype(samples["x"])
         title = str(own["x_title"].iloc[0])
         at = {

@@ -123,6 +123,7 @@ def _spent_figure(table: pd.DataFrame, name: str, title: str, spent: str, x_titl
     samples = pd.DataFrame(
         {
             "panel": table["scene"] + ", " + table["split"].map(lambda split: SPLIT_NAMES[split].words),
+            "scale": table["scene"],
             "x_title": x_title,
             "series": table["method"].map(names),
             "x": table[spent].astype(float),

@@ -95,6 +95,17 @@ def test_the_sections_draw_what_was_run():
     assert spent([cell("ash", 20.0)]) == []
 
 
+def test_scenes_of_other_levels_have_scales_of_their_own_and_splits_of_a_scene_share_one():
+    results = [trained("ash", LEARNED), trained("wo_mot", STATIC)]
+    results += [replace(r, config=replace(r.config, scene="elsewhere")) for r in [trained("ash", {30: 31.0, 60: 33.0})]]
+    (section,) = spent(results)
+    chart = section.blocks[0]
+    assert isinstance(chart, Chart)
+    spans = [panel.to_dict()["layer"][1]["encoding"]["y"]["scale"]["domain"] for panel in chart.figure.panels]
+    assert len(spans) == 4 and spans[0] == spans[1] != spans[2] == spans[3]
+    assert spans[0][1] < 27 and spans[2][0] > 30
+
+
 def test_a_curve_settles_where_it_never_leaves_the_last_three_tenths_again():
     scores = {10: 20.0, 20: 24.8, 30: 24.5, 40: 24.75, 80: 25.0}
     curve = tuple(CurvePoint(seconds=float(s), loss=None, psnr=p) for s, p in scores.items())
