@@ -69,7 +69,7 @@ def subjects() -> tuple[TimedAvatar, ...]:
 
 
 @runtime_checkable
-class Agreement(Protocol):
+class AgreementLine(Protocol):
     """How far the images that are played are from those by the definitions; its fields are those of the JSON."""
 
     def told(self) -> str:
@@ -302,12 +302,12 @@ def main(json_path: Path | None, folder: Path | None = None, device: torch.devic
     return print_table(speed_frame(captured(folder), device=device), json_path, device)
 
 
-def print_table(results: Iterable[list[SpeedRow] | Agreement], json_path: Path | None, device: torch.device) -> int:
+def print_table(results: Iterable[list[SpeedRow] | AgreementLine], json_path: Path | None, device: torch.device) -> int:
     """Print rows and agreements as they come, and write them to `json_path`; returns the exit code."""
     print(f"device {device}")
     print(f"{'what':10} {'size':9} {'pass':17} th {'by':18} {'min ms':>9} {'median ms':>9} {'naive/min':>9} {'1/s':>6}")
     rows: list[SpeedRow] = []
-    agreements: list[Agreement] = []
+    agreements: list[AgreementLine] = []
     for result in results:
         if not isinstance(result, list):
             agreements.append(result)

@@ -68,7 +68,7 @@ class PlaybackAgreement:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Clip:
+class TimedClip:
     """Frames of the capture's motion to be timed, seen by one camera."""
 
     candidate: str
@@ -78,7 +78,7 @@ class Clip:
 
 
 @torch.no_grad()
-def held_out_clips(model: AshModel, capture: Capture, title: str) -> list[Clip]:
+def held_out_clips(model: AshModel, capture: Capture, title: str) -> list[TimedClip]:
     """The held-out near motion and the new motion of a capture, each at 512x512 and at the size of its images.
 
     Raises:
@@ -93,14 +93,14 @@ def held_out_clips(model: AshModel, capture: Capture, title: str) -> list[Clip]:
         own = capture.cameras[capture.splits[split].cameras[0]]
         for width, height in dict.fromkeys((SIZE, (own.width, own.height))):
             camera = scaled_camera(own, width, height)
-            clips.append(Clip(candidate=f"{title} {name}", poses=poses, trust=trust, camera=camera))
+            clips.append(TimedClip(candidate=f"{title} {name}", poses=poses, trust=trust, camera=camera))
     if not clips:
         raise InputError(f"{capture.folder}: expected held-out frames of near or new motion, and it has neither")
     return clips
 
 
 def speed_playback(
-    avatar: AshAvatar, clips: list[Clip], *, threads: tuple[int, ...] = (1, 2), rounds: int = 2
+    avatar: AshAvatar, clips: list[TimedClip], *, threads: tuple[int, ...] = (1, 2), rounds: int = 2
 ) -> Iterator[list[SpeedRow] | PlaybackAgreement]:
     """Time a trained avatar through clips of its capture's motion, each `rounds` times; yields results as they come."""
     before = torch.get_num_threads()
@@ -116,7 +116,7 @@ def speed_playback(
         torch.set_num_threads(before)
 
 
-def _timed(model: AshModel, players: dict[int, Player], clip: Clip, rounds: int) -> Samples:
+def _timed(model: AshModel, players: dict[int, Player], clip: TimedClip, rounds: int) -> Samples:
     """Milliseconds of every stage and of the whole frame, frame by frame, by all players in turns."""
     samples: Samples = defaultdict(list)
     for pose in clip.poses * rounds:
@@ -127,7 +127,7 @@ def _timed(model: AshModel, players: dict[int, Player], clip: Clip, rounds: int)
     return samples
 
 
-def _compared(avatar: AshAvatar, players: dict[int, Player], clip: Clip) -> tuple[PlaybackAgreement, list[float]]:
+def _compared(avatar: AshAvatar, players: dict[int, Player], clip: TimedClip) -> tuple[PlaybackAgreement, list[float]]:
     """How the played images agree with those by the definitions, and the milliseconds that each of the latter took."""
     defined_ms, worst = [], []
     for pose, trust in zip(clip.poses, clip.trust, strict=True):
