@@ -94,6 +94,7 @@ def novelties(scores: Scores) -> list[Section]:
     samples = pd.DataFrame(
         {
             "panel": table["scene"],
+            "scale": table["scene"],
             "x_title": "novelty of the pose [degrees]",
             "series": table["method"].map(names),
             "x": table["novelty_deg"].round(1),
