@@ -109,6 +109,30 @@ def independent(samples: Samples) -> list[float]:
     )
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Spreads:
+    """Standard deviations of a method's scores: between captures, and between the seeds of one capture.
+
+    None: unknown, of fewer than two captures, or where no capture has two seeds. Without the seeds' spread that between
+    captures holds theirs too.
+    """
+
+    captures: float | None
+    seeds: float | None
+
+
+def spreads(samples: Samples) -> Spreads:
+    """The two components of variance by analysis of variance (one way, captures at random)."""
+    repeated = [own for own in samples.values() if len(own) > 1]
+    freedom = sum(len(own) - 1 for own in repeated)
+    seeds = sum((len(own) - 1) * float(np.var(own, ddof=1)) for own in repeated) / freedom if freedom else None
+    if len(samples) < 2:
+        return Spreads(captures=None, seeds=None if seeds is None else math.sqrt(seeds))
+    means = float(np.var([np.mean(own) for own in samples.values()], ddof=1))
+    of_seeds = (seeds or 0.0) * float(np.mean([1 / len(own) for own in samples.values()]))
+    return Spreads(captures=math.sqrt(max(0.0, means - of_seeds)), seeds=None if seeds is None else math.sqrt(seeds))
+
+
 def redrawn(samples: Sequence[Samples], *, rng: np.random.Generator) -> list[float]:
     """The means of several methods when what they rest on is drawn anew.
 

@@ -17,9 +17,11 @@ from benchmarks.report.content import Report, Section
 from benchmarks.report.pictures import Album
 from benchmarks.report.scene import FEW_WORST, MANY, WORST, SceneData, SceneReport, scene_report
 from benchmarks.report.vega import Figure
+from benchmarks.suites.archive import write_archive
 from benchmarks.suites.runs import Run, results_of
 
 PUBLISHED = ("report.md", "results.csv", "tables.tex", "chart_*.svg", "pictures_*.png", "worst_*.png")
+CELLS = "cells.zip"
 PICTURE_BYTES = 10_000_000  # of all pictures that are stepped through; worst frames come on top
 LATEX_HEAD = "% Needs booktabs and colortbl, and \\definecolor{antiquebrass}{rgb}{0.98, 0.92, 0.84}\n"
 
@@ -63,20 +65,21 @@ def write_report(run: Run) -> list[str]:
     return [*_told(scores, [*findings, *novelties]), f"report: {run.folder / 'report.html'}"]
 
 
-def publish(run: Path, folder: Path) -> None:
-    """Copy what a repository should keep of a report, in place of what an earlier one left there.
+def publish(run: Run, folder: Path) -> None:
+    """Copy what a repository should keep of a report, in place of what an earlier one left there, and all its numbers.
 
     Raises:
         InputError: the report was not written.
     """
-    found = [path for pattern in PUBLISHED for path in sorted(run.glob(pattern))]
-    if not (run / PUBLISHED[0]).exists():
-        raise InputError(f"{run}: expected {PUBLISHED[0]}, which `ash-bench report` writes")
+    found = [path for pattern in PUBLISHED for path in sorted(run.folder.glob(pattern))]
+    if not (run.folder / PUBLISHED[0]).exists():
+        raise InputError(f"{run.folder}: expected {PUBLISHED[0]}, which `ash-bench report` writes")
     for pattern in PUBLISHED:
         for old in folder.glob(pattern):
             old.unlink()
     for path in found:
         write_atomic(folder / path.name, path.read_bytes())
+    write_archive(run, folder / CELLS)
 
 
 def figures_of(report: Report) -> Iterator[Figure]:

@@ -4,6 +4,7 @@ import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from ash.capture.formats import load_capture
 from ash.capture.typed import from_json
@@ -121,14 +122,18 @@ def cell_for(spec: CellSpec, capture_folder: Path, out: Path) -> Cell:
 
 def write_run(run: Run) -> None:
     """Write `run.json`: the whole matrix, also the cells that other shards will fill."""
-    content = {
+    write_json(run.folder / RUN_FILE, description_of(run))
+
+
+def description_of(run: Run) -> dict[str, Any]:
+    """What `run.json` says of a run."""
+    return {
         "protocol": PROTOCOL,
         "suite": run.suite,
         "about": run.about,
         "command": run.command,
         "cells": [cell.config.key for cell in run.cells],
     }
-    write_json(run.folder / RUN_FILE, content)
 
 
 def read_run(folder: Path) -> Run:

@@ -141,11 +141,15 @@ def run_and_report(suite: "Suite", options: "RunOptions") -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class ReportVerb:
-    """Write a report: of a run again, or of any cells and runs together."""
+    """Write a report: of a run again, or of any cells and runs together.
+
+    What --publish leaves holds cells.zip, every number of every cell. Unpacked, that is a run for `report` and
+    `compare`: `unzip reports/quick/cells.zip -d runs/earlier`.
+    """
 
     runs: Positional[tuple[Path, ...]]  # folders of runs or of single cells
     out: Folder | None = None  # where the report goes; default: the run's own folder, for several runs/report
-    publish: Folder | None = None  # copy all of it but the page there, to be committed
+    publish: Folder | None = None  # copy it there, to be committed: all but the page, and every cell's numbers
 
     def __call__(self) -> int:
         """Write it, and copy it where that is asked for."""
@@ -161,7 +165,7 @@ class ReportVerb:
         if self.publish is not None:
             from benchmarks.report.page import publish
 
-            publish(run.folder, self.publish)
+            publish(run, self.publish)
         return code
 
 

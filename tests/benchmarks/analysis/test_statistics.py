@@ -13,6 +13,7 @@ from benchmarks.analysis.statistics import (
     noncentrality,
     paired,
     redrawn,
+    spreads,
     welch,
     wilson,
 )
@@ -178,3 +179,20 @@ def test_evidence_is_drawn_anew_by_captures_for_all_methods_alike() -> None:
     assert {a == b for a, b in seeds} == {True, False}, "seeds of two methods have nothing to do with each other"
     with pytest.raises(ValueError, match="a capture in common"):
         redrawn([{"x": [1.0]}, {"y": [1.0]}], rng=rng)
+
+
+def test_spreads_finds_what_varies_between_captures_and_what_between_seeds() -> None:
+    rng = np.random.default_rng(0)
+    people = rng.normal(25.0, 1.5, 2000)
+    samples = {f"{k}": list(rng.normal(person, 0.4, 1 + k % 3)) for k, person in enumerate(people)}
+    found = spreads(samples)
+    assert found.captures == pytest.approx(1.5, rel=0.05)
+    assert found.seeds == pytest.approx(0.4, rel=0.05)
+
+
+def test_spreads_says_what_it_cannot_know() -> None:
+    single = spreads({"a": [25.0], "b": [27.0]})
+    assert (single.captures, single.seeds) == (pytest.approx(2**0.5), None)
+    one = spreads({"a": [25.0, 27.0]})
+    assert (one.captures, one.seeds) == (None, pytest.approx(2**0.5))
+    assert spreads({"a": [25.0, 29.0], "b": [26.0, 28.0]}).captures == 0.0

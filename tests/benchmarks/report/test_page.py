@@ -27,7 +27,7 @@ from benchmarks.report.pictures import Album
 from benchmarks.report.scene import SceneData, scene_report
 from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells
 from benchmarks.suites.progress import Progress
-from benchmarks.suites.runs import Run, cell_for, read_run, write_run
+from benchmarks.suites.runs import Run, cell_for, read_run, results_of, write_run
 from benchmarks.suites.suites import CaptureSpec, CellSpec
 from benchmarks.verbs import arguments
 
@@ -231,8 +231,22 @@ def test_a_published_report_replaces_the_one_before_and_leaves_the_rest_alone(ru
     assert "chart_gone.svg" not in there and "report.html" not in there
     assert (place / "report.md").read_bytes() == (run.folder / "report.md").read_bytes()
     with pytest.raises(InputError, match=r"expected report\.md"):
-        publish(tmp_path, place)
+        publish(replace(run, folder=tmp_path), place)
     assert (place / "report.md").exists()
+
+
+def test_the_numbers_that_are_published_are_a_run_again(run: Run, tmp_path: Path) -> None:
+    publish(run, tmp_path / "here")
+    publish(run, tmp_path / "there")
+    archive = tmp_path / "here" / "cells.zip"
+    assert archive.read_bytes() == (tmp_path / "there" / "cells.zip").read_bytes()
+    again = tmp_path / "again"
+    shutil.unpack_archive(archive, again)
+    assert not any(str(run.folder.parent) in path.read_text() for path in again.rglob("config.json"))
+    assert results_of(read_run(again)) == results_of(run)
+    cli.main(["report", str(again)])
+    assert (again / "results.csv").read_bytes() == (run.folder / "results.csv").read_bytes()
+    assert "No pictures" in (again / "report.md").read_text()
 
 
 def test_an_interval_that_reaches_below_zero_gives_way_to_the_range() -> None:
