@@ -50,7 +50,7 @@ class Actor:
         """Premultiplied RGBA, float32 `[h, w, 4]`."""
         if not isinstance(self.avatar, PosesGaussians):
             return self.avatar.render(pose, camera, clock=clock)
-        shared = self.gaussians(pose, clock)
+        shared = self.shared_gaussians(pose, clock)
         with clock.stage("stg4"):
             return image_of(self._splat(shared, camera, None))
 
@@ -59,7 +59,7 @@ class Actor:
         """The picture over a colour, uint8 `[h, w, 3]`: what is shown, at less cost than what is scored."""
         if not isinstance(self.avatar, PosesGaussians):
             return on_colour(self.picture(pose, camera, clock), behind)
-        shared = self.gaussians(pose, clock)
+        shared = self.shared_gaussians(pose, clock)
         with clock.stage("stg4"):
             return self._over(shared, camera, behind)
 
@@ -74,12 +74,12 @@ class Actor:
             raise InputError(f"{self.title} has no Gaussians to show as ellipsoids")
         shown = [
             (share, replace(full, scales=THIN * full.scales, opacities=(full.opacities > 0.1).float()))
-            for share, full in self.gaussians(pose, clock)
+            for share, full in self.shared_gaussians(pose, clock)
         ]
         with clock.stage("stg4"):
             return self._over(shown, camera, behind)
 
-    def gaussians(self, pose: Pose, clock: StageClock) -> Shared:
+    def shared_gaussians(self, pose: Pose, clock: StageClock) -> Shared:
         """The posed Gaussians of an avatar that has any."""
         assert isinstance(self.avatar, PosesGaussians)
         key = (pose.motion.dofs[pose.window(8)].tobytes(), pose.frame)

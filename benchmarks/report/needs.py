@@ -10,6 +10,7 @@ from benchmarks.analysis import contrasts, necessity, pareto
 from benchmarks.analysis.names import SPLIT_NAMES, look_of
 from benchmarks.analysis.necessity import Dose, Matrix, Need
 from benchmarks.analysis.scores import RANKED_SPLITS, Quantity, Scores
+from benchmarks.analysis.statistics import Difference
 from benchmarks.cell.metrics import METRICS
 from benchmarks.report import charts, tables, vega
 from benchmarks.report.content import Block, Bullets, Chart, Entry, Head, Mark, Row, Section, Table, Text
@@ -156,9 +157,15 @@ def _dose_figure(found: Sequence[Dose], split: str) -> Figure:
 
 
 def _dose_sentence(dose: Dose) -> str:
-    course = ", ".join(f"{loss.mean:+z.2f} dB at {strength:g}" for strength, loss in dose.losses)
+    course = ", ".join(f"{_loss(loss)} at {strength:g}" for strength, loss in dose.losses)
     rises = "rises" if dose.rises else "does not rise"
     return f"{dose.scene}, {dose.part.title}: {course}; it {rises} with every dose."
+
+
+def _loss(loss: Difference) -> str:
+    """A loss with its interval, where one is known."""
+    interval = "" if math.isnan(loss.low) else f" [{loss.low:+z.2f}, {loss.high:+z.2f}]"
+    return f"{loss.mean:+z.2f} dB{interval}"
 
 
 def _sufficient_section(scores: Scores) -> list[Section]:

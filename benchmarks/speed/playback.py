@@ -40,31 +40,24 @@ SIZE = (512, 512)  # Besides that of the capture's own images.
 
 @dataclass(frozen=True, kw_only=True)
 class PlaybackAgreement:
-    """How far played images are from those by the definitions, in the frames in which decoders count.
-
-    Where the decoders are not trusted (`ash.textures.TextureDrawer.trust` is 0) a picture is the static avatar's, and
-    every engine agrees. An avatar without decoders is compared in all frames.
-    """
+    """How far played images are from those by the definitions."""
 
     candidate: str
     size: str
     gaussians: int
     engines: tuple[str, ...]  # of the decoders, by threads, fewest first; none without decoders
-    frames: int  # timed
-    compared: int  # of them
-    least_trust: float | None  # in the frames that are compared, 0..1; None: no frame is
-    least_db: float | None  # foreground PSNR of the worst frame on any number of threads
-    median_db: float | None  # over the frames
+    frames: int
+    least_trust: float  # 0..1, the least share of a picture that is decoded
+    least_db: float  # foreground PSNR of the worst frame on any number of threads
+    median_db: float  # over the frames
 
     def told(self) -> str:
         """In one line."""
         decoders = f"decoders in {' and '.join(dict.fromkeys(self.engines))}" if self.engines else "no decoders"
         about = f"{self.candidate}, {self.size}: {self.gaussians:,} Gaussians, {decoders}"
-        if self.least_db is None:
-            return f"{about}; they are trusted in none of {self.frames} frames, so that nothing is compared"
         found = f"to {self.least_db:.1f} dB at least, {self.median_db:.1f} dB in the median"
-        where = f"in {self.compared} of {self.frames} frames, of trust {self.least_trust:.2f} or more"
-        return f"{about}; agrees with the definitions {found}, {where}"
+        where = f"of {self.frames} frames, decoded by shares of {self.least_trust:.2f} or more"
+        return f"{about}; agrees with the definitions {found} {where}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +66,7 @@ class TimedClip:
 
     candidate: str
     poses: tuple[Pose, ...]
-    trust: tuple[float, ...]  # 0..1, how much decoders count in each
+    trust: tuple[float, ...]  # 0..1, the share of each that is decoded
     camera: Camera
 
 
@@ -130,24 +123,22 @@ def _timed(model: AshModel, players: dict[int, Player], clip: TimedClip, rounds:
 def _compared(avatar: AshAvatar, players: dict[int, Player], clip: TimedClip) -> tuple[PlaybackAgreement, list[float]]:
     """How the played images agree with those by the definitions, and the milliseconds that each of the latter took."""
     defined_ms, worst = [], []
-    for pose, trust in zip(clip.poses, clip.trust, strict=True):
+    for pose in clip.poses:
         _arrive(avatar.module, pose)
         start = time.perf_counter()
         defined = frame_by_definition(avatar.module, pose, clip.camera)
         defined_ms.append((time.perf_counter() - start) * 1e3)
-        if trust > 0:
-            drawn = (player.draw(pose.frame, clip.camera) for player in players.values())
-            worst.append(min(agreement_db(image, defined) for image in drawn))
+        drawn = (player.draw(pose.frame, clip.camera) for player in players.values())
+        worst.append(min(agreement_db(image, defined) for image in drawn))
     found = PlaybackAgreement(
         candidate=clip.candidate,
         size=f"{clip.camera.width}x{clip.camera.height}",
         gaussians=avatar.gaussian_count(),
         engines=tuple(player.engine.name for player in players.values() if player.engine),
         frames=len(clip.poses),
-        compared=len(worst),
-        least_trust=min((trust for trust in clip.trust if trust > 0), default=None),
-        least_db=min(worst, default=None),
-        median_db=statistics.median(worst) if worst else None,
+        least_trust=min(clip.trust),
+        least_db=min(worst),
+        median_db=statistics.median(worst),
     )
     return found, defined_ms
 
