@@ -45,7 +45,7 @@ def speed(
             _whiskers(seen, at, series),
             seen.transform_filter("datum.ringed").mark_point(size=330, filled=False, color=INK, clip=True).encode(**at),
             seen.mark_point(size=80, opacity=1, strokeWidth=2, clip=True).encode(
-                **at, **_look(series), tooltip=tooltips(tips)
+                **at, **look(series), tooltip=tooltips(tips)
             ),
             *_labels(seen, at, own),
             _text(seen.transform_filter("isValid(datum.below)"), at, "note:N", dy=-14),
@@ -79,7 +79,7 @@ def curves(
     tips = tooltips([("series", "method", ""), ("x", x, ".3~s"), ("y", y, ".2f")])
     layers = [
         seen.mark_line(strokeWidth=1.8, clip=True).encode(**at, **_stroke(series, dashes=True)),
-        seen.mark_point(size=22, opacity=1, clip=True).encode(**at, **_look(series), tooltip=tips),
+        seen.mark_point(size=22, opacity=1, clip=True).encode(**at, **look(series), tooltip=tips),
         *([_text(last, at, "series:N", dx=9, align="left")] if named else []),
     ]
     return (layered(layers, "", size),), named
@@ -136,7 +136,7 @@ def forest(effects: pd.DataFrame, series: Sequence[Series], *, x: str) -> tuple[
             seen.mark_rule(strokeWidth=1.8, clip=True).encode(x=alt.X("start:Q"), x2="end:Q", y=y, **_stroke(series)),
             seen.transform_filter("datum.mean >= datum.left && datum.mean <= datum.right")
             .mark_point(size=60, opacity=1)
-            .encode(x=at, y=y, **_look(series), tooltip=tips),
+            .encode(x=at, y=y, **look(series), tooltip=tips),
             seen.transform_filter("datum.low < datum.left")
             .mark_point(shape="triangle-left", **arrow)
             .encode(x="left:Q", y=y, **_stroke(series)),
@@ -184,7 +184,7 @@ def lines(
             alt.Chart(inline(here)).mark_rule(strokeDash=[2, 4]).encode(y=at["y"]),
             seen.mark_line(strokeWidth=1.8, clip=True).encode(**at, **_stroke(series)),
             _whiskers(seen, at, series),
-            seen.mark_point(size=50, opacity=1, clip=True).encode(**at, **_look(series), tooltip=tips),
+            seen.mark_point(size=50, opacity=1, clip=True).encode(**at, **look(series), tooltip=tips),
             seen.transform_filter("datum.crossed")
             .mark_point(shape="M-1,-1L1,1M1,-1L-1,1", size=110, strokeWidth=2, color=INK, opacity=1)
             .encode(**at),
@@ -211,7 +211,7 @@ def frames(points: pd.DataFrame, series: Sequence[Series]) -> tuple[alt.LayerCha
     layers = [
         now.mark_rule(color=INK, strokeWidth=1.5).encode(x=at["x"]),
         shown.mark_line(strokeWidth=1.6).encode(**at, **_stroke(series, dashes=True)),
-        shown.mark_point(size=24, opacity=1).encode(**at, **_look(series), tooltip=tips),
+        shown.mark_point(size=24, opacity=1).encode(**at, **look(series), tooltip=tips),
     ]
     signals = [alt.param(name="track", value=0), alt.param(name="frame", value=0)]
     return (layered(layers, "", (WIDTH - 80, 190)).add_params(*signals),)
@@ -256,7 +256,8 @@ def _scale(channel: str, series: Sequence[Series], values: Sequence[Any]) -> Any
     return kind("series:N", scale=scale, legend=legend)
 
 
-def _look(series: Sequence[Series]) -> dict[str, Any]:
+def look(series: Sequence[Series]) -> dict[str, Any]:
+    """Fill, stroke and shape of marks, by the column `series`."""
     return {
         "fill": _scale("fill", series, [PAPER if s.hollow else s.colour for s in series]),
         "stroke": _scale("stroke", series, [s.colour for s in series]),

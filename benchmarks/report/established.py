@@ -1,14 +1,12 @@
 """Which differences between ASH and the other methods are established, and which a run of its size could have found."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 from benchmarks.analysis import contrasts
 from benchmarks.analysis.contrasts import Contrast
-from benchmarks.analysis.names import SPLIT_NAMES, look_of
-from benchmarks.analysis.scores import RANKED_SPLITS, Scores, foreground
-from benchmarks.analysis.statistics import spreads
-from benchmarks.cell.methods import is_oracle
+from benchmarks.analysis.names import SPLIT_NAMES
+from benchmarks.analysis.scores import RANKED_SPLITS, Scores
 from benchmarks.report import figures
 from benchmarks.report.content import Block, Chart, Entry, Head, Row, Section, Table, Text
 
@@ -22,11 +20,6 @@ SIGHT_NOTE = (
     "capture shows none: whatever is found on it may be its own."
 )
 
-SPREAD_NOTE = (
-    "Standard deviations of foreground PSNR: between captures (people in their outfits), and between trainings of one "
-    "capture from other seeds. n/a: no capture has two seeds, and the spread between captures holds theirs too."
-)
-
 
 def sections(scores: Scores, scene: str, found: Sequence[Contrast], beside: Sequence[Contrast] = ()) -> list[Section]:
     """The differences with their intervals, and what more captures would show; none without two seeds or captures.
@@ -38,8 +31,7 @@ def sections(scores: Scores, scene: str, found: Sequence[Contrast], beside: Sequ
     figure = figures.effects_figure(found, scene, over=scores.unit(scene))
     charted: tuple[Block, ...] = (Chart(figure=figure),) if figure else ()
     apart = (_table(scores, scene, beside, title="On near and far motion"),) if beside else ()
-    table = _table(scores, scene, found)
-    blocks = (*charted, table, *apart, Text(text=NOTE, note=True), *_sights(found), *_spreads(scores, scene))
+    blocks = (*charted, _table(scores, scene, found), *apart, Text(text=NOTE, note=True), *_sights(found))
     return [Section(title=f"Which differences are established on {scene}", blocks=blocks)]
 
 
@@ -101,30 +93,6 @@ def _sights(found: Sequence[Contrast]) -> tuple[Block, ...]:
     )
     table = Table(title="What more captures would show", corner="split", columns=heads, rows=rows)
     return table, Text(text=SIGHT_NOTE, note=True)
-
-
-def _spreads(scores: Scores, scene: str) -> tuple[Block, ...]:
-    """How far scores differ between people, and how far by chance of training; none on a single capture."""
-    if scores.captures(scene) < 2:
-        return ()
-    methods = [method for method in scores.methods(scene) if scores.whole(scene, method) and not is_oracle(method)]
-    rows = tuple(
-        Row(name=look_of(method).title, entries=tuple(_spread_entries(scores, scene, method))) for method in methods
-    )
-    heads = tuple(
-        Head(title=title, unit="dB", group=SPLIT_NAMES[split].title)
-        for split in RANKED_SPLITS
-        for title in ("between captures", "between seeds")
-    )
-    table = Table(title="How far scores spread", columns=heads, rows=rows)
-    return table, Text(text=SPREAD_NOTE, note=True)
-
-
-def _spread_entries(scores: Scores, scene: str, method: str) -> Iterator[Entry]:
-    for split in RANKED_SPLITS:
-        found = spreads(scores.samples(scene, method, foreground(split)))
-        for value in (found.captures, found.seeds):
-            yield Entry(text="n/a" if value is None else f"{value:.2f}", sort=value)
 
 
 def _sight(sight: contrasts.Sight) -> Entry:

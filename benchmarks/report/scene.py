@@ -21,7 +21,7 @@ from benchmarks.analysis.scores import (
 )
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS
-from benchmarks.report import charts, established, figures, pictures, sentences, tables, vega
+from benchmarks.report import charts, established, figures, people, pictures, sentences, tables, vega
 from benchmarks.report.content import (
     Block,
     Bullets,
@@ -104,6 +104,7 @@ def scene_report(data: SceneData) -> SceneReport:
         Section(title=quality.title, blocks=(_untitled(quality), *seen, Text(text=quality_note, note=True), *notes)),
         Section(title=cost.title, blocks=(_untitled(cost), Text(text=COST_NOTE, note=True), *notes)),
         *established.sections(scores, scene, compared, beside),
+        *people.sections(scores, scene),
         *_exact(scores, scene),
         *picture_sections,
         *_time(data),

@@ -6,7 +6,6 @@ import pandas as pd
 import pytest
 
 from ash.files import InputError
-from benchmarks.analysis.contrasts import contrasts
 from benchmarks.analysis.scores import COLUMNS, csv_of, foreground, read_csv, scores_of, tidy
 from benchmarks.cell.cells import (
     Cell,
@@ -25,7 +24,6 @@ from benchmarks.cell.cells import (
 )
 from benchmarks.cell.curves import read_curve
 from benchmarks.cell.metrics import METRICS
-from benchmarks.report import established
 from benchmarks.report.sentences import doubts
 from benchmarks.report.tables import build, quality_columns
 
@@ -114,22 +112,6 @@ def test_several_captures_of_a_scene_are_the_unit_and_their_seeds_are_averaged()
     assert list(scores.rows["capture"].unique()) == ["boxes-ci-0", "boxes-ci-0-subject1"]
     assert scores.values("boxes", "ash", foreground()) == [25.0, 28.0] and scores.captures("boxes") == 2
     assert scores.get("boxes", "ash", foreground()).seeds == 2
-
-
-def test_a_report_over_people_says_how_far_they_and_their_seeds_spread() -> None:
-    values = {"ash": ((24.0, 26.0), (27.0, 29.0)), "ddc": ((23.0, 23.5), (26.5, 27.0))}
-    results = [
-        replace(result(seed=seed, psnr=psnr), config=replace(config(method, seed), subject=subject))
-        for method, people in values.items()
-        for subject, scores in enumerate(people)
-        for seed, psnr in enumerate(scores)
-    ]
-    scores = scores_of(results)
-    (section,) = established.sections(scores, "boxes", contrasts(scores, "boxes"))
-    (table,) = (block for block in section.blocks if getattr(block, "title", "") == "How far scores spread")
-    # ASH: means 25 and 28, so a variance of 4.5, of which half of the seeds' 2 is theirs.
-    assert [row.entries[0].text for row in table.rows] == ["1.87", "2.46"]
-    assert [row.entries[1].text for row in table.rows] == ["1.41", "0.35"]
 
 
 def test_scores_are_means_with_students_interval() -> None:

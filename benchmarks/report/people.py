@@ -1,0 +1,158 @@
+"""Person by person: how far ASH is ahead on each capture, and how far scores spread between captures and seeds."""
+
+from collections.abc import Iterator, Sequence
+
+import altair as alt
+import numpy as np
+import pandas as pd
+
+from benchmarks.analysis.names import SPLIT_NAMES, is_ours, look_of
+from benchmarks.analysis.scores import RANKED_SPLITS, Scores, foreground
+from benchmarks.analysis.statistics import spreads
+from benchmarks.cell.methods import is_oracle
+from benchmarks.report import charts, vega
+from benchmarks.report.content import Block, Bullets, Chart, Entry, Head, Row, Section, Table, Text
+from benchmarks.report.vega import Figure, Series
+
+REFERENCE = "ash"
+RIVALS = ("ddc", "wo_mot")  # Of many rows, those that are shown person by person, and the user's own.
+FEW = 5
+NOTE = (
+    "Foreground PSNR. Standard deviations: between captures (people in their outfits), and between trainings of one "
+    "capture from other seeds; n/a where no capture has two seeds, and then the spread between captures holds theirs."
+)
+
+
+def sections(scores: Scores, scene: str) -> list[Section]:
+    """The differences on every capture, where a scene has several."""
+    others = _others(scores, scene)
+    if scores.captures(scene) < 2 or not others:
+        return []
+    gains = _gains(scores, scene, others)
+    blocks: tuple[Block, ...] = (
+        Chart(figure=_figure(gains, others, scene)),
+        Bullets(items=tuple(_told(gains, others))),
+        *(_table(scores, scene, gains, others, split) for split in gains["split"].unique()),
+        _spread_table(scores, scene, others),
+        Text(text=NOTE, note=True),
+    )
+    return [Section(title=f"Person by person on {scene}", blocks=blocks)]
+
+
+def _others(scores: Scores, scene: str) -> list[str]:
+    """The rows that ASH is compared with, if there is an ASH; none that failed anywhere."""
+    rows = [m for m in scores.methods(scene) if scores.whole(scene, m) and not is_oracle(m)]
+    others = [row for row in rows if row != REFERENCE] if REFERENCE in rows else []
+    return others if len(others) <= FEW else [row for row in others if row in RIVALS or not is_ours(row)][:FEW]
+
+
+def _gains(scores: Scores, scene: str, others: Sequence[str]) -> pd.DataFrame:
+    """A row per split, capture and method: the capture's name for readers, and ASH's PSNR minus the method's in dB."""
+    who = _names(scores, scene)
+    rows = []
+    for split in RANKED_SPLITS:
+        own = scores.samples(scene, REFERENCE, foreground(split))
+        for method in others:
+            rival = scores.samples(scene, method, foreground(split))
+            rows += [
+                {"split": split, "who": who[c], "capture": c, "method": method, "gain": _mean(own[c]) - _mean(rival[c])}
+                for c in own
+                if c in rival
+            ]
+    return pd.DataFrame(rows)
+
+
+def _names(scores: Scores, scene: str) -> dict[str, str]:
+    """The subject of each capture, or where one has several captures, the captures' own names."""
+    subjects = scores.clean[scores.clean["scene"] == scene].groupby("capture", sort=False)["subject"].first()
+    alone = subjects.is_unique
+    return {str(name): f"subject {subject}" if alone else str(name) for name, subject in subjects.items()}
+
+
+def _figure(gains: pd.DataFrame, others: Sequence[str], scene: str) -> Figure:
+    looks = vega.series_of(others)
+    titles = {method: look.title for method, look in zip(others, looks, strict=True)}
+    first = gains[(gains["split"] == RANKED_SPLITS[0]) & (gains["method"] == others[0])]
+    order = list(first.sort_values("gain", ascending=False)["who"])
+    points = gains.assign(series=gains["method"].map(titles), panel=[SPLIT_NAMES[s].title for s in gains["split"]])
+    return Figure(
+        name=f"people_{scene}",
+        title="Person by person",
+        caption="Foreground PSNR of ASH minus that of each method, a row per person. Right of the line ASH is ahead. "
+        f"Sorted by the lead over {looks[0].title} on {SPLIT_NAMES[RANKED_SPLITS[0]].words}.",
+        panels=_dots(points, looks, order),
+        series=looks,
+    )
+
+
+def _dots(points: pd.DataFrame, looks: Sequence[Series], order: Sequence[str]) -> tuple[alt.LayerChart, ...]:
+    """`points`: panel, who, series, gain. All panels share the scale."""
+    low, high = min(0.0, float(points["gain"].min())), max(0.0, float(points["gain"].max()))
+    room = 0.05 * (high - low)
+    axis = alt.Scale(domain=[low - room, high + room], nice=False)
+    at = {
+        "x": alt.X("gain:Q", title="ASH minus the method [dB]", scale=axis),
+        "y": alt.Y("who:N", sort=list(order), title=None, axis=alt.Axis(ticks=False, domain=False, grid=True)),
+    }
+    tips = charts.tooltips([("who", "", ""), ("series", "ASH minus", ""), ("gain", "dB", "+.2f")])
+    panels = []
+    for panel, own in points.groupby("panel", sort=False):
+        seen = alt.Chart(charts.inline(own)).transform_filter("indexof(hidden, datum.series) < 0")
+        layers = [
+            alt.Chart(charts.inline(own.head(1).assign(zero=0.0))).mark_rule().encode(x=alt.X("zero:Q")),
+            seen.mark_point(size=70, opacity=1).encode(**at, **charts.look(looks), tooltip=tips),
+        ]
+        panels.append(charts.layered(layers, str(panel), (300, 24 * len(order))))
+    return tuple(panels)
+
+
+def _told(gains: pd.DataFrame, others: Sequence[str]) -> Iterator[str]:
+    """On how many people ASH is ahead, in one sentence per split and method."""
+    for split in gains["split"].unique():
+        for method in others:
+            here = gains[(gains["split"] == split) & (gains["method"] == method)]["gain"]
+            yield (
+                f"On {SPLIT_NAMES[split].words} ASH is ahead of {look_of(method).title} on {(here > 0).sum()} of "
+                f"{len(here)} people, by {here.min():+.2f} to {here.max():+.2f} dB."
+            )
+
+
+def _table(scores: Scores, scene: str, gains: pd.DataFrame, others: Sequence[str], split: str) -> Table:
+    own = scores.samples(scene, REFERENCE, foreground(split))
+    here = gains[gains["split"] == split].set_index(["capture", "method"])["gain"]
+    rows = []
+    for capture, who in _names(scores, scene).items():
+        if capture in own:
+            values = [here.get((capture, method)) for method in others]
+            found = [Entry(text="n/a" if v is None else f"{v:+.2f}", sort=v) for v in values]
+            rows.append(Row(name=who, entries=(Entry(text=f"{_mean(own[capture]):.2f}"), *found)))
+    heads = (
+        Head(title=look_of(REFERENCE).title, unit="dB"),
+        *(Head(title=f"minus {look_of(m).title}") for m in others),
+    )
+    return Table(title=SPLIT_NAMES[split].title, corner="person", columns=heads, rows=tuple(rows))
+
+
+def _spread_table(scores: Scores, scene: str, others: Sequence[str]) -> Table:
+    """How far scores differ between people, and how far by chance of training."""
+    heads = tuple(
+        Head(title=title, unit="dB", group=SPLIT_NAMES[split].title)
+        for split in RANKED_SPLITS
+        for title in ("between captures", "between seeds")
+    )
+    rows = tuple(
+        Row(name=look_of(method).title, entries=tuple(_spread_entries(scores, scene, method)))
+        for method in (REFERENCE, *others)
+    )
+    return Table(title="How far scores spread", columns=heads, rows=rows)
+
+
+def _spread_entries(scores: Scores, scene: str, method: str) -> Iterator[Entry]:
+    for split in RANKED_SPLITS:
+        found = spreads(scores.samples(scene, method, foreground(split)))
+        for value in (found.captures, found.seeds):
+            yield Entry(text="n/a" if value is None else f"{value:.2f}", sort=value)
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values))

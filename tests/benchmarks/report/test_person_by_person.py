@@ -1,0 +1,70 @@
+"""What a report says of each person of a cast."""
+
+from dataclasses import replace
+
+from helpers.cells import config
+
+from benchmarks.analysis.scores import Scores, scores_of
+from benchmarks.cell.cells import CellResult, Summary, failed_result
+from benchmarks.report import people
+from benchmarks.report.content import Bullets, Chart, Section, Table
+
+SPLITS = ("novel_view", "novel_pose")
+PSNR = {  # on held-out views by subject and seed; one dB less on new motion
+    "ash": ((24.0, 26.0), (27.0, 29.0)),
+    "ddc": ((23.0, 23.5), (28.5, 29.0)),
+}
+
+
+def result(method: str, subject: int, seed: int, psnr: float) -> CellResult:
+    rows = [Summary(split=split, region="foreground", metric="psnr", value=psnr - k) for k, split in enumerate(SPLITS)]
+    return CellResult(config=replace(config(method, seed), subject=subject), status="done", summary=tuple(rows))
+
+
+def cast(psnr: dict[str, tuple[tuple[float, ...], ...]]) -> Scores:
+    return scores_of(
+        [
+            result(method, subject, seed, value)
+            for method, persons in psnr.items()
+            for subject, seeds in enumerate(persons)
+            for seed, value in enumerate(seeds)
+        ]
+    )
+
+
+def blocks(section: Section, kind: type) -> list:
+    return [block for block in section.blocks if isinstance(block, kind)]
+
+
+def test_every_person_has_the_lead_of_ash_and_the_cast_its_spread() -> None:
+    (section,) = people.sections(cast(PSNR), "loose")
+    views, _, spread = blocks(section, Table)
+    assert [(row.name, [e.text for e in row.entries]) for row in views.rows] == [
+        ("subject 0", ["25.00", "+1.75"]),
+        ("subject 1", ["28.00", "-0.75"]),
+    ]
+    # ASH: means 25 and 28, so a variance of 4.5, of which half of the seeds' 2 is theirs.
+    assert [[e.text for e in row.entries[:2]] for row in spread.rows] == [["1.87", "1.41"], ["3.88", "0.35"]]
+    (told,) = blocks(section, Bullets)
+    assert told.items[0] == "On held-out views ASH is ahead of DDC on 1 of 2 people, by -0.75 to +1.75 dB."
+    (chart,) = blocks(section, Chart)
+    assert chart.figure.svg().count("subject 0") >= 2, "a row in each of the two panels"
+
+
+def test_a_single_person_and_a_rival_that_failed_have_no_such_section() -> None:
+    alone = cast({method: persons[:1] for method, persons in PSNR.items()})
+    assert people.sections(alone, "loose") == []
+    fallen = [result("ash", subject, 0, 25.0) for subject in (0, 1)]
+    fallen += [replace(failed_result(replace(config("ddc", 0), subject=k), "crashed", "boom")) for k in (0, 1)]
+    assert people.sections(scores_of(fallen), "loose") == []
+
+
+def test_of_many_rows_the_rivals_and_the_users_own_are_shown() -> None:
+    rows = ("ash", "ddc", "wo_disp", "wo_offset", "wo_mot", "mlp", "res_128", "res_512", "theirs")
+    (section,) = people.sections(cast({row: ((25.0,), (26.0,)) for row in rows}), "loose")
+    assert [head.title for head in blocks(section, Table)[0].columns] == [
+        "ASH",
+        "minus theirs",
+        "minus DDC",
+        "minus w/o mot.",
+    ]
