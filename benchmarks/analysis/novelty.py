@@ -7,7 +7,7 @@ import pandas as pd
 
 from benchmarks.analysis.names import look_of
 from benchmarks.analysis.scores import HELD_OUT_SPLITS
-from benchmarks.analysis.statistics import independent, mean_interval
+from benchmarks.analysis.statistics import intervals
 
 BINS, LEAST = 5, 3  # at most so many bins of motion, of so many frames or more
 COLUMNS = ("scene", "method", "novelty_deg", "psnr", "low", "high")
@@ -17,8 +17,8 @@ def curves(images: pd.DataFrame) -> pd.DataFrame:
     """Mean foreground PSNR with its 95 % interval (NaN for one value) by bins of novelty: `COLUMNS`.
 
     `images`: see `scores.images_of`. Held-out views of training poses stand at zero degrees; the frames of all
-    held-out motion are sorted by their novelty into bins of equal number, each at its mean. Intervals are over
-    captures, or over the seeds of a single one. Scenes whose frames fill fewer than two bins have no curve.
+    held-out motion are sorted by their novelty into bins of equal number, each at its mean. Intervals are those of
+    `statistics.intervals`. Scenes whose frames fill fewer than two bins have no curve.
     """
     known = images[images["split"].isin(HELD_OUT_SPLITS) & images["novelty_deg"].notna()]
     rows = [row for scene, here in known.groupby("scene", sort=False) for row in _of_scene(str(scene), here)]
@@ -35,13 +35,15 @@ def _of_scene(scene: str, images: pd.DataFrame) -> Iterator[tuple[str, str, floa
     of_image = pd.Series(1 + np.searchsorted(edges, images["novelty_deg"], side="right"), index=images.index)
     of_image[images["split"] == "novel_view"] = 0
     places = frames["novelty_deg"].groupby(of_image[frames.index]).mean()
-    for method, own in images.groupby("method", sort=False):
-        means = own.groupby([of_image[own.index], "capture", "seed"])["psnr"].mean()
-        for place, degrees in places.items():
-            if place in means.index.get_level_values(0):
-                samples = means.loc[place].groupby("capture").agg(list).to_dict()
-                interval = mean_interval(independent(samples))
-                yield scene, str(method), float(degrees), interval.mean, interval.low, interval.high
+    means = images.groupby(["method", of_image, "capture", "seed"], sort=False)["psnr"].mean()
+    for place, degrees in places.items():
+        here = means[means.index.get_level_values(1) == place]
+        samples = {
+            str(method): own.groupby("capture").agg(list).to_dict()
+            for method, own in here.groupby("method", sort=False)
+        }
+        for method, interval in intervals(samples).items():
+            yield scene, method, float(degrees), interval.mean, interval.low, interval.high
 
 
 def sentences(table: pd.DataFrame) -> list[str]:

@@ -8,6 +8,7 @@ from benchmarks.analysis import contrasts, pareto
 from benchmarks.analysis.contrasts import Contrast
 from benchmarks.analysis.names import EXACT, SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Score, Scores, foreground
+from benchmarks.analysis.statistics import intervals
 from benchmarks.cell.methods import WRONG_BY_MM
 from benchmarks.report import charts, vega
 from benchmarks.report.vega import Figure, Series
@@ -38,13 +39,9 @@ def speed_figure(scores: Scores, scene: str) -> Figure | None:
         here = {
             m: (frame, score) for m in methods for frame, score in [_pair(scores, scene, m, split)] if frame and score
         }
+        spans = intervals({m: scores.samples(scene, m, foreground(split)) for m in here}) if here else {}
         for method, (frame, score) in here.items():
-            spread = score.half_width
-            ends = (
-                {"low": None, "high": None}
-                if spread is None
-                else {"low": score.mean - spread, "high": score.mean + spread}
-            )
+            ends = {"low": spans[method].low, "high": spans[method].high}
             ringed = sufficient is not None and sufficient.name == method
             where = {
                 "panel": panel,
@@ -88,7 +85,8 @@ def _speed_caption(*, exact: bool, over: str) -> str:
         )
     caption += " Grey staircase: the front of those that no other beats in both."
     if over:
-        caption += f" Whiskers: 95 % interval over {over}. Ringed: the smallest sufficient method."
+        apart = ", what these add to all methods taken out" if over == "captures" else ""
+        caption += f" Whiskers: 95 % interval over {over}{apart}. Ringed: the smallest sufficient method."
     return caption
 
 

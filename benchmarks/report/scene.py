@@ -137,9 +137,11 @@ def what_was_compared(data: SceneData, capture: Capture | None) -> str:
     rows = scores.clean.query("scene == @scene")
     names = [look_of(method).title for method in scores.methods(scene)]
     presets = ", ".join(dict.fromkeys(result.config.preset for result in data.results))
-    folders = ", ".join(rows["capture"].unique())
+    folders, subjects = (list(map(str, rows[name].unique())) for name in ("capture", "subject"))
+    shown = f"capture {folders[0]}" if len(folders) == 1 else f"{len(folders)} captures, {folders[0]} to {folders[-1]}"
+    who = f"subject {subjects[0]}" if len(subjects) == 1 else f"subjects {', '.join(subjects)}"
     text = f"{_count(len(names), 'method')} ({'; '.join(names)}) were trained with preset {presets} on scene {scene}"
-    text += f" (capture {folders}, subject {', '.join(map(str, rows['subject'].unique()))})"
+    text += f" ({shown}; {who})"
     if capture is not None:
         camera, train = next(iter(capture.cameras.values())), capture.splits["train"]
         text += f": {_count(len(train.cameras), 'camera')}, {_count(len(train.frames), 'frame')}"

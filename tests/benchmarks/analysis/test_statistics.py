@@ -8,6 +8,7 @@ from benchmarks.analysis.statistics import (
     hierarchical_bootstrap,
     holm,
     independent,
+    intervals,
     kendall,
     mean_interval,
     noncentrality,
@@ -196,3 +197,26 @@ def test_spreads_says_what_it_cannot_know() -> None:
     one = spreads({"a": [25.0, 27.0]})
     assert (one.captures, one.seeds) == (None, pytest.approx(2**0.5))
     assert spreads({"a": [25.0, 29.0], "b": [26.0, 28.0]}).captures == 0.0
+
+
+def test_intervals_over_shared_captures_leave_out_what_a_capture_adds_to_all_methods() -> None:
+    rng = np.random.default_rng(0)
+    people = rng.normal(25.0, 5.0, 12)
+    gain = rng.normal(1.0, 0.3, 12)
+    samples = {
+        "ash": {f"{k}": [person + own] for k, (person, own) in enumerate(zip(people, gain, strict=True))},
+        "ddc": {f"{k}": [person] for k, person in enumerate(people)},
+    }
+    found = intervals(samples)
+    tested = paired(list(people + gain), list(people))
+    assert found["ash"].mean - found["ddc"].mean == pytest.approx(tested.mean)
+    for each in found.values():  # Of two methods, the paired interval by the square root of two.
+        assert each.high - each.mean == pytest.approx((tested.high - tested.mean) / 2**0.5)
+
+
+def test_intervals_of_methods_that_share_no_two_captures_are_students() -> None:
+    one = {"ash": {"a": [25.0, 26.0, 27.0]}, "ddc": {"a": [24.0, 24.5, 25.0]}}
+    assert intervals(one)["ash"] == mean_interval([25.0, 26.0, 27.0])
+    apart = {"ash": {"a": [25.0], "b": [27.0]}, "ddc": {"b": [24.0], "c": [25.0]}}
+    assert intervals(apart)["ddc"] == mean_interval([24.0, 25.0])
+    assert intervals({"ash": {"a": [25.0], "b": [27.0]}})["ash"] == mean_interval([25.0, 27.0])
