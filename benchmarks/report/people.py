@@ -1,18 +1,24 @@
 """Person by person: how far ASH is ahead on each capture, and how far scores spread between captures and seeds."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import altair as alt
 import numpy as np
 import pandas as pd
 
+from ash.capture.formats import load_capture
 from benchmarks.analysis.names import SPLIT_NAMES, is_ours, look_of
 from benchmarks.analysis.scores import RANKED_SPLITS, Scores, foreground
 from benchmarks.analysis.statistics import spreads
+from benchmarks.cell.cells import CellResult
 from benchmarks.cell.methods import is_oracle
-from benchmarks.report import charts, vega
-from benchmarks.report.content import Block, Bullets, Chart, Entry, Head, Row, Section, Table, Text
+from benchmarks.report import charts, pictures, vega
+from benchmarks.report.content import Block, Bullets, Chart, Entry, Head, Row, Section, Strips, Table, Text
+from benchmarks.report.pictures import Album, Frames, Shown
 from benchmarks.report.vega import Figure, Series
+from benchmarks.suites.runs import Run
 
 REFERENCE = "ash"
 RIVALS = ("ddc", "wo_mot")  # Of many rows, those that are shown person by person, and the user's own.
@@ -21,6 +27,15 @@ NOTE = (
     "Foreground PSNR. Standard deviations: between captures (people in their outfits), and between trainings of one "
     "capture from other seeds; n/a where no capture has two seeds, and then the spread between captures holds theirs."
 )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Pictured:
+    """Pictures of everybody: for the page, and as a sheet."""
+
+    strips: Strips
+    file: str
+    sheet: bytes
 
 
 def sections(scores: Scores, scene: str) -> list[Section]:
@@ -37,6 +52,44 @@ def sections(scores: Scores, scene: str) -> list[Section]:
         Text(text=NOTE, note=True),
     )
     return [Section(title=f"Person by person on {scene}", blocks=blocks)]
+
+
+def pictured(run: Run, results: Sequence[CellResult], scores: Scores, scene: str, album: Album) -> Pictured | None:
+    """Everybody as the methods draw them, where a scene has several captures: a typical view of each ranked split.
+
+    The sheet for Markdown has a column per person and a row per method, of held-out views.
+
+    Raises:
+        InputError: a capture or a picture is not there.
+    """
+    others = _others(scores, scene)
+    if scores.captures(scene) < 2 or not others:
+        return None
+    groups, columns = [], []
+    for who, (folder, cells) in _persons(run, results, scores, scene, (REFERENCE, *others)).items():
+        capture, first = load_capture(folder), cells[0].result
+        views = [view for split in RANKED_SPLITS for view in pictures.choose_views(first, split, 1)]
+        rows = [pictures.compare(capture, cells, view, with_errors=False) for view in views]
+        groups.append((who, tuple(replace(row, title=f"{who}, {row.title}").strip(album) for row in rows)))
+        columns.append([replace(rows[0].images[0], caption=who), *rows[0].images[1:]])
+    lines = [Frames(title="", images=line) for line in zip(*columns, strict=True)]
+    file = f"pictures_people_{scene}.png"
+    strips = Strips(file=file, title=f"Everybody on {scene}", groups=tuple(groups))
+    return Pictured(strips=strips, file=file, sheet=pictures.sheet(lines, scale=1))
+
+
+def _persons(
+    run: Run, results: Sequence[CellResult], scores: Scores, scene: str, methods: Sequence[str]
+) -> dict[str, tuple[Path, list[Shown]]]:
+    """By person: the capture's folder, and the first cell of each method on it, the reference first."""
+    names, done = _names(scores, scene), {result.config.key: result for result in results}
+    found: dict[str, tuple[Path, dict[str, Shown]]] = {}
+    for cell in run.cells:
+        if cell.config.key in done and cell.config.method in methods:
+            _, cells = found.setdefault(names[cell.capture_folder.name], (cell.capture_folder, {}))
+            cells.setdefault(cell.config.method, Shown(cell=cell, result=done[cell.config.key]))
+    whole = {who: kept for who, kept in found.items() if len(kept[1]) == len(methods)}
+    return {who: (folder, [cells[m] for m in methods]) for who, (folder, cells) in whole.items()}
 
 
 def _others(scores: Scores, scene: str) -> list[str]:

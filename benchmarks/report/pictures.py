@@ -119,7 +119,7 @@ def choose_views(result: CellResult, split: str, count: int = 2) -> list[ViewSco
 def comparisons(capture: Capture, shown: Sequence[Shown]) -> list[Frames]:
     """Two held-out views and two of held-out motion, chosen by the first method's scores."""
     views = [view for split in RANKED_SPLITS for view in choose_views(shown[0].result, split)]
-    return [_compare(capture, shown, view) for view in views]
+    return [compare(capture, shown, view) for view in views]
 
 
 def worst(capture: Capture, shown: Shown, *, count: int) -> list[Frames]:
@@ -212,7 +212,7 @@ def _cameras(result: CellResult, split: str) -> list[str]:
     return list(dict.fromkeys(view.camera for view in result.views if view.split == split))
 
 
-def _compare(capture: Capture, shown: Sequence[Shown], view: ViewScore) -> Frames:
+def compare(capture: Capture, shown: Sequence[Shown], view: ViewScore, *, with_errors: bool = True) -> Frames:
     """The comparison of several methods on one view, cropped to the subject, with FLIP errors below."""
     truth = metrics.on_black(capture.image(view.camera, view.frame))
     place = View(split=view.split, camera=view.camera, frame=view.frame)
@@ -225,9 +225,10 @@ def _compare(capture: Capture, shown: Sequence[Shown], view: ViewScore) -> Frame
         own = next(
             v for v in each.result.views if (v.split, v.camera, v.frame) == (view.split, view.camera, view.frame)
         )
-        flip = own.scores["foreground", "flip"]
         images.append(Frame(caption=each.title, score=f"{psnr_of(own):.1f} dB", pixels=on_paper(prediction[crop])))
-        errors.append(Frame(caption="FLIP error", score=f"{flip:.3f}", pixels=_flip(prediction, truth, crop)))
+        if with_errors:
+            flip = own.scores["foreground", "flip"]
+            errors.append(Frame(caption="FLIP error", score=f"{flip:.3f}", pixels=_flip(prediction, truth, crop)))
     return Frames(
         title=f"{SPLIT_NAMES[view.split].words}, camera {view.camera}, frame {view.frame}",
         images=tuple(images),

@@ -256,6 +256,7 @@ def _picture_sections(
         if capture is None:
             raise InputError(trouble)
         flipbook, sheets = _flipbook(data, capture, shown)
+        everybody = people.pictured(data.run, data.results, data.scores, data.scene, data.album)
         strips, worst_sheet = _worst(data, capture, shown)
     except InputError as error:
         reason = trouble or f"No pictures: {error}. The numbers come from {data.run.folder} and do not need it."
@@ -266,6 +267,11 @@ def _picture_sections(
         "Difference: that to the truth, four times enlarged."
     )
     sections = [Section(title=title, blocks=(flipbook, Text(text=note, note=True)))]
+    if everybody is not None:
+        typical = "Of held-out cameras and of new motion the view whose score by ASH is the person's median."
+        blocks = (everybody.strips, Text(text=typical, note=True))
+        sections.append(Section(title=everybody.strips.title, blocks=blocks))
+        sheets |= {everybody.file: everybody.sheet}
     if strips is not None:
         regions = (
             "Held-out motion, worst foreground PSNR first, each from another frame. FLIP error from black (0) to "
