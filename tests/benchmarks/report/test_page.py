@@ -1,4 +1,3 @@
-import io
 import re
 import shutil
 import xml.etree.ElementTree as ElementTree
@@ -12,24 +11,20 @@ from helpers import fakes
 from helpers.browser import DESKTOP, PHONE, Visit, Visitor
 from helpers.cells import config
 from helpers.waiting import wait_for
-from PIL import Image
 
 from ash.files import InputError
 from ash.protocol import TrainingOutcome
 from benchmarks import cli
 from benchmarks.analysis.scores import Quantity, scores_of
-from benchmarks.cell.cells import Cell, CellResult, Summary, failed_result
+from benchmarks.cell.cells import CellResult, Summary, failed_result
 from benchmarks.cell.metrics import PROTOCOL
-from benchmarks.report import people, sentences, tables
+from benchmarks.report import sentences, tables
 from benchmarks.report.content import Text
 from benchmarks.report.figures import speed_figure
 from benchmarks.report.page import publish, write_report
 from benchmarks.report.pictures import Album
 from benchmarks.report.scene import SceneData, scene_report
-from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells
-from benchmarks.suites.progress import Progress
-from benchmarks.suites.runs import Run, cell_for, read_run, results_of, write_run
-from benchmarks.suites.suites import CaptureSpec, CellSpec
+from benchmarks.suites.runs import Run, read_run, results_of
 from benchmarks.verbs import arguments
 
 
@@ -41,27 +36,6 @@ def scored(method: str, *, view: float, pose: float, frame_ms: float = 10.0, see
         Summary(split="speed", region="", metric="frame_ms", value=frame_ms),
     )
     return CellResult(config=config(method, seed), status="done", summary=rows)
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """A finished run of fake methods, one of which fails."""
-    folder = tmp_path_factory.mktemp("report")
-    capture = fakes.write_capture(folder / "capture")
-    out, spec = folder / "run", CaptureSpec(scene="boxes", size="ci")
-    with pytest.MonkeyPatch.context() as patch:
-        fakes.use(folder / "plugins", patch)
-        names = ("fake_good", "fake_bad", "fake_nan")
-        specs = [CellSpec(capture=spec, method=name, preset="ci", seed=0) for name in names]
-        cells = tuple(cell_for(cell, capture, out) for cell in specs)
-        found = Run(folder=out, suite="fakes", about="boxes", command="ash-bench run fakes", cells=cells)
-        write_run(found)
-        plan = plan_cells(cells)
-        progress = Progress("cells", 3, expected_s=1.0, workers=2, stream=io.StringIO())
-        with make_executor("local", workers=2) as executor:
-            run_cells(plan, executor, Limits(seconds=60.0, memory_mb=4096), progress)
-        write_report(found)
-    return found
 
 
 class Page(HTMLParser):
@@ -248,42 +222,6 @@ def test_the_numbers_that_are_published_are_a_run_again(run: Run, tmp_path: Path
     cli.main(["report", str(again)])
     assert (again / "results.csv").read_bytes() == (run.folder / "results.csv").read_bytes()
     assert "No pictures" in (again / "report.md").read_text()
-
-
-def two_people(run: Run, other: Path) -> tuple[Run, list[CellResult]]:
-    """The good and the bad method as ASH and the mesh, on the run's capture and on a copy of it as another person."""
-    shutil.copytree(run.cells[0].capture_folder, other)
-    names = {"fake_good": "ash", "fake_bad": "ddc"}
-    cells, results = [], []
-    for subject, capture in enumerate((run.cells[0].capture_folder, other)):
-        for cell, result in zip(run.cells, results_of(run), strict=True):
-            if (method := names.get(cell.config.method)) is not None:
-                told = replace(cell.config, method=method, subject=subject)
-                cells.append(Cell(config=told, folder=cell.folder, capture_folder=capture))
-                results.append(replace(result, config=told))
-    return replace(run, cells=tuple(cells)), results
-
-
-def test_a_report_over_people_shows_everybody(run: Run, tmp_path: Path) -> None:
-    cast, results = two_people(run, tmp_path / "other")
-    scores = scores_of(results, {cell.config.key: cell.capture_folder.name for cell in cast.cells})
-    data = SceneData(
-        run=cast, scores=scores, results=tuple(results), scene="boxes", album=Album(), room=10**6, worst_frames=1
-    )
-    made = scene_report(data)
-    (strips,) = (b for s in made.sections if s.title == "Everybody on boxes" for b in s.blocks if b.kind == "strips")
-    assert [name for name, _ in strips.groups] == ["subject 0", "subject 1"]
-    assert all([tile.caption for tile in strip.tiles] == ["Truth", "ASH", "DDC"] for strip in strips.groups[0][1])
-    assert [strip.title.split(",")[:2] for strip in strips.groups[1][1]] == [
-        ["subject 1", " held-out views"],
-        ["subject 1", " held-out motion"],
-    ]
-    sheet = Image.open(io.BytesIO(made.sheets[strips.file]))
-    alone = next(b for s in made.sections for b in s.blocks if b.kind == "flipbook")
-    assert strips.file in made.sheets and alone.file in made.sheets and sheet.width < sheet.height
-    shutil.rmtree(tmp_path / "other")
-    with pytest.raises(InputError):
-        people.pictured(cast, results, scores, "boxes", Album())
 
 
 def test_an_interval_that_reaches_below_zero_gives_way_to_the_range() -> None:

@@ -1,13 +1,22 @@
 """What a report says of each person of a cast."""
 
+import io
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
+import pytest
 from helpers.cells import config
+from PIL import Image
 
+from ash.files import InputError
 from benchmarks.analysis.scores import Scores, scores_of
-from benchmarks.cell.cells import CellResult, Summary, failed_result
+from benchmarks.cell.cells import Cell, CellResult, Summary, failed_result
 from benchmarks.report import people
 from benchmarks.report.content import Bullets, Chart, Section, Table
+from benchmarks.report.pictures import Album
+from benchmarks.report.scene import SceneData, scene_report
+from benchmarks.suites.runs import Run, results_of
 
 SPLITS = ("novel_view", "novel_pose")
 PSNR = {  # on held-out views by subject and seed; one dB less on new motion
@@ -68,3 +77,39 @@ def test_of_many_rows_the_rivals_and_the_users_own_are_shown() -> None:
         "minus DDC",
         "minus w/o mot.",
     ]
+
+
+def two_people(run: Run, other: Path) -> tuple[Run, list[CellResult]]:
+    """The good and the bad method as ASH and the mesh, on the run's capture and on a copy of it as another person."""
+    shutil.copytree(run.cells[0].capture_folder, other)
+    names = {"fake_good": "ash", "fake_bad": "ddc"}
+    cells, results = [], []
+    for subject, capture in enumerate((run.cells[0].capture_folder, other)):
+        for cell, result in zip(run.cells, results_of(run), strict=True):
+            if (method := names.get(cell.config.method)) is not None:
+                told = replace(cell.config, method=method, subject=subject)
+                cells.append(Cell(config=told, folder=cell.folder, capture_folder=capture))
+                results.append(replace(result, config=told))
+    return replace(run, cells=tuple(cells)), results
+
+
+def test_a_report_over_people_shows_everybody(run: Run, tmp_path: Path) -> None:
+    cast, results = two_people(run, tmp_path / "other")
+    scores = scores_of(results, {cell.config.key: cell.capture_folder.name for cell in cast.cells})
+    data = SceneData(
+        run=cast, scores=scores, results=tuple(results), scene="boxes", album=Album(), room=10**6, worst_frames=1
+    )
+    made = scene_report(data)
+    (strips,) = (b for s in made.sections if s.title == "Everybody on boxes" for b in s.blocks if b.kind == "strips")
+    assert [name for name, _ in strips.groups] == ["subject 0", "subject 1"]
+    assert all([tile.caption for tile in strip.tiles] == ["Truth", "ASH", "DDC"] for strip in strips.groups[0][1])
+    assert [strip.title.split(",")[:2] for strip in strips.groups[1][1]] == [
+        ["subject 1", " held-out views"],
+        ["subject 1", " held-out motion"],
+    ]
+    sheet = Image.open(io.BytesIO(made.sheets[strips.file]))
+    alone = next(b for s in made.sections for b in s.blocks if b.kind == "flipbook")
+    assert strips.file in made.sheets and alone.file in made.sheets and sheet.width < sheet.height
+    shutil.rmtree(tmp_path / "other")
+    with pytest.raises(InputError):
+        people.pictured(cast, results, scores, "boxes", Album())
