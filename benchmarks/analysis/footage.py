@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 import pandas as pd
 
 from benchmarks.analysis.names import look_of
@@ -32,32 +31,43 @@ def curves(results: Sequence[CellResult]) -> pd.DataFrame:
                 frames = FOOTAGE_FRAMES - int(severity)
                 rows.append((scene, split, method, frames, interval.mean, interval.low, interval.high))
     table = pd.DataFrame(rows, columns=["scene", "split", "method", "frames", "psnr", "low", "high"])
-    return table.astype({"low": float, "high": float}).sort_values(["scene", "split", "method", "frames"])
+    return table.astype({"low": float, "high": float}).sort_values(
+        ["scene", "split", "method", "frames"], key=_in_order
+    )
 
 
-def pays_from(table: pd.DataFrame, method: str) -> pd.DataFrame:
-    """The least number of frames from which on a method is above static Gaussians on held-out motion, per scene.
+def _in_order(column: pd.Series) -> pd.Series:
+    """Splits as they are told everywhere, from held-out views to far motion."""
+    return column.map(HELD_OUT_SPLITS.index) if column.name == "split" else column
 
-    NaN: at no number that was tried.
-    """
-    rows = []
+
+def pays_at(table: pd.DataFrame, method: str) -> dict[str, pd.Series]:
+    """Whether a method is above static Gaussians on held-out motion, by number of training frames, per scene."""
+    found = {}
     for scene, here in table[table.split == "novel_pose"].groupby("scene", sort=False):
         wide = here.pivot(index="frames", columns="method", values="psnr")
-        if not {method, STATIC} <= set(wide.columns):
-            continue
-        ahead = (wide[method] > wide[STATIC])[::-1].cumprod().astype(bool)
-        rows.append((scene, float(ahead[ahead].index.min()) if ahead.any() else np.nan))
-    return pd.DataFrame(rows, columns=["scene", "frames"])
+        if {method, STATIC} <= set(wide.columns):
+            found[str(scene)] = wide[method] > wide[STATIC]
+    return found
 
 
 def sentences(table: pd.DataFrame) -> list[str]:
     """When motion pays, for every method that learns from it."""
-    found = []
-    for method in [m for m in dict.fromkeys(table.method) if m != STATIC]:
-        for row in pays_from(table, method).itertuples():
-            name, rest = look_of(method).title, f"{look_of(STATIC).title} on held-out motion"
-            if np.isnan(row.frames):
-                found.append(f"On {row.scene}, {name} is above {rest} at no number of training frames that was tried.")
-            else:
-                found.append(f"On {row.scene}, {name} is above {rest} from {row.frames:.0f} training frames on.")
-    return found
+    rest = f"{look_of(STATIC).title} on held-out motion"
+    return [
+        f"On {scene}, {look_of(method).title} is above {rest} {_when(ahead)}."
+        for method in dict.fromkeys(table.method)
+        if method != STATIC
+        for scene, ahead in pays_at(table, method).items()
+    ]
+
+
+def _when(ahead: pd.Series) -> str:
+    """At which numbers of training frames, in words."""
+    if ahead.all():
+        return f"at every number of training frames that was tried, {ahead.index.min()} to {ahead.index.max()}"
+    if not ahead.any():
+        return "at no number of training frames that was tried"
+    if ahead.iloc[-1]:
+        return f"from {ahead.index[ahead[::-1].cumprod().astype(bool)[::-1]].min()} training frames on"
+    return f"at {', '.join(map(str, ahead.index[ahead]))} training frames, and no more at {ahead.index.max()}"
