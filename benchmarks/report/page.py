@@ -21,6 +21,7 @@ from benchmarks.suites.archive import write_archive
 from benchmarks.suites.runs import Run, results_of
 
 PUBLISHED = ("report.md", "results.csv", "tables.tex", "chart_*.svg", "pictures_*.png", "worst_*.png")
+PICTURED = (".svg", ".png")
 CELLS = "cells.zip"
 PICTURE_BYTES = 10_000_000  # of all pictures that are stepped through; worst frames come on top
 LATEX_HEAD = "% Needs booktabs and colortbl, and \\definecolor{antiquebrass}{rgb}{0.98, 0.92, 0.84}\n"
@@ -71,9 +72,12 @@ def publish(run: Run, folder: Path) -> None:
     Raises:
         InputError: the report was not written.
     """
-    found = [path for pattern in PUBLISHED for path in sorted(run.folder.glob(pattern))]
-    if not (run.folder / PUBLISHED[0]).exists():
+    report = run.folder / PUBLISHED[0]
+    if not report.exists():
         raise InputError(f"{run.folder}: expected {PUBLISHED[0]}, which `ash-bench report` writes")
+    told = report.read_text()
+    found = [path for pattern in PUBLISHED for path in sorted(run.folder.glob(pattern))]
+    found = [path for path in found if path.suffix not in PICTURED or path.name in told]  # Not an earlier report's.
     for pattern in PUBLISHED:
         for old in folder.glob(pattern):
             old.unlink()
