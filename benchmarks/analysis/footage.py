@@ -69,5 +69,6 @@ def _when(ahead: pd.Series) -> str:
     if not ahead.any():
         return "at no number of training frames that was tried"
     if ahead.iloc[-1]:
-        return f"from {ahead.index[ahead[::-1].cumprod().astype(bool)[::-1]].min()} training frames on"
+        last_behind = ahead.index[~ahead].max()
+        return f"from {ahead.index[ahead.index > last_behind].min()} training frames on"
     return f"at {', '.join(map(str, ahead.index[ahead]))} training frames, and no more at {ahead.index.max()}"

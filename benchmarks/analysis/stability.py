@@ -94,8 +94,8 @@ def curves(scores: Scores) -> tuple[Curve, ...]:
     psnr = scores.rows.query("region == 'foreground' and metric == 'psnr'").assign(scene=_scene)
     stressed = psnr.loc[psnr["axis"] != "", ["scene", "axis"]].drop_duplicates()
     for scene in stressed["scene"].unique():
-        axes = set(stressed.loc[stressed["scene"] == scene, "axis"])
-        for axis, split in product([name for name in AXES if name in axes - {FOOTAGE}], RANKED_SPLITS):
+        axes = set(stressed.loc[stressed["scene"] == scene, "axis"]) - {FOOTAGE}
+        for axis, split in product([name for name in AXES if name in axes], RANKED_SPLITS):
             here = psnr.query("scene == @scene and split == @split and axis in ('', @axis)")
             found.append(_curve(here, scene, axis, split))
     return tuple(found)

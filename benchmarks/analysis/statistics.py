@@ -145,12 +145,13 @@ def spreads(samples: Samples) -> Spreads:
     """The two components of variance by analysis of variance (one way, captures at random)."""
     repeated = [own for own in samples.values() if len(own) > 1]
     freedom = sum(len(own) - 1 for own in repeated)
-    seeds = sum((len(own) - 1) * float(np.var(own, ddof=1)) for own in repeated) / freedom if freedom else None
+    variance = sum((len(own) - 1) * float(np.var(own, ddof=1)) for own in repeated) / freedom if freedom else 0.0
+    seeds = math.sqrt(variance) if freedom else None
     if len(samples) < 2:
-        return Spreads(captures=None, seeds=None if seeds is None else math.sqrt(seeds))
+        return Spreads(captures=None, seeds=seeds)
     means = float(np.var([np.mean(own) for own in samples.values()], ddof=1))
-    of_seeds = (seeds or 0.0) * float(np.mean([1 / len(own) for own in samples.values()]))
-    return Spreads(captures=math.sqrt(max(0.0, means - of_seeds)), seeds=None if seeds is None else math.sqrt(seeds))
+    of_seeds = variance * float(np.mean([1 / len(own) for own in samples.values()]))
+    return Spreads(captures=math.sqrt(max(0.0, means - of_seeds)), seeds=seeds)
 
 
 def redrawn(samples: Sequence[Samples], *, rng: np.random.Generator) -> list[float]:

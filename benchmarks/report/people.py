@@ -1,7 +1,7 @@
 """Person by person: how far ASH is ahead on each capture, and how far scores spread between captures and seeds."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import altair as alt
@@ -29,19 +29,10 @@ NOTE = (
 )
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Pictured:
-    """Pictures of everybody: for the page, and as a sheet."""
-
-    strips: Strips
-    file: str
-    sheet: bytes
-
-
 def sections(scores: Scores, scene: str) -> list[Section]:
     """The differences on every capture, where a scene has several."""
     others = _others(scores, scene)
-    if scores.captures(scene) < 2 or not others:
+    if not others:
         return []
     gains = _gains(scores, scene, others)
     blocks: tuple[Block, ...] = (
@@ -54,7 +45,9 @@ def sections(scores: Scores, scene: str) -> list[Section]:
     return [Section(title=f"Person by person on {scene}", blocks=blocks)]
 
 
-def pictured(run: Run, results: Sequence[CellResult], scores: Scores, scene: str, album: Album) -> Pictured | None:
+def pictured(
+    run: Run, results: Sequence[CellResult], scores: Scores, scene: str, album: Album
+) -> tuple[Strips | None, dict[str, bytes]]:
     """Everybody as the methods draw them, where a scene has several captures: a typical view of each ranked split.
 
     The sheet for Markdown has a column per person and a row per method, of held-out views.
@@ -63,8 +56,8 @@ def pictured(run: Run, results: Sequence[CellResult], scores: Scores, scene: str
         InputError: a capture or a picture is not there.
     """
     others = _others(scores, scene)
-    if scores.captures(scene) < 2 or not others:
-        return None
+    if not others:
+        return None, {}
     groups, columns = [], []
     for who, (folder, cells) in _persons(run, results, scores, scene, (REFERENCE, *others)).items():
         capture, first = load_capture(folder), cells[0].result
@@ -75,7 +68,7 @@ def pictured(run: Run, results: Sequence[CellResult], scores: Scores, scene: str
     lines = [Frames(title="", images=line) for line in zip(*columns, strict=True)]
     file = f"pictures_people_{scene}.png"
     strips = Strips(file=file, title=f"Everybody on {scene}", groups=tuple(groups))
-    return Pictured(strips=strips, file=file, sheet=pictures.sheet(lines, scale=1))
+    return strips, {file: pictures.sheet(lines, scale=1)}
 
 
 def _persons(
@@ -93,9 +86,17 @@ def _persons(
 
 
 def _others(scores: Scores, scene: str) -> list[str]:
-    """The rows that ASH is compared with, if there is an ASH; none that failed anywhere."""
-    rows = [m for m in scores.methods(scene) if scores.whole(scene, m) and not is_oracle(m)]
-    others = [row for row in rows if row != REFERENCE] if REFERENCE in rows else []
+    """The rows that ASH is compared with: run on everybody that ASH was, and failed on nobody; none for one person."""
+    views = foreground(RANKED_SPLITS[0])
+    own = scores.samples(scene, REFERENCE, views).keys()
+    if len(own) < 2 or not scores.whole(scene, REFERENCE):
+        return []
+    others = [
+        row
+        for row in scores.methods(scene)
+        if row != REFERENCE and scores.whole(scene, row) and not is_oracle(row)
+        if own <= scores.samples(scene, row, views).keys()
+    ]
     return others if len(others) <= FEW else [row for row in others if row in RIVALS or not is_ours(row)][:FEW]
 
 

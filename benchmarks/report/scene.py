@@ -256,7 +256,7 @@ def _picture_sections(
         if capture is None:
             raise InputError(trouble)
         flipbook, sheets = _flipbook(data, capture, shown)
-        everybody = people.pictured(data.run, data.results, data.scores, data.scene, data.album)
+        everybody, cast_sheet = people.pictured(data.run, data.results, data.scores, data.scene, data.album)
         strips, worst_sheet = _worst(data, capture, shown)
     except InputError as error:
         reason = trouble or f"No pictures: {error}. The numbers come from {data.run.folder} and do not need it."
@@ -269,9 +269,7 @@ def _picture_sections(
     sections = [Section(title=title, blocks=(flipbook, Text(text=note, note=True)))]
     if everybody is not None:
         typical = "Of held-out cameras and of new motion the view whose score by ASH is the person's median."
-        blocks = (everybody.strips, Text(text=typical, note=True))
-        sections.append(Section(title=everybody.strips.title, blocks=blocks))
-        sheets |= {everybody.file: everybody.sheet}
+        sections.append(Section(title=everybody.title, blocks=(everybody, Text(text=typical, note=True))))
     if strips is not None:
         regions = (
             "Held-out motion, worst foreground PSNR first, each from another frame. FLIP error from black (0) to "
@@ -281,7 +279,7 @@ def _picture_sections(
         sections.append(
             Section(title=f"The worst frames on {data.scene}, and why", blocks=(strips, Text(text=regions, note=True)))
         )
-    return sections, sheets | worst_sheet
+    return sections, sheets | cast_sheet | worst_sheet
 
 
 def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Flipbook, dict[str, bytes]]:

@@ -16,7 +16,6 @@ from benchmarks.report.tables import entry_of
 from benchmarks.report.vega import Figure, Series
 
 WHISKERS = "Whiskers: 95 % interval over seeds, or over captures where there are several."
-APART = "What captures add to all methods is taken out."
 KEPT = "Avatars kept on the way, at learning rates that fall only at the end."
 
 
@@ -110,7 +109,8 @@ def novelties(scores: Scores) -> list[Section]:
         title="Quality against novelty",
         caption="Foreground PSNR by how far a pose lies from the nearest training pose: the mean over the joints of "
         "the angle between their rotations, the heading removed. At zero: held-out views of training poses. The frames "
-        f"of near, new and far motion stand in bins of equal number, each at its mean. {WHISKERS} {APART}",
+        f"of near, new and far motion stand in bins of equal number, each at its mean. {WHISKERS} "
+        "What captures add to all methods is taken out.",
         panels=charts.lines(samples, looks, y="foreground PSNR [dB]", size=(390, 240)),
         series=looks,
     )

@@ -21,14 +21,14 @@ def write_archive(run: Run, path: Path) -> None:
 
     Of a capture's folder only the name is kept: where it lay says nothing to others.
     """
+    keys: list[str] = []
     entries: dict[str, Any] = {}
     for cell in run.cells:
         if (cell.folder / "result.json").exists():
             config = read_json(cell.folder / "config.json")  # A gathered run may call the scene by another name.
-            inside = f"cells/{config['key']}"
-            entries[f"{inside}/config.json"] = config | {"capture_folder": cell.capture_folder.name}
-            entries[f"{inside}/result.json"] = read_json(cell.folder / "result.json")
-    keys = [name.split("/")[1] for name in entries if name.endswith("config.json")]
+            keys.append(config["key"])
+            entries[f"cells/{keys[-1]}/config.json"] = config | {"capture_folder": cell.capture_folder.name}
+            entries[f"cells/{keys[-1]}/result.json"] = read_json(cell.folder / "result.json")
     entries[RUN_FILE] = description_of(run) | {"cells": keys}
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:

@@ -12,7 +12,7 @@ from benchmarks.suites.runs import Run, cell_for, write_run
 from benchmarks.suites.suites import CaptureSpec, CellSpec
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A finished run of fake methods, one of which fails."""
     folder = tmp_path_factory.mktemp("report")

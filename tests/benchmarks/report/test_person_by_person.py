@@ -79,6 +79,15 @@ def test_of_many_rows_the_rivals_and_the_users_own_are_shown() -> None:
     ]
 
 
+def test_rows_of_other_people_than_those_of_ash_are_left_out() -> None:
+    scores = cast({"ash": ((25.0,), (26.0,)), "ddc": ((24.0,), (24.5,))})
+    few = [result("ash", subject, 0, 25.0) for subject in (0, 1)] + [
+        result("ddc", subject, 0, 24.0) for subject in (1, 2)
+    ]
+    assert len(people.sections(scores, "loose")) == 1
+    assert people.sections(scores_of(few), "loose") == []
+
+
 def two_people(run: Run, other: Path) -> tuple[Run, list[CellResult]]:
     """The good and the bad method as ASH and the mesh, on the run's capture and on a copy of it as another person."""
     shutil.copytree(run.cells[0].capture_folder, other)
