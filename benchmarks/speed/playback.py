@@ -22,6 +22,7 @@ from ash.files import InputError
 from ash.inference import Player
 from ash.model import AshModel
 from ash.protocol import Avatar
+from benchmarks.speed.energy import energy_meter
 from benchmarks.speed.frames import (
     Samples,
     agreement_db,
@@ -101,7 +102,7 @@ def speed_playback(
     try:
         players = players_of(avatar, clips[0].poses[0].motion, clips[0].camera, threads)
         for clip in clips:
-            samples = _timed(avatar.module, players, clip, rounds)
+            samples = _timed(avatar, players, clip, rounds)
             agreement, defined_ms = _compared(avatar, players, clip)
             yield agreement
             yield frame_rows(samples, defined_ms, clip.candidate, clip.camera, avatar.device)
@@ -109,14 +110,15 @@ def speed_playback(
         torch.set_num_threads(before)
 
 
-def _timed(model: AshModel, players: dict[int, Player], clip: TimedClip, rounds: int) -> Samples:
-    """Milliseconds of every stage and of the whole frame, frame by frame, by all players in turns."""
+def _timed(avatar: AshAvatar, players: dict[int, Player], clip: TimedClip, rounds: int) -> Samples:
+    """What each frame took in milliseconds (stages, whole) and in joules, drawn by all players in turns."""
     samples: Samples = defaultdict(list)
+    meter = energy_meter(avatar.device)
     for pose in clip.poses * rounds:
         for count, player in players.items():
-            _arrive(model, pose)
-            for what, ms in timed_frame(player, pose.frame, clip.camera, count).items():
-                samples[what, count].append(ms)
+            _arrive(avatar.module, pose)
+            for what, value in timed_frame(player, pose.frame, clip.camera, count, meter).items():
+                samples[what, count].append(value)
     return samples
 
 

@@ -25,6 +25,7 @@ class SpeedRow:
     min_ms: float
     median_ms: float
     ratio: float  # the naive minimum over this one's, both from this run
+    joules: float = math.nan  # a call in the mean, see `benchmarks.speed.energy`; nan: not known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,9 +105,9 @@ def row_of(
 
 
 def as_json(row: SpeedRow) -> dict[str, object]:
-    """The row under its public names; null for a ratio to nothing."""
-    fields = {name.rstrip("_"): value for name, value in vars(row).items()}
-    return fields | {"ratio": None if math.isnan(row.ratio) else row.ratio}
+    """The row under its public names; null for a ratio to nothing, and for joules that nobody counted."""
+    known = {name.rstrip("_"): value for name, value in vars(row).items()}
+    return {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in known.items()}
 
 
 def print_rows(rows: list[SpeedRow]) -> None:
