@@ -1,5 +1,8 @@
 """What a suite would cost, before anything is started."""
 
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+
 from benchmarks.cell.methods import find_method
 from benchmarks.suites.captures import described
 from benchmarks.suites.engine import shard_of
@@ -29,9 +32,17 @@ def estimate(suite: Suite, options: RunOptions) -> str:
             lines.append(f"capture {spec.name}: splatted, under a minute")
             continue
         lines.append(f"capture {spec.name}: {estimate_capture(described(spec)).text}")
-    lines += [f"cell {cell.capture.name} · {cell.method}:{cell.preset} · seed {cell.seed}" for cell in cells]
+    lines += ["", *_told(cells)]
     hours = len(cells) * suite.cell_minutes / 60
     beside = options.side_by_side
     wall = hours / min(beside, max(1, len(cells)))
     lines += ["", f"{len(cells)} cells, about {hours:.2f} core-hours, {wall:.2f} hours with {beside} workers"]
     return "\n".join(lines)
+
+
+def _told(cells: Sequence[CellSpec]) -> Iterator[str]:
+    """A line per capture, preset and seed."""
+    for (capture, preset, seed), alike in groupby(cells, key=lambda cell: (cell.capture.name, cell.preset, cell.seed)):
+        methods = [cell.method for cell in alike]
+        of_them = "cell" if len(methods) == 1 else "cells"
+        yield f"{len(methods)} {of_them} on {capture}, {preset}, seed {seed}: {', '.join(methods)}"

@@ -1,7 +1,7 @@
 """Reads a suite from its file, ours (beside this module) or a user's; every error names file, line and key.
 
     about = "is width needed?"
-    scenes = ["tight", { of = "tight", name = "tight_swing", outfit.swing = 0.8 }, { capture = "data/mine" }]
+    scenes = ["tight", { of = "tight", outfit.swing = 0.8, methods = ["ash"] }, { capture = "data/mine" }]
     size = "quick"               # of scenes; `size` in a scene's table overrules it
     methods = ["ash", { of = "ash", model.width = 8 }, { of = "my_package.avatar:mine", name = "mine" }]
     preset = "cpu"               # of methods; `preset` in a method's table overrules it
@@ -12,11 +12,11 @@
     cell_minutes = 2.5           # what one cell takes, for estimates
 
 `[[methods]]` and `[[scenes]]` as tables of their own mean the same; all further keys of such a table are replacements
-in the scene or in the method's configuration.
+in the scene or in the method's configuration. Of a scene that names some of the methods, only those run on it.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -121,15 +121,18 @@ class _Reader:
         from benchmarks.suites.scenes import scene_of
 
         place: Place = ("scenes", index)
-        known, changes = self.split(row, place, SCENE_KEYS)
+        methods = self.names(row.get("methods", []), (*place, "methods"))
+        known, changes = self.split({key: row[key] for key in row if key != "methods"}, place, SCENE_KEYS)
         if "capture" in known:
             if changes or set(known) - {"capture", "name"}:
-                raise self.error(place, "a finished capture is taken as it is: expected no key but capture and name")
-            return self.told(place, lambda: given_capture(Path(known["capture"]), name=known.get("name", "")))
+                raise self.error(
+                    place, "a finished capture is taken as it is: expected no key but capture, name and methods"
+                )
+            spec = self.told(place, lambda: given_capture(Path(known["capture"]), name=known.get("name", "")))
+            return replace(spec, methods=methods)
         of = self.required(known, place)
-        spec = SceneSpec(
-            name=known.get("name") or varied_name(of, changes), of=of, size=known.get("size", ""), changes=changes
-        )
+        name, size_of_it = known.get("name") or varied_name(of, changes), known.get("size", "")
+        spec = SceneSpec(name=name, of=of, size=size_of_it, changes=changes, methods=methods)
         self.told(place, lambda: scene_of(of, size=spec.size or size))
         self.each(place, changes, lambda some: scene_of(of, size=spec.size or size, changes=some))
         return spec
@@ -167,6 +170,12 @@ class _Reader:
             if key in row:
                 raise self.error((*place, key), f"{key}: a row has none of its own, the suite's `{key}s` counts them")
         return known, _dotted({key: value for key, value in row.items() if key not in own})
+
+    def names(self, value: Any, place: Place) -> tuple[str, ...]:
+        """A list of names."""
+        if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
+            raise self.error(place, f"{place[-1]}: expected a list of names, got {value!r}")
+        return tuple(value)
 
     def required(self, known: dict[str, str], place: Place) -> str:
         """The name of what a row is a variant of."""

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ash.fields import Changes
+from ash.fields import Changes, nearest
 from ash.files import InputError, hash_of
 from benchmarks.cell.methods import ORACLES, find_method, is_oracle, named_method
 from benchmarks.suites.stress import Stress
@@ -23,6 +23,7 @@ class SceneSpec:
     size: str = ""  # none: the suite's
     changes: Changes = ()  # in `synth.scene.Scene`
     folder: Path | None = None  # of a finished capture
+    methods: tuple[str, ...] = ()  # rows of the suite that run on it; none: all
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -100,6 +101,11 @@ class Suite:
                 raise InputError(f"expected at least one {what}")
             if twice := [name for name in names if names.count(name) > 1]:
                 raise InputError(f"two {what}s are called {twice[0]!r}, expected a name of its own for each")
+        known = tuple(method.name for method in self.methods)
+        for scene in self.scenes:
+            for name in scene.methods:
+                if name not in known:
+                    raise InputError(f"scenes: {scene.name} asks for the method {name!r}, {nearest(name, known)}")
         if self.seeds < 1:
             raise InputError(f"seeds: expected at least 1, got {self.seeds}")
         if not 1 <= self.subjects <= VALIDATION:
@@ -128,9 +134,10 @@ class Suite:
     @property
     def cells(self) -> Iterator[CellSpec]:
         """Seeds outermost: whoever interrupts early has one whole table, not three thirds of one."""
+        wanted = {scene.name: scene.methods or tuple(method.name for method in self.methods) for scene in self.scenes}
         for seed in range(self.seeds):
             for capture in self.captures:
-                for method in self.methods:
+                for method in (method for method in self.methods if method.name in wanted[capture.scene]):
                     yield CellSpec(
                         capture=capture,
                         method=method.name,
@@ -145,6 +152,8 @@ class Suite:
     ) -> "Suite":
         """The suite with other rows and values where they are given; a method that is no row of it becomes one.
 
+        Methods that are given run on every scene, also on one that has a choice of its own.
+
         Raises:
             InputError: a method that is neither a row nor installed.
         """
@@ -152,7 +161,8 @@ class Suite:
         chosen = tuple(rows[name] if name in rows else MethodSpec(name=find_method(name).name) for name in methods)
         given: dict[str, object] = {name: value for name, value in others.items() if value is not None}
         given |= {"scenes": scenes} if scenes else {}
-        given |= {"methods": chosen} if chosen else {}
+        if chosen:
+            given |= {"methods": chosen, "scenes": tuple(replace(scene, methods=()) for scene in scenes or self.scenes)}
         return replace(self, **given)  # type: ignore[arg-type]
 
 

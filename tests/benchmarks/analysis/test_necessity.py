@@ -226,6 +226,9 @@ def test_the_ladder_has_a_row_for_every_expected_part_and_doses_of_known_strengt
         if f"{of}{ending}" in captures:
             expected = rung(of, size="rung", strength=strength)
             assert replace(captures[f"{of}{ending}"], name=of) == expected
+            (dose,) = [scene for scene in suite.scenes if scene.name == f"{of}{ending}"]
+            assert dose.methods == ("ash", *EXPECTED[of]), "what the doses of its report ask for, and no more"
+    assert all(not scene.methods for scene in suite.scenes if scene.name in EXPECTED)
     assert {f"{of}_half" for of in RUNGS} <= set(captures)
 
 

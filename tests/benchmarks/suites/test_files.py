@@ -56,6 +56,24 @@ def test_a_file_says_scenes_methods_and_what_is_replaced_in_them(tmp_path: Path)
     assert (cells[0].factory, cells[2].preset) == ("", "brief")
 
 
+def test_a_scene_may_name_the_methods_that_run_on_it(tmp_path: Path) -> None:
+    some = GOOD.replace("outfit.swing = 0.8", "outfit.swing = 0.8, methods = ['mesh', 'ash']")
+    suite = read_suite(written(tmp_path, some))
+    assert suite.scenes[1].changes == (("outfit.swing", 0.8),)
+    ran = {
+        scene: [cell.method for cell in suite.cells if cell.capture.scene == scene]
+        for scene in ("tight", "tight_swing")
+    }
+    assert ran["tight"] == ["ash", "ash+width=4", "mesh"] * 3 * 2
+    assert ran["tight_swing"] == ["ash", "mesh"] * 3 * 2, "in the suite's order, under every stress"
+    asked = suite.narrowed(methods=("ash+width=4",), seeds=1)
+    assert [cell.capture.scene for cell in asked.cells] == ["tight", "tight_swing"] * 3, "who asks gets what was asked"
+    assert len(list(suite.narrowed(scenes=suite.scenes[1:], seeds=1).cells)) == 2 * 3
+    capture = fakes.write_capture(tmp_path / "boxes")
+    given = GOOD.replace('"tight",', f"{{ capture = {str(capture)!r}, methods = ['ash'] }},", 1)
+    assert read_suite(written(tmp_path, given)).scenes[0].methods == ("ash",)
+
+
 def test_an_ablation_is_three_lines(tmp_path: Path) -> None:
     assert [row.name for row in read_suite(written(tmp_path, TABLES)).methods] == ["ash", "ash+width=4"]
 
@@ -90,6 +108,13 @@ def test_a_capture_that_is_there_is_a_scene(tmp_path: Path) -> None:
             2,
             "subject: a row has none of its own, the suite's `subjects` counts them",
         ),
+        (
+            "swing = 0.8",
+            "swing = 0.8, methods = ['mehs']",
+            2,
+            "tight_swing asks for the method 'mehs', did you mean mesh",
+        ),
+        ("swing = 0.8", "swing = 0.8, methods = 'ash'", 2, "methods: expected a list of names, got 'ash'"),
         ('of = "ddc"', 'of = "nearest"', 7, "nearest: offers no configuration, and so has no key 'texture'"),
         ('preset = "brief"', 'preset = "chaep"', 7, "preset: expected one of ci, brief"),
         ('name = "mesh"', 'name = "ash"', 4, "two methods are called 'ash'"),
