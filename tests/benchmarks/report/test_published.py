@@ -11,7 +11,7 @@ from benchmarks.cell.methods import code_version
 REPORTS = Path(__file__).parents[3] / "reports"
 ROW = re.compile(r"^\| \[.+?\]\((?P<file>[^)]+)\).*? \| (?P<state>[^|]+) \|", re.MULTILINE)
 FACT = r"^(?:\| {0} \| |- {0}: )(.*?)(?: \|)?$"  # of a report's provenance, as a table's row or a list's item
-NO_CELLS = ("no cells", "reference")  # pictures; the gate's baseline, which judges code that is younger than it
+NO_CELLS = ("no cells", "reference")  # pictures, times; the gate's baseline, which judges code that is younger than it
 
 
 def fact(report: str, name: str) -> str:
