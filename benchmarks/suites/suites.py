@@ -134,10 +134,12 @@ class Suite:
     @property
     def cells(self) -> Iterator[CellSpec]:
         """Seeds outermost: whoever interrupts early has one whole table, not three thirds of one."""
-        wanted = {scene.name: scene.methods or tuple(method.name for method in self.methods) for scene in self.scenes}
+        chosen = {scene.name: scene.methods for scene in self.scenes}
         for seed in range(self.seeds):
             for capture in self.captures:
-                for method in (method for method in self.methods if method.name in wanted[capture.scene]):
+                for method in self.methods:
+                    if chosen[capture.scene] and method.name not in chosen[capture.scene]:
+                        continue
                     yield CellSpec(
                         capture=capture,
                         method=method.name,
