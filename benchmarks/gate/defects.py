@@ -17,12 +17,11 @@ import ash.model
 import ash.template.template
 import ash.textures
 from ash.avatar import AshAvatar
-from ash.capture.dataset import Capture
+from ash.capture.dataset import Camera, Capture
 from ash.config import AshConfig
 from ash.presets import named
 from ash.rotations import RigidTransforms
 from ash.template.skinning import SkinWeights
-from synth.readers.perturb import miscalibrate
 
 MISCALIBRATION_PX = 2.0
 SLOWER = 0.2
@@ -94,13 +93,22 @@ def half_the_steps(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
     return _ash(capture, seed, preset, training={"steps": named(preset).training.steps // 2})
 
 
+def _turned(camera: Camera, pixels: float) -> Camera:
+    """The camera turned about its own vertical axis, so that the middle of its image moves by so many pixels."""
+    angle = pixels / camera.K[0, 0]
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    viewmat = camera.viewmat.copy()
+    viewmat[:3] = turn @ viewmat[:3]
+    return replace(camera, viewmat=viewmat)
+
+
 class _Miscalibrated(AshAvatar):
     """Learns with one training camera turned."""
 
     def fit(self, capture: Capture, **more: Any) -> None:
         """Train on wrong extrinsics."""
         first = capture.splits["train"].cameras[0]
-        wrong = miscalibrate(capture.cameras[first], MISCALIBRATION_PX, seed=0)
+        wrong = _turned(capture.cameras[first], MISCALIBRATION_PX)
         super().fit(replace(capture, cameras={**capture.cameras, first: wrong}), **more)
 
 

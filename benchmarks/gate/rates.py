@@ -7,7 +7,7 @@ Baseline: seeds 0 to 2 of ASH on the suite `ci`. A re-run of unchanged code is t
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from ash.files import write_atomic, write_json
+from ash.files import InputError, write_atomic, write_json
 from benchmarks.analysis.statistics import wilson
 from benchmarks.cell.cells import Cell, CellResult, result_of
 from benchmarks.gate.defects import DEFECTS
@@ -45,9 +45,10 @@ class Trust:
 
 
 def measure(out: Path, data: Path, *, reruns: int, workers: int) -> Trust:
-    """Train what is missing, judge, and write `rates.md` and `rates.json` into `out`.
+    """Train what is missing, one cell at a time as the gate does, judge, and write `rates.md` and `rates.json` into `out`.
 
     Raises:
+        InputError: a cell failed, so that the gate had nothing to judge: that is no defect caught.
         KeyboardInterrupt: trainings were interrupted; the next call goes on with them.
     """
     suite = find_suite("ci")
@@ -66,9 +67,14 @@ def measure(out: Path, data: Path, *, reruns: int, workers: int) -> Trust:
     wanted = [cells_of(SOUND, range(SEEDS * (reruns + 1)))]
     wanted += [cells_of(method, base) for method in SOUND_FOR.values()]
     wanted += [cells_of(_target(defect.__name__), other) for defect in DEFECTS]
-    run_missing([cell for group in wanted for cell in group], suite, RunOptions(out=out, data=data, workers=workers))
-    if any(result_of(cell) is None for group in wanted for cell in group):
-        raise KeyboardInterrupt("some trainings were interrupted")
+    cells = [cell for group in wanted for cell in group]
+    run_missing(cells, suite, RunOptions(out=out, data=data, workers=workers, cells=1))
+    for cell in cells:
+        result = result_of(cell)
+        if result is None:
+            raise KeyboardInterrupt("some trainings were interrupted")
+        if result.status != "done":
+            raise InputError(f"{cell.config.method}, seed {cell.config.seed}: expected a result to judge, got {result.reason}")
 
     def baseline(method: str, seeds: range) -> Baseline:
         return summarise("ci", [_as(SOUND, cell) for cell in cells_of(method, seeds)])

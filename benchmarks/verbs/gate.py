@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tyro.conf import FlagCreatePairsOff
 
-from benchmarks.verbs.arguments import DONE, FAILED, Count, CountIfAny, File, Folder, Natural
+from benchmarks.verbs.arguments import DONE, FAILED, Count, File, Folder, Natural
 from benchmarks.verbs.runs import run_and_report
 
 
@@ -36,7 +36,8 @@ class GateVerb:
         if folder is None:
             suite = find_suite(self.suite if baseline is None else baseline.suite).narrowed(seeds=self.seeds)
             folder = Path("runs/gate")
-            code = run_and_report(suite, RunOptions(out=folder, data=self.data, workers=cores()))
+            # One cell at a time: a neighbour slows the stages of a frame by more than it slows the reference workload.
+            code = run_and_report(suite, RunOptions(out=folder, data=self.data, workers=cores(), cells=1))
             if code not in (DONE, FAILED):
                 return code
         found = read_run(folder)
@@ -61,12 +62,11 @@ class GateRatesVerb:
     reruns: Natural = 20  # unchanged runs
     out: Folder = Path("runs/gate-rates")  # where they go
     data: Folder = Path("data")  # where captures are kept
-    workers: CountIfAny = None  # default: one per core
 
     def __call__(self) -> int:
         """Measure and print."""
         from benchmarks.gate.rates import markdown, measure
         from benchmarks.provenance import cores
 
-        print(markdown(measure(self.out, self.data, reruns=self.reruns, workers=self.workers or cores())))
+        print(markdown(measure(self.out, self.data, reruns=self.reruns, workers=cores())))
         return DONE

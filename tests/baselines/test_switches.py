@@ -101,7 +101,7 @@ def test_the_mlp_tells_frames_apart_and_learns_no_texels_beneath(
 
 
 def test_the_suites_have_them_as_rows() -> None:
-    assert len(SWITCHES) == 24 and len(LEARNED) == 4
+    assert len(SWITCHES) == 23 and len(LEARNED) == 4
     methods = [row.of or row.name for suite in ("switches", "template") for row in find_suite(suite).methods]
     assert all(find_method(method).is_ours and callable(find_method(method).load()) for method in methods)
     named = ["baselines.switches:by_surface", "baselines.switches:by_vertices"]

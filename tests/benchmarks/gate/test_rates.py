@@ -1,5 +1,6 @@
 """The gate's own rates: planted defects do what they say, and the verdicts on them are counted right."""
 
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -64,17 +65,36 @@ def test_a_defect_changes_what_is_drawn_or_what_it_costs(
     assert np.array_equal(before, after) == (defect in (defects.slow_splatter, defects.more_memory))
 
 
-def test_unchanged_code_and_defects_are_judged_and_written_down(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_defects_can_be_loaded_where_the_generator_of_truth_is_hidden() -> None:
+    """As in a cell: a defect that cannot start is none."""
+    told = "import sys; sys.modules['synth'] = None; import benchmarks.gate.defects"
+    subprocess.run([sys.executable, "-c", told], check=True)
+
+
+def test_one_camera_off_is_off_by_so_many_pixels(tube: Capture) -> None:
+    camera = next(iter(tube.cameras.values()))
+    point = (-camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3] + 3 * camera.viewmat[2, :3])[None]  # on its axis
+    shift = defects._turned(camera, 2.0).project(point)[0] - camera.project(point)[0]
+    np.testing.assert_allclose(shift[0], [2.0, 0.0], atol=0.01)
+
+
+@pytest.fixture
+def on_fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rates of methods that need no training: the names of defects are names of methods."""
     capture = fakes.write_capture(tmp_path / "capture")
     fakes.use(tmp_path / "plugins", monkeypatch)
     monkeypatch.setattr(rates, "make_capture", lambda *_, **__: capture)
     monkeypatch.setattr(rates, "SEEDS", 2)
     monkeypatch.setattr(rates, "SOUND", "fake_good")
     monkeypatch.setattr(rates, "SOUND_FOR", {})
-    monkeypatch.setattr(rates, "DEFECTS", (fake_bad,))
     monkeypatch.setattr(rates, "_target", lambda name: name)
+
+
+@pytest.mark.usefixtures("on_fakes")
+def test_unchanged_code_and_defects_are_judged_and_written_down(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rates, "DEFECTS", (fake_bad,))
     found = rates.measure(tmp_path / "out", tmp_path, reruns=2, workers=2)
     assert [trial.name for trial in found.unchanged] == ["seeds 2 to 3", "seeds 4 to 5"]
     (defect,) = found.defects
@@ -86,6 +106,17 @@ def test_unchanged_code_and_defects_are_judged_and_written_down(
 
 def fake_bad() -> None:
     """A worse method under a better one's name."""
+
+
+@pytest.mark.usefixtures("on_fakes")
+def test_a_defect_that_fails_is_none_that_was_caught(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rates, "DEFECTS", (fake_raising,))
+    with pytest.raises(InputError, match="fake_raising, seed 2: expected a result to judge"):
+        rates.measure(tmp_path / "out", tmp_path, reruns=0, workers=2)
+
+
+def fake_raising() -> None:
+    """A method that raises."""
 
 
 def test_a_method_may_be_named_by_its_path_and_is_known_by_its_source() -> None:
