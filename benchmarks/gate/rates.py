@@ -45,7 +45,7 @@ class Trust:
 
 
 def measure(out: Path, data: Path, *, reruns: int, workers: int) -> Trust:
-    """Train what is missing, one cell at a time as the gate does, judge, and write `rates.md` and `rates.json` into `out`.
+    """Train what is missing, one cell at a time as the gate does, judge, and write `rates.md` and `rates.json`.
 
     Raises:
         InputError: a cell failed, so that the gate had nothing to judge: that is no defect caught.
@@ -74,7 +74,9 @@ def measure(out: Path, data: Path, *, reruns: int, workers: int) -> Trust:
         if result is None:
             raise KeyboardInterrupt("some trainings were interrupted")
         if result.status != "done":
-            raise InputError(f"{cell.config.method}, seed {cell.config.seed}: expected a result to judge, got {result.reason}")
+            raise InputError(
+                f"{cell.config.method}, seed {cell.config.seed}: expected a result to judge, got {result.reason}"
+            )
 
     def baseline(method: str, seeds: range) -> Baseline:
         return summarise("ci", [_as(SOUND, cell) for cell in cells_of(method, seeds)])

@@ -21,7 +21,7 @@ def speed(
 ) -> tuple[tuple[alt.LayerChart, ...], bool]:
     """Accuracy against speed: a panel per `panel` of `points`, which all share both axes; and whether points are named.
 
-    `points`: panel, series, ms, psnr, low, high, ringed, below (the value of one that lies below the chart) and note.
+    `points`: panel, series, ms, psnr, low, high, ringed, and where it lies below the chart note and level, a count.
     `front`: panel, ms, psnr of the staircase. `links`: panel, link, ms, psnr.
     """
     size, x, y = (380, 330), _log_domain(points["ms"], 1.5), _domain(points, ["psnr", "low", "high"])
@@ -47,8 +47,11 @@ def speed(
             seen.mark_point(size=80, opacity=1, strokeWidth=2, clip=True).encode(
                 **at, **look(series), tooltip=tooltips(tips)
             ),
-            *_labels(seen, at, own),
-            _text(seen.transform_filter("isValid(datum.below)"), at, "note:N", dy=-14),
+            *_labels(seen.transform_filter("!isValid(datum.level)"), at, own),
+            *(
+                _text(seen.transform_filter(f"datum.level === {level}"), at, "note:N", dy=-14 * level)
+                for level in sorted(own["level"].dropna().unique())
+            ),
         ]
         if x[0] < REAL_TIME_MS < x[1]:
             mark = pd.DataFrame({"ms": [REAL_TIME_MS], "psnr": [y[0]], "text": ["30 frames/s"]})

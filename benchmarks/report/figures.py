@@ -95,11 +95,15 @@ def _pair(scores: Scores, scene: str, method: str, split: str) -> tuple[Score | 
 
 
 def _lifted(points: pd.DataFrame) -> pd.DataFrame:
-    """Points that lie far below all others, raised to the floor of the chart with their value in `note`."""
+    """Points that lie far below all others, raised to the floor of the chart with their value in `note`.
+
+    `level` counts those of a panel from 1, so that no note is written over another.
+    """
     floor = points["psnr"].max() - SPAN_DB
     far = points["psnr"] < floor
     note = points["series"] + points["psnr"].map(": {:.1f} ↓".format)
-    lifted = points.assign(below=points["psnr"].where(far), note=note.where(far), psnr=points["psnr"].clip(lower=floor))
+    level = far.groupby(points["panel"]).cumsum().where(far)
+    lifted = points.assign(note=note.where(far), level=level, psnr=points["psnr"].clip(lower=floor))
     return lifted.assign(**{end: points[end].where(~far) for end in ("low", "high")})
 
 

@@ -16,6 +16,7 @@ from benchmarks.report.tables import entry_of
 from benchmarks.report.vega import Figure, Series
 
 WHISKERS = "Whiskers: 95 % interval over seeds, or over captures where there are several."
+FIXED_MESH = "A fixed mesh with the best texture shows what the geometry alone is worth. "
 KEPT = "Avatars kept on the way, at learning rates that fall only at the end."
 
 
@@ -37,7 +38,9 @@ def margins(scores: Scores) -> list[Section]:
     differences = pd.DataFrame([_sample(c, name, m.error_mm, m.mean, m.low, m.high) for c, name, m in margins])
     rules = [(_place(c), 0.0, "") for c in curves]
     rules += [(_place(c), c.paper_db, f"the paper's {c.paper_db:+.1f} dB") for c in curves if c.paper_db is not None]
-    looks = [Series(title=title, colour=look_of(method).colour) for method, title in margin.LEVEL_TITLES.items()]
+    run = {level.method for curve in curves for level in curve.levels}
+    titles = {method: title for method, title in margin.LEVEL_TITLES.items() if method in run}
+    looks = [Series(title=title, colour=look_of(method).colour) for method, title in titles.items()]
     pair = [Series(title=known, colour=vega.BLUE), Series(title=own, colour=vega.ORANGE, shape="square")]
     size = (390, 240)
     figures = (
@@ -45,8 +48,7 @@ def margins(scores: Scores) -> list[Section]:
             name="levels",
             title="Quality against the template's error",
             caption="Foreground PSNR when a method is given a template that is wrong by a known amount (the exact "
-            "surface, displaced smoothly). A fixed mesh with the best texture shows what the geometry alone is worth. "
-            f"{WHISKERS}",
+            f"surface, displaced smoothly). {FIXED_MESH if 'oracle_texture' in run else ''}{WHISKERS}",
             panels=charts.lines(levels, looks, y="foreground PSNR [dB]", size=size),
             series=tuple(looks),
         ),

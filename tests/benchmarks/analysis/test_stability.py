@@ -29,6 +29,7 @@ from benchmarks.suites.suites import CaptureSpec
 
 MASKS = Path(__file__).parents[3] / "reports" / "masks" / "masks.toml"
 
+
 def severities_of(axis: str) -> list[float]:
     """The steps that our suites take along an axis."""
     stresses = (*find_suite("stability").stresses, *find_suite("motions").stresses)
