@@ -1,9 +1,10 @@
 """How far the gate can be trusted: its false alarms on unchanged code, and which planted defects it catches.
 
-Baseline: seeds 0 to 2 of ASH on the suite `ci`. A re-run of unchanged code is three other seeds; a defect is
-`benchmarks.gate.defects` with seeds 3 to 5 under ASH's name.
+Baseline: three seeds of ASH on the suite `ci`. A re-run of unchanged code is three other seeds; a defect is three seeds
+of `benchmarks.gate.defects` under ASH's name.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -11,9 +12,10 @@ from ash.files import InputError, write_atomic, write_json
 from benchmarks.analysis.statistics import wilson
 from benchmarks.cell.cells import Cell, CellResult, result_of
 from benchmarks.gate.defects import DEFECTS
-from benchmarks.gate.gate import FINE, Baseline, Check, judge, summarise
+from benchmarks.gate.gate import FINE, TIMED_AGAIN, Baseline, Check, settle, summarise
 from benchmarks.suites.captures import make_capture, require_intact
 from benchmarks.suites.files import find_suite
+from benchmarks.suites.progress import Progress
 from benchmarks.suites.runs import RunOptions, cell_for, run_missing
 from benchmarks.suites.suites import CellSpec
 
@@ -45,7 +47,7 @@ class Trust:
 
 
 def measure(out: Path, data: Path, *, reruns: int, workers: int) -> Trust:
-    """Train what is missing, one cell at a time as the gate does, judge, and write `rates.md` and `rates.json`.
+    """Train, judge as the gate does, trial by trial, and write `rates.md` and `rates.json` into `out`.
 
     Raises:
         InputError: a cell failed, so that the gate had nothing to judge: that is no defect caught.
@@ -55,47 +57,45 @@ def measure(out: Path, data: Path, *, reruns: int, workers: int) -> Trust:
     spec = suite.captures[0]
     folder = make_capture(spec, data, workers=workers)
     require_intact(folder)
+    options = RunOptions(out=out, data=data, workers=workers, cells=1)
 
-    def cells_of(method: str, seeds: range) -> list[Cell]:
-        return [
-            cell_for(CellSpec(capture=spec, method=method, preset=suite.preset, seed=seed), folder, out)
-            for seed in seeds
-        ]
+    def run(method: str, seeds: Sequence[int]) -> list[CellResult]:
+        """Results of a method under the sound one's name."""
+        specs = [CellSpec(capture=spec, method=method, preset=suite.preset, seed=seed) for seed in seeds]
+        cells = [cell_for(one, folder, out) for one in specs]
+        run_missing(cells, suite, options)
+        return [_as(SOUND, cell) for cell in cells]
 
-    base, other = range(SEEDS), range(SEEDS, 2 * SEEDS)
-    unchanged = [range(SEEDS * (i + 1), SEEDS * (i + 2)) for i in range(reruns)]
-    wanted = [cells_of(SOUND, range(SEEDS * (reruns + 1)))]
-    wanted += [cells_of(method, base) for method in SOUND_FOR.values()]
-    wanted += [cells_of(_target(defect.__name__), other) for defect in DEFECTS]
-    cells = [cell for group in wanted for cell in group]
-    run_missing(cells, suite, RunOptions(out=out, data=data, workers=workers, cells=1))
-    for cell in cells:
-        result = result_of(cell)
-        if result is None:
-            raise KeyboardInterrupt("some trainings were interrupted")
-        if result.status != "done":
-            raise InputError(
-                f"{cell.config.method}, seed {cell.config.seed}: expected a result to judge, got {result.reason}"
-            )
+    def baseline(method: str) -> Baseline:
+        own, more = _seeds(0)
+        return summarise("ci", run(method, own), run(method, more))
 
-    def baseline(method: str, seeds: range) -> Baseline:
-        return summarise("ci", [_as(SOUND, cell) for cell in cells_of(method, seeds)])
+    def trial(name: str, about: str, before: Baseline, method: str, block: int) -> GateTrial:
+        own, more = _seeds(block)
+        _, checks = settle(before, "ci", run(method, own), lambda _, attempt: run(method, [more[attempt]]))
+        progress.finish(name)
+        return GateTrial(name=name, about=about, flagged=tuple(check for check in checks if check.verdict not in FINE))
 
-    found = Trust(
-        unchanged=tuple(
-            _trial(f"seeds {seeds.start} to {seeds.stop - 1}", "", baseline(SOUND, base), baseline(SOUND, seeds))
-            for seeds in unchanged
-        ),
-        defects=tuple(
-            _trial(
-                defect.__name__.replace("_", " "),
-                (defect.__doc__ or "").strip(),
-                baseline(SOUND_FOR.get(defect.__name__, SOUND), base),
-                baseline(_target(defect.__name__), other),
-            )
-            for defect in DEFECTS
-        ),
+    expected_s = 60 * suite.cell_minutes * (SEEDS + 1)
+    progress = Progress("trials", reruns + len(DEFECTS), expected_s=expected_s, workers=1)
+    before = {method: baseline(method) for method in (SOUND, *SOUND_FOR.values())}
+    unchanged = tuple(
+        trial(f"seeds {seeds[0]} to {seeds[-1]}", "", before[SOUND], SOUND, block)
+        for block in range(1, reruns + 1)
+        for seeds in [_seeds(block)[0]]
     )
+    defects = tuple(
+        trial(
+            defect.__name__.replace("_", " "),
+            (defect.__doc__ or "").strip(),
+            before[SOUND_FOR.get(defect.__name__, SOUND)],
+            _target(defect.__name__),
+            1,
+        )
+        for defect in DEFECTS
+    )
+    progress.close()
+    found = Trust(unchanged=unchanged, defects=defects)
     write_json(out / "rates.json", asdict(found))
     write_atomic(out / "rates.md", markdown(found).encode())
     return found
@@ -124,9 +124,10 @@ def _rate(what: str, count: int, trials: int) -> str:
     return f"{what}: {count} of {trials} (95 % interval {100 * low:.0f} to {100 * high:.0f} %)."
 
 
-def _trial(name: str, about: str, before: Baseline, after: Baseline) -> GateTrial:
-    flagged = tuple(check for check in judge(before, after) if check.verdict not in FINE)
-    return GateTrial(name=name, about=about, flagged=flagged)
+def _seeds(block: int) -> tuple[range, range]:
+    """Seeds that no other block has: those of a run, and those whose times alone are measured."""
+    first = block * (SEEDS + TIMED_AGAIN)
+    return range(first, first + SEEDS), range(first + SEEDS, first + SEEDS + TIMED_AGAIN)
 
 
 def _target(defect: str) -> str:
@@ -134,6 +135,11 @@ def _target(defect: str) -> str:
 
 
 def _as(method: str, cell: Cell) -> CellResult:
+    """The result of a cell under another method's name."""
     result = result_of(cell)
-    assert result is not None, cell.folder
+    if result is None:
+        raise KeyboardInterrupt("some trainings were interrupted")
+    if result.status != "done":
+        name, seed = cell.config.method, cell.config.seed
+        raise InputError(f"{name}, seed {seed}: expected a result to judge, got {result.reason}")
     return replace(result, config=replace(result.config, method=method))

@@ -14,7 +14,10 @@ from ash.capture.dataset import Capture, Pose
 from ash.files import InputError, read_json
 from ash.protocol import Avatar, StageClock
 from benchmarks.cell.methods import code_version, find_method
-from benchmarks.gate import defects, rates
+from benchmarks.gate import defects, gate, rates
+from benchmarks.gate.again import run_again
+from benchmarks.suites.files import read_suite
+from benchmarks.suites.runs import RunOptions
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +88,8 @@ def on_fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fakes.use(tmp_path / "plugins", monkeypatch)
     monkeypatch.setattr(rates, "make_capture", lambda *_, **__: capture)
     monkeypatch.setattr(rates, "SEEDS", 2)
+    monkeypatch.setattr(rates, "TIMED_AGAIN", 1)
+    monkeypatch.setattr(gate, "TIMED_AGAIN", 1)
     monkeypatch.setattr(rates, "SOUND", "fake_good")
     monkeypatch.setattr(rates, "SOUND_FOR", {})
     monkeypatch.setattr(rates, "_target", lambda name: name)
@@ -96,7 +101,7 @@ def test_unchanged_code_and_defects_are_judged_and_written_down(
 ) -> None:
     monkeypatch.setattr(rates, "DEFECTS", (fake_bad,))
     found = rates.measure(tmp_path / "out", tmp_path, reruns=2, workers=2)
-    assert [trial.name for trial in found.unchanged] == ["seeds 2 to 3", "seeds 4 to 5"]
+    assert [trial.name for trial in found.unchanged] == ["seeds 3 to 4", "seeds 6 to 7"]
     (defect,) = found.defects
     assert defect.alarm and any("psnr" in check.what for check in defect.flagged)
     text = (tmp_path / "out" / "rates.md").read_text()
@@ -111,7 +116,7 @@ def fake_bad() -> None:
 @pytest.mark.usefixtures("on_fakes")
 def test_a_defect_that_fails_is_none_that_was_caught(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rates, "DEFECTS", (fake_raising,))
-    with pytest.raises(InputError, match="fake_raising, seed 2: expected a result to judge"):
+    with pytest.raises(InputError, match="fake_raising, seed 3: expected a result to judge"):
         rates.measure(tmp_path / "out", tmp_path, reruns=0, workers=2)
 
 
@@ -127,3 +132,15 @@ def test_a_method_may_be_named_by_its_path_and_is_known_by_its_source() -> None:
     for wrong in ("benchmarks.nothing:holes", "nothing.at.all:f"):
         with pytest.raises(InputError, match="unknown method"):
             find_method(wrong)
+
+
+def test_more_cells_are_run_of_all_methods_or_of_some(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = fakes.write_capture(tmp_path / "capture")
+    fakes.use(tmp_path / "plugins", monkeypatch)
+    suite = read_suite(fakes.write_suite(tmp_path, capture))
+    options = RunOptions(out=tmp_path / "out", data=tmp_path, workers=1)
+    both = run_again(suite, options, [7])
+    assert [(result.config.method, result.config.seed) for result in both] == [("fake_good", 7), ("fake_bad", 7)]
+    assert all(result.timing is not None for result in both)
+    (one,) = run_again(suite, options, [7], {(both[1].config.place, "fake_bad")})
+    assert one == both[1], "what is there is not run again"
