@@ -23,6 +23,7 @@ from benchmarks.suites.runs import Run
 REFERENCE = "ash"
 RIVALS = ("ddc", "wo_mot")  # Of many rows, those that are shown person by person, and the user's own.
 FEW = 5
+FEW_PEOPLE = 4  # whose pictures are shown at twice their size
 NOTE = (
     "Foreground PSNR. Standard deviations: between captures (people in their outfits), and between trainings of one "
     "capture from other seeds; n/a where no capture has two seeds, and then the spread between captures holds theirs."
@@ -68,7 +69,7 @@ def pictured(
     lines = [Frames(title="", images=line) for line in zip(*columns, strict=True)]
     file = f"pictures_people_{scene}.png"
     strips = Strips(file=file, title=f"Everybody on {scene}", groups=tuple(groups))
-    return strips, {file: pictures.sheet(lines, scale=1)}
+    return strips, {file: pictures.sheet(lines, scale=1 if len(columns) > FEW_PEOPLE else 2)}
 
 
 def _persons(

@@ -6,6 +6,7 @@ into Markdown is a sheet: one PNG.
 
 import base64
 import io
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -146,7 +147,10 @@ def sheet(rows: Sequence[Frames], *, scale: int = 2) -> bytes:
     gap, caption = 10, 34
     lines = [line for row in rows for line in (row.images, row.errors) if line]
     columns = max(len(row.images) for row in rows)
-    wide = max(frame.pixels.shape[1] for line in lines for frame in line) * scale + gap
+    frames = [frame for line in lines for frame in line]
+    texts = [text for frame in frames for text in (frame.caption, frame.score)]
+    pictures, words = (frame.pixels.shape[1] * scale for frame in frames), map(font.getlength, texts)
+    wide = math.ceil(max(*pictures, *words)) + gap
     heights = [max(frame.pixels.shape[0] for frame in line) * scale + caption + gap for line in lines]
     paper = Image.new("RGB", (columns * wide + gap, sum(heights) + gap), (255, 255, 255))
     pen, top = ImageDraw.Draw(paper), gap
