@@ -10,6 +10,7 @@ from benchmarks.analysis.scores import HELD_OUT_SPLITS
 from benchmarks.analysis.statistics import intervals
 
 BINS, LEAST = 5, 3  # at most so many bins of motion, of so many frames or more
+NARROW_DEG = 1.0  # Motion that stays within it is none: a curve would be a point.
 COLUMNS = ("scene", "method", "novelty_deg", "psnr", "low", "high")
 
 
@@ -18,7 +19,7 @@ def curves(images: pd.DataFrame) -> pd.DataFrame:
 
     `images`: see `scores.images_of`. Held-out views of training poses stand at zero degrees; the frames of all
     held-out motion are sorted by their novelty into bins of equal number, each at its mean. Intervals are those of
-    `statistics.intervals`. Scenes whose frames fill fewer than two bins have no curve.
+    `statistics.intervals`. Scenes whose frames fill fewer than two bins, or lie within a degree, have no curve.
     """
     known = images[images["split"].isin(HELD_OUT_SPLITS) & images["novelty_deg"].notna()]
     rows = [row for scene, here in known.groupby("scene", sort=False) for row in _of_scene(str(scene), here)]
@@ -29,7 +30,7 @@ def _of_scene(scene: str, images: pd.DataFrame) -> Iterator[tuple[str, str, floa
     frames = images.drop_duplicates(["capture", "frame"])
     moved = frames.loc[frames["split"] != "novel_view", "novelty_deg"]
     count = min(BINS, len(moved) // LEAST)
-    if count < 2:
+    if count < 2 or moved.max() < NARROW_DEG:
         return
     edges = np.quantile(moved, np.linspace(0, 1, count + 1)[1:-1])
     of_image = pd.Series(1 + np.searchsorted(edges, images["novelty_deg"], side="right"), index=images.index)

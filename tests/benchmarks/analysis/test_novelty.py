@@ -60,6 +60,12 @@ def test_intervals_are_over_seeds_of_one_capture_and_over_captures_of_several():
     np.testing.assert_allclose(captures["high"] - captures["psnr"], half, rtol=1e-5)
 
 
+def test_one_pose_has_no_curve():
+    images = images_of([result("ash", 0, 0.5)])
+    assert novelty.curves(images.assign(novelty_deg=images["novelty_deg"] / 25)).empty
+    assert not novelty.curves(images.assign(novelty_deg=images["novelty_deg"] / 20)).empty
+
+
 def test_results_from_before_novelty_have_no_curve():
     old = result("ash", 0, 0.5)
     views = [replace(v, scores={("foreground", "psnr"): 20.0}) for v in old.views if v.split == "novel_view"]
