@@ -157,14 +157,15 @@ def settle(
     `again`: results of another cell for each of some methods on their scenes; its second argument counts the calls.
     """
     timed: list[CellResult] = []
-    for attempt in range(TIMED_AGAIN):
-        checks = judge(baseline, summarise(suite, results, timed))
+    slow: set[Pair] = set()
+    for attempt in range(TIMED_AGAIN + 1):
+        timed += again(slow, attempt - 1) if attempt else ()
+        head = summarise(suite, results, timed)
+        checks = judge(baseline, head)
         slow = {(check.scene, check.method) for check in checks if (check.kind, check.verdict) == ("time", "fail")}
         if not slow:
             break
-        timed += again(slow, attempt)
-    head = summarise(suite, results, timed)
-    return head, judge(baseline, head)
+    return head, checks
 
 
 def markdown(baseline: Baseline, head: Baseline, checks: Sequence[Check]) -> str:

@@ -10,14 +10,14 @@ from pathlib import Path
 
 from ash.files import InputError, write_atomic, write_json
 from benchmarks.analysis.statistics import wilson
-from benchmarks.cell.cells import Cell, CellResult, result_of
+from benchmarks.cell.cells import CellResult
+from benchmarks.gate.again import run_again
 from benchmarks.gate.defects import DEFECTS
 from benchmarks.gate.gate import FINE, TIMED_AGAIN, Baseline, Check, settle, summarise
 from benchmarks.suites.captures import make_capture, require_intact
 from benchmarks.suites.files import find_suite
 from benchmarks.suites.progress import Progress
-from benchmarks.suites.runs import RunOptions, cell_for, run_missing
-from benchmarks.suites.suites import CellSpec
+from benchmarks.suites.runs import RunOptions
 
 SEEDS = 3
 SOUND = "ash"
@@ -54,17 +54,16 @@ def measure(out: Path, data: Path, *, reruns: int, workers: int) -> Trust:
         KeyboardInterrupt: trainings were interrupted; the next call goes on with them.
     """
     suite = find_suite("ci")
-    spec = suite.captures[0]
-    folder = make_capture(spec, data, workers=workers)
-    require_intact(folder)
     options = RunOptions(out=out, data=data, workers=workers, cells=1)
+    for capture in suite.captures:
+        require_intact(make_capture(capture, data, workers=workers))
 
     def run(method: str, seeds: Sequence[int]) -> list[CellResult]:
         """Results of a method under the sound one's name."""
-        specs = [CellSpec(capture=spec, method=method, preset=suite.preset, seed=seed) for seed in seeds]
-        cells = [cell_for(one, folder, out) for one in specs]
-        run_missing(cells, suite, options)
-        return [_as(SOUND, cell) for cell in cells]
+        results = run_again(suite.narrowed(methods=(method,)), options, seeds)
+        if len(results) < len(seeds):
+            raise KeyboardInterrupt("some trainings were interrupted")
+        return [_as(SOUND, result) for result in results]
 
     def baseline(method: str) -> Baseline:
         own, more = _seeds(0)
@@ -134,12 +133,9 @@ def _target(defect: str) -> str:
     return f"benchmarks.gate.defects:{defect}"
 
 
-def _as(method: str, cell: Cell) -> CellResult:
-    """The result of a cell under another method's name."""
-    result = result_of(cell)
-    if result is None:
-        raise KeyboardInterrupt("some trainings were interrupted")
+def _as(method: str, result: CellResult) -> CellResult:
+    """A result under another method's name."""
     if result.status != "done":
-        name, seed = cell.config.method, cell.config.seed
+        name, seed = result.config.method, result.config.seed
         raise InputError(f"{name}, seed {seed}: expected a result to judge, got {result.reason}")
     return replace(result, config=replace(result.config, method=method))

@@ -14,8 +14,7 @@ from ash.capture.dataset import Capture, Pose
 from ash.files import InputError, read_json
 from ash.protocol import Avatar, StageClock
 from benchmarks.cell.methods import code_version, find_method
-from benchmarks.gate import defects, gate, rates
-from benchmarks.gate.again import run_again
+from benchmarks.gate import again, defects, gate, rates
 from benchmarks.suites.files import read_suite
 from benchmarks.suites.runs import RunOptions
 
@@ -86,7 +85,8 @@ def on_fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rates of methods that need no training: the names of defects are names of methods."""
     capture = fakes.write_capture(tmp_path / "capture")
     fakes.use(tmp_path / "plugins", monkeypatch)
-    monkeypatch.setattr(rates, "make_capture", lambda *_, **__: capture)
+    for module in (rates, again):
+        monkeypatch.setattr(module, "make_capture", lambda *_, **__: capture)
     monkeypatch.setattr(rates, "SEEDS", 2)
     monkeypatch.setattr(rates, "TIMED_AGAIN", 1)
     monkeypatch.setattr(gate, "TIMED_AGAIN", 1)
@@ -139,8 +139,8 @@ def test_more_cells_are_run_of_all_methods_or_of_some(tmp_path: Path, monkeypatc
     fakes.use(tmp_path / "plugins", monkeypatch)
     suite = read_suite(fakes.write_suite(tmp_path, capture))
     options = RunOptions(out=tmp_path / "out", data=tmp_path, workers=1)
-    both = run_again(suite, options, [7])
+    both = again.run_again(suite, options, [7])
     assert [(result.config.method, result.config.seed) for result in both] == [("fake_good", 7), ("fake_bad", 7)]
     assert all(result.timing is not None for result in both)
-    (one,) = run_again(suite, options, [7], {(both[1].config.place, "fake_bad")})
+    (one,) = again.run_again(suite, options, [7], {(both[1].config.place, "fake_bad")})
     assert one == both[1], "what is there is not run again"
