@@ -20,6 +20,7 @@ from benchmarks.analysis.statistics import independent, mean_interval
 from benchmarks.cell.cells import CellConfig, CellResult
 from benchmarks.cell.metrics import METRICS
 from benchmarks.suites.suites import capture_name
+from synth.person.cast import VALIDATION
 
 COLUMNS = (
     "scene",
@@ -240,6 +241,10 @@ class Scores:
     def captures(self, scene: str) -> int:
         """How many captures a scene has."""
         return self._captures.get(scene, 0)
+
+    def for_choosing(self, scene: str) -> bool:
+        """Whether the people of a scene are those for validation and tuning."""
+        return bool((self.clean.loc[self.clean["scene"] == scene, "subject"] >= VALIDATION).any())
 
     def unit(self, scene: str) -> str:
         """What intervals of a scene are taken over."""

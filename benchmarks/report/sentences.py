@@ -9,10 +9,15 @@ from benchmarks.analysis.names import EXACT, SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Scores, foreground
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.methods import is_oracle
+from synth.person.cast import VALIDATION
 
 TOO_CLOSE_DB = 0.1
 CLOCKS_APART_S, CLOCKS_APART = 5.0, 0.5  # seconds, and share of the shorter: what a busy machine does not explain
 FEW_METHODS = 6
+CHOOSING = (
+    f"People from {VALIDATION} on: these numbers are there to choose by, and no verdict. What they choose, others are to"
+    " confirm."
+)
 DRAWN_BY = {
     "display": "frames are timed as its display draws them, by OpenGL",
     "trainer": "frames are timed as its training renderer draws them, for this machine opens no OpenGL display",
@@ -46,7 +51,8 @@ def _finding(scores: Scores, scene: str) -> str:
 
 def remarks(scores: Scores, scene: str) -> list[str]:
     """What else must be known to read the numbers: the exact surface, cost, template, noise, seeds, failures."""
-    found = [_exact(scores, scene), _cost(scores, scene), _template(scores, scene), _noise(scores, scene)]
+    found = [CHOOSING] if scores.for_choosing(scene) else []
+    found += [_exact(scores, scene), _cost(scores, scene), _template(scores, scene), _noise(scores, scene)]
     choices = scores.outcomes.query("scene == @scene and choice != ''").drop_duplicates(["method", "choice"])
     said = [f"{look_of(method).title}: {choice}" for method, choice in zip(choices.method, choices.choice, strict=True)]
     found.append(f"What a search found to suffice: {'; '.join(said)}." if said else "")

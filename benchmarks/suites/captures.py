@@ -79,18 +79,25 @@ def subject_of(manifest: Manifest) -> int:
     return number
 
 
-def require_published(suite: Suite) -> None:
-    """Refuse a suite with captures for validation and tuning: what was tuned on them may not be judged by them.
+def require_kept_apart(suite: Suite) -> None:
+    """Refuse captures for validation and tuning, or all others where the suite is there to choose by.
+
+    What was tuned on a capture may not be judged by it.
 
     Raises:
-        InputError: a finished capture has a subject or a root seed from 100 on.
+        InputError: a finished capture has a subject or a root seed from 100 on, or for choosing, neither.
     """
     for spec in suite.captures:
         if spec.folder is None:
             continue
         manifest = read_manifest(spec.folder)
-        for what, number in (("subject", subject_of(manifest)), ("seed", manifest.seed)):
-            if number >= VALIDATION:
+        subject, seed = subject_of(manifest), manifest.seed
+        if suite.validation and max(subject, seed) < VALIDATION:
+            raise InputError(
+                f"{spec.folder}: subject {subject} is for tables, expected one from {VALIDATION} on to choose by"
+            )
+        for what, number in (("subject", subject), ("seed", seed)):
+            if number >= VALIDATION and not suite.validation:
                 raise InputError(
                     f"{spec.folder}: {what} {number} is for validation and tuning, expected one below {VALIDATION}"
                 )

@@ -78,7 +78,7 @@ def read_suite(path: Path) -> Suite:
     return _Reader(path, text).suite(content)
 
 
-SUITE_KEYS = tuple(field.name for field in fields(Suite) if field.name != "name")
+SUITE_KEYS = tuple(field.name for field in fields(Suite) if field.name not in ("name", "validation"))
 REQUIRED = ("scenes", "methods", "preset")
 SCENE_KEYS, METHOD_KEYS = ("name", "of", "size", "capture"), ("name", "of", "preset")
 

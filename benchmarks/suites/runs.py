@@ -17,6 +17,7 @@ from benchmarks.suites.captures import make_capture, require_intact, subject_of,
 from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells, shard_of
 from benchmarks.suites.progress import Progress
 from benchmarks.suites.suites import CellSpec, Suite
+from synth.person.cast import VALIDATION
 
 RUN_FILE = "run.json"
 
@@ -164,6 +165,9 @@ def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
     """The finished cells of several runs as one, to be reported in `out`; a cell that several have is taken once.
 
     Where one scene's name stands for different captures of a subject, each is called as its capture's folder is.
+
+    Raises:
+        InputError: a folder is no run, or people for validation are among others.
     """
     runs = [read_run(folder) for folder in folders]
     cells = list({cell.config.key: cell for run in runs for cell in run.cells}.values())
@@ -171,6 +175,10 @@ def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
     for cell in cells:
         shown.setdefault((cell.config.place, cell.config.subject), set()).add(cell.config.truth)
     mixed = {place for (place, _), truths in shown.items() if len(truths) > 1}
+    if len({cell.config.subject >= VALIDATION for cell in cells}) > 1:
+        raise InputError(
+            f"{out}: people from {VALIDATION} on are there to choose by, expected a report without the others"
+        )
     named = [_told_apart(cell) if cell.config.place in mixed else cell for cell in cells]
     about = f"cells of {', '.join(map(str, folders))}"
     return Run(folder=out, suite=out.name, about=about, command=command, cells=tuple(named))

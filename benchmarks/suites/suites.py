@@ -92,6 +92,7 @@ class Suite:
     stresses: tuple[Stress, ...] = ()
     limit_minutes: float = 60.0
     limit_mb: int = 8192
+    validation: bool = False  # on the people that are there to choose by, whom no table of results has
 
     def __post_init__(self) -> None:
         """Refuse what makes no table."""
@@ -118,6 +119,12 @@ class Suite:
                 raise InputError(f"{name}: expected more than 0, got {getattr(self, name)}")
 
     @property
+    def people(self) -> range:
+        """The subjects."""
+        first = VALIDATION if self.validation else 0
+        return range(first, first + self.subjects)
+
+    @property
     def captures(self) -> tuple[CaptureSpec, ...]:
         """One capture per subject and scene, and one per stress of it, shared by all methods and seeds.
 
@@ -125,10 +132,10 @@ class Suite:
         """
         return tuple(
             _capture(scene, self.size, stress, subject)
-            for subject in range(self.subjects)
+            for subject in self.people
             for stress in (None, *self.stresses)
             for scene in self.scenes
-            if not (scene.folder and subject)
+            if not scene.folder or subject == self.people[0]
         )
 
     @property

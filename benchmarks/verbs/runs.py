@@ -56,6 +56,7 @@ class RunVerb:
     device: DeviceName = CPU  # where methods learn and draw that can choose: cpu, cuda, cuda:1, or auto
     seeds: CountIfAny = None  # train every method with so many seeds
     subjects: CountIfAny = None  # on captures of so many people, from subject 0 on
+    validation: FlagCreatePairsOff[bool] = False  # on the people from 100 on: to choose by, not to report
     out: Folder | None = None  # where results go; default: runs/SUITE
     data: Folder = Path("data")  # where captures are kept
     workers: CountIfAny = None  # cells side by side; default: all cores, on CUDA all GPUs
@@ -68,14 +69,14 @@ class RunVerb:
     def __call__(self) -> int:
         """Captures, cells, report."""
         from benchmarks.provenance import cores
-        from benchmarks.suites.captures import require_published
+        from benchmarks.suites.captures import require_kept_apart
         from benchmarks.suites.runs import RunOptions
 
         local = self.executor == LOCAL
         device = chosen_device(self.device, here=local)
         gpus = gpus_for(device) if local else ()
         suite = on_device(self._chosen(), device)
-        require_published(suite)
+        require_kept_apart(suite)
         _use_lpips(self.lpips_weights)
         options = RunOptions(
             out=self.out or Path("runs") / suite.name,
@@ -107,6 +108,7 @@ class RunVerb:
             preset=self.preset,
             seeds=self.seeds,
             subjects=self.subjects,
+            validation=self.validation,
         )
 
     def _scenes(self, suite: "Suite") -> "tuple[SceneSpec, ...]":
@@ -118,8 +120,11 @@ class RunVerb:
             raise InputError("--capture takes the place of the scenes: expected it or --scenes")
         rows = {row.name: row for row in suite.scenes}
         for name in self.scenes:
-            if name not in rows:
-                scene_of(name, size=self.size or suite.size)
+            if name in rows:
+                continue
+            scene_of(name, size=self.size or suite.size)
+            if variants := [row.name for row in suite.scenes if row.of == name]:
+                raise InputError(f"{suite.name} has {name!r} as {', '.join(variants)}: expected that name in --scenes")
         return given_captures(self.capture) or tuple(rows.get(name, SceneSpec(name=name)) for name in self.scenes)
 
 

@@ -165,6 +165,31 @@ def test_a_run_refuses_what_is_for_validation_and_training_does_not(
     assert json.loads(cell.read_text())["config"]["subject"] == (number if what == "subject" else 0)
 
 
+def test_people_to_choose_by_have_runs_of_their_own_which_say_so(capture: Path, tmp_path: Path, capsys) -> None:
+    chosen = tmp_path / "capture"
+    shutil.copytree(capture, chosen)
+    manifest = read_manifest(chosen)
+    replace(manifest, parameters=manifest.parameters | {"subject": 100}).write(chosen)
+    run = ["run", "ci", "--methods", "fake_good"]
+    search, table = tmp_path / "search", tmp_path / "table"
+    assert cli.main([*run, "--validation", "--capture", str(chosen), "--out", str(search)]) == arguments.DONE
+    assert cli.main([*run, "--capture", str(capture), "--out", str(table)]) == arguments.DONE
+    assert "to choose by, and no verdict" in (search / "report.md").read_text()
+    assert "to choose by" not in (table / "report.md").read_text()
+    own = ("--validation", "--capture", str(capture), "--out", str(search))
+    assert "subject 0 is for tables, expected one from 100 on" in refused_last(capsys, *run, *own)
+    mixed = ("report", str(search), str(table), "--out", str(tmp_path / "both"))
+    assert "expected a report without the others" in refused_last(capsys, *mixed)
+
+
+def test_a_scene_that_a_suite_has_under_other_names_only_is_asked_for_by_them(tmp_path: Path, capsys) -> None:
+    suite = tmp_path / "mine.toml"
+    suite.write_text('scenes = [{ of = "still", rig.cameras = 160 }]\nmethods = ["ash"]\npreset = "ci"\n')
+    told = refused(capsys, "run", str(suite), "--scenes", "still", "--dry-run")
+    assert "mine has 'still' as still+cameras=160: expected that name in --scenes" in told
+    assert cli.main(["run", str(suite), "--scenes", "still+cameras=160", "--dry-run"]) == arguments.DONE
+
+
 def test_the_reference_holds_the_public_names(tmp_path: Path) -> None:
     pytest.importorskip("pdoc", reason="of the extra dev")
     assert ash_bench("docs", "--out", str(tmp_path)).returncode == arguments.DONE

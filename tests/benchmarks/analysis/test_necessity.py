@@ -9,7 +9,7 @@ import pytest
 from helpers.cells import cell
 from scipy import stats
 
-from benchmarks.analysis.necessity import EXPECTED, Matrix, Need, Part, corrected, doses, matrix
+from benchmarks.analysis.necessity import EXPECTED, ON_TRIAL, Matrix, Need, Part, corrected, doses, matrix
 from benchmarks.analysis.scores import Scores, scores_of
 from benchmarks.analysis.statistics import Difference, paired
 from benchmarks.cell.cells import CellResult, Summary, failed_result
@@ -228,11 +228,13 @@ def test_the_ladder_has_a_row_for_every_expected_part_and_doses_of_known_strengt
             assert replace(captures[f"{of}{ending}"], name=of) == expected
             (dose,) = [scene for scene in suite.scenes if scene.name == f"{of}{ending}"]
             assert dose.methods == ("ash", *EXPECTED[of]), "what the doses of its report ask for, and no more"
-    assert all(not scene.methods for scene in suite.scenes if scene.name in EXPECTED)
+    ran = {scene.name: scene.methods for scene in suite.scenes}
+    assert all({"ash", *EXPECTED[name]} <= set(ran[name]) for name in (*RUNGS, "skinned", "still", "splats"))
+    assert set(ON_TRIAL) <= set(ran["skinned"]), "where no part should be needed, all are tried"
     assert {f"{of}_half" for of in RUNGS} <= set(captures)
 
 
-def test_the_ladders_mlp_is_ash_but_for_its_decoders() -> None:
-    suite = find_suite("ladder")
-    (mlp,) = [row for row in suite.methods if "mlp" in row.name]
+def test_the_mlp_with_a_learned_base_is_ash_but_for_its_decoders() -> None:
+    suite = find_suite("table")
+    (mlp,) = [row for row in suite.methods if row.name == "mlp_base"]
     assert not mlp.changes and offered(mlp.name, suite.preset) == offered("ash", suite.preset)

@@ -74,6 +74,12 @@ def test_a_scene_may_name_the_methods_that_run_on_it(tmp_path: Path) -> None:
     assert read_suite(written(tmp_path, given)).scenes[0].methods == ("ash",)
 
 
+def test_people_to_choose_by_are_numbered_from_100_on(tmp_path: Path) -> None:
+    suite = read_suite(written(tmp_path, GOOD)).narrowed(subjects=2, validation=True)
+    assert {capture.subject for capture in suite.captures} == {100, 101}
+    assert {capture.subject for capture in suite.narrowed(validation=False).captures} == {0, 1}
+
+
 def test_an_ablation_is_three_lines(tmp_path: Path) -> None:
     assert [row.name for row in read_suite(written(tmp_path, TABLES)).methods] == ["ash", "ash+width=4"]
 
