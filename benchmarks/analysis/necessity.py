@@ -40,6 +40,13 @@ EXPECTED = {
     "turning": ("wo_heading",),
     "loose": ("unlearned",),
 }
+# Where a surprise has an experiment: the scene that shows why, and what is different there.
+SHADELESS = ("shadeless", "under an even sky, where no shade depends on the pose")
+EXPERIMENTS = {
+    **{(scene, "wo_mot"): SHADELESS for scene in ("skinned", "lit", "turning")},
+    ("turning", "wo_heading"): ("turned_wrinkles", "with wrinkles to decode at headings never seen"),
+    ("wrinkles", "wo_disp"): ("wrinkles_twice", "with wrinkles twice as large"),
+}
 ON_TRIAL = tuple(dict.fromkeys(row for rows in EXPECTED.values() for row in rows))  # Of others nothing is expected.
 ZERO_DOSE = "skinned"  # A rung of strength 0 has its images, bit for bit.
 DOSES = {"_half": 0.5, "": 1.0, "_twice": 2.0}  # how a scene's name ends, times the rung's strength
@@ -69,6 +76,7 @@ class Need:
     part: Part
     loss: Difference | None
     p_adjusted: float = math.nan
+    elsewhere: Difference | None = None  # the same loss in the experiment of `EXPERIMENTS`
 
     @property
     def expected(self) -> bool:
@@ -89,13 +97,19 @@ class Need:
         """How the cell contradicts the expected diagonal; empty where it does not."""
         if self.loss is None or self.scene not in EXPECTED or self.part.row not in ON_TRIAL:
             return ""
-        size = f"{self.loss.mean:+z.2f} dB [{self.loss.low:+z.2f}, {self.loss.high:+z.2f}]"
-        what = f"{self.scene}, {self.part.title}: {size}"
+        what = f"{self.scene}, {self.part.title}: {told(self.loss)}"
         if self.expected and self.verdict in ("not needed", "harmful"):
-            return f"{what}, {self.verdict} where it should be needed."
+            return f"{what}, {self.verdict} where it should be needed.{self._experiment}"
         if not self.expected and self.verdict in ("needed", "harmful"):
-            return f"{what}, {self.verdict} though nothing in the scene asks for it."
+            return f"{what}, {self.verdict} though nothing in the scene asks for it.{self._experiment}"
         return ""
+
+    @property
+    def _experiment(self) -> str:
+        if self.elsewhere is None:
+            return ""
+        scene, differs = EXPERIMENTS[self.scene, self.part.row]
+        return f" By experiment, {differs} ({scene}): {told(self.elsewhere)}."
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -135,11 +149,27 @@ def matrix(scores: Scores, split: str) -> Matrix | None:
     if len(scenes) < 2 or all(part.row == RIVAL for part in parts):
         return None
     needs = [
-        Need(scene=scene, part=part, loss=difference(scores, scene, part.within, part.without, split))
+        Need(
+            scene=scene,
+            part=part,
+            loss=difference(scores, scene, part.within, part.without, split),
+            elsewhere=_elsewhere(scores, scene, part, split),
+        )
         for scene in scenes
         for part in parts
     ]
     return Matrix(split=split, scenes=scenes, parts=parts, needs=corrected(needs))
+
+
+def _elsewhere(scores: Scores, scene: str, part: Part, split: str) -> Difference | None:
+    place, _ = EXPERIMENTS.get((scene, part.row), ("", ""))
+    return difference(scores, place, part.within, part.without, split) if place in scores.scenes else None
+
+
+def told(loss: Difference) -> str:
+    """A loss with its interval, where one is known."""
+    interval = "" if math.isnan(loss.low) else f" [{loss.low:+z.2f}, {loss.high:+z.2f}]"
+    return f"{loss.mean:+z.2f} dB{interval}"
 
 
 def parts_of(scores: Scores, scenes: Sequence[str]) -> tuple[Part, ...]:

@@ -1,6 +1,7 @@
 """What each scene needs: the matrix as a picture and in numbers, its surprises, its doses, and what would suffice."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -10,7 +11,6 @@ from benchmarks.analysis import contrasts, necessity, pareto
 from benchmarks.analysis.names import SPLIT_NAMES, look_of
 from benchmarks.analysis.necessity import Dose, Matrix, Need
 from benchmarks.analysis.scores import RANKED_SPLITS, Quantity, Scores
-from benchmarks.analysis.statistics import Difference
 from benchmarks.cell.metrics import METRICS
 from benchmarks.report import charts, tables, vega
 from benchmarks.report.content import Block, Bullets, Chart, Entry, Head, Mark, Row, Section, Table, Text
@@ -24,7 +24,7 @@ NOTE = (
     "Harmful: as sure and as large a gain. Not needed: surely less is lost. One seed on one capture tells nothing."
 )
 UNTOLD = "One seed on one capture: what is needed cannot be told; --seeds 3 or --subjects 8 can."
-MANY_ROWS = 6  # from which on it is worth asking which of them would suffice
+MANY_ROWS = 3  # from which on it is worth asking which of them would suffice
 PARAMETERS = Quantity("memory", "", "params")
 
 
@@ -87,12 +87,14 @@ def _interval(need: Need) -> str:
 def _surprises(matrix: Matrix) -> tuple[Block, ...]:
     """In words: what contradicts the expected diagonal, and how much of it was found."""
     framed = [need for need in matrix.needs if need.expected]
-    if not framed:
+    if not any(need.loss for need in framed):
         return ()
-    found = sum(need.verdict == "needed" for need in framed)
+    counts = Counter(need.verdict for need in framed if need.loss)
     words = SPLIT_NAMES[matrix.split].words
     surprises = tuple(need.surprise for need in matrix.needs if need.surprise)
-    told = f"On {words}, {found} of {len(framed)} parts are needed where they should be."
+    told = f"On {words}, of {counts.total()} parts that were tried where they should be needed, {counts['needed']} are"
+    told += f" needed, {counts['not needed'] + counts['harmful']} are not,"
+    told += f" and of {counts['unclear'] + counts['unknown']} it cannot be told from so few people or seeds."
     told += " Surprises:" if surprises else " No surprises."
     return (Text(text=told), Bullets(items=surprises)) if surprises else (Text(text=told),)
 
@@ -157,15 +159,9 @@ def _dose_figure(found: Sequence[Dose], split: str) -> Figure:
 
 
 def _dose_sentence(dose: Dose) -> str:
-    course = ", ".join(f"{_loss(loss)} at {strength:g}" for strength, loss in dose.losses)
+    course = ", ".join(f"{necessity.told(loss)} at {strength:g}" for strength, loss in dose.losses)
     rises = "rises" if dose.rises else "does not rise"
     return f"{dose.scene}, {dose.part.title}: {course}; it {rises} with every dose."
-
-
-def _loss(loss: Difference) -> str:
-    """A loss with its interval, where one is known."""
-    interval = "" if math.isnan(loss.low) else f" [{loss.low:+z.2f}, {loss.high:+z.2f}]"
-    return f"{loss.mean:+z.2f} dB{interval}"
 
 
 def _sufficient_section(scores: Scores) -> list[Section]:

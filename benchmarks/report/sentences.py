@@ -15,7 +15,7 @@ TOO_CLOSE_DB = 0.1
 CLOCKS_APART_S, CLOCKS_APART = 5.0, 0.5  # seconds, and share of the shorter: what a busy machine does not explain
 FEW_METHODS = 6
 CHOOSING = (
-    f"People from {VALIDATION} on: these numbers are there to choose by, and no verdict. What they choose, others are to"
+    f"People from {VALIDATION} on: these numbers are there to choose by, and no verdict. What they choose, others must"
     " confirm."
 )
 DRAWN_BY = {
