@@ -14,6 +14,7 @@ FEW = 6  # Up to so many series are named where they are drawn, if there is room
 APART = 0.06  # of an axis, at least, between two of its ticks
 WIDTH = 900  # pixels of a chart in a file
 REAL_TIME_MS = 1e3 / 30
+LEAST_REACH_DB = 2.0  # that a whisker may stand out beyond all points of a chart of speed
 
 
 def speed(
@@ -24,7 +25,7 @@ def speed(
     `points`: panel, series, ms, psnr, low, high, ringed, and where it lies below the chart note and level, a count.
     `front`: panel, ms, psnr of the staircase. `links`: panel, link, ms, psnr.
     """
-    size, x, y = (380, 330), _log_domain(points["ms"], 1.5), _domain(points, ["psnr", "low", "high"])
+    size, x, y = (380, 330), _log_domain(points["ms"], 1.5), _domain(_cut(points), ["psnr", "low", "high"])
     sides = [_sides(own, series, "ms", "psnr", x=x, y=y, size=size) for _, own in points.groupby("panel", sort=False)]
     named = len(series) <= FEW and all(side is not None for side in sides)
     placed = points.assign(side=pd.concat([side for side in sides if side is not None]) if named else "")
@@ -352,6 +353,13 @@ def _domain(table: pd.DataFrame, columns: Sequence[str], pad: float = 0.1) -> tu
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
     room = pad * (high - low) or 1.0
     return low - room, high + room
+
+
+def _cut(points: pd.DataFrame) -> pd.DataFrame:
+    """With whiskers that stand out no farther than the points span, so that one failure hides no difference."""
+    low, high = points["psnr"].min(), points["psnr"].max()
+    reach = max(LEAST_REACH_DB, high - low)
+    return points.assign(low=points["low"].clip(lower=low - reach), high=points["high"].clip(upper=high + reach))
 
 
 def _log_domain(values: pd.Series, room: float) -> tuple[float, float]:

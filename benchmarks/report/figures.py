@@ -86,7 +86,8 @@ def _speed_caption(*, exact: bool, over: str) -> str:
     caption += " Grey staircase: the front of those that no other beats in both."
     if over:
         apart = ", what these add to all methods taken out" if over == "captures" else ""
-        caption += f" Whiskers: 95 % interval over {over}{apart}. Ringed: the smallest sufficient method."
+        caption += f" Whiskers: 95 % interval over {over}{apart}; one that reaches the edge goes on beyond it."
+        caption += " Ringed: the smallest sufficient method."
     return caption
 
 

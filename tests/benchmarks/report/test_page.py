@@ -6,6 +6,7 @@ from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from helpers import fakes
 from helpers.browser import DESKTOP, PHONE, Visit, Visitor
@@ -18,7 +19,7 @@ from benchmarks import cli
 from benchmarks.analysis.scores import Quantity, scores_of
 from benchmarks.cell.cells import CellResult, Summary, failed_result
 from benchmarks.cell.metrics import PROTOCOL
-from benchmarks.report import sentences, tables
+from benchmarks.report import charts, sentences, tables, vega
 from benchmarks.report.content import Text
 from benchmarks.report.figures import speed_figure
 from benchmarks.report.page import publish, write_report
@@ -98,6 +99,18 @@ def test_no_caption_tells_of_marks_that_are_not_there(run: Run) -> None:
         assert figure is not None
         captions.append(figure.caption)
     assert [told in caption for caption in captions] == [False, True]
+
+
+def test_one_failure_does_not_press_the_points_of_a_chart_together() -> None:
+    points = pd.DataFrame({"panel": "views", "series": ["a", "b"], "ms": [5.0, 9.0], "psnr": [30.0, 31.0]})
+    points = points.assign(low=[29.5, 0.0], high=[30.5, 60.0], ringed=False, note="", level=None)
+    front = pd.DataFrame({"panel": ["views"], "ms": [5.0], "psnr": [30.0]})
+    links = pd.DataFrame(columns=["panel", "link", "ms", "psnr"])
+    (panel,), _ = charts.speed(
+        points, front, links, [vega.Series(title=name, colour=vega.BLUE) for name in "ab"], notes={}
+    )
+    low, high = panel.to_dict()["layer"][0]["encoding"]["y"]["scale"]["domain"]
+    assert 27 < low < 28.1 and 32.9 < high < 34
 
 
 def test_markdown_and_latex_say_the_same_as_the_page(run: Run) -> None:
