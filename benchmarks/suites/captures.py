@@ -80,19 +80,19 @@ def subject_of(manifest: Manifest) -> int:
 
 
 def require_kept_apart(suite: Suite) -> None:
-    """Refuse captures for validation and tuning, or all others where the suite is there to choose by.
+    """Refuse captures for validation and tuning, and where the suite is there to choose by, people of the tables.
 
     What was tuned on a capture may not be judged by it.
 
     Raises:
-        InputError: a finished capture has a subject or a root seed from 100 on, or for choosing, neither.
+        InputError: a finished capture has a subject or a root seed from 100 on, or for choosing, a subject below.
     """
     for spec in suite.captures:
         if spec.folder is None:
             continue
         manifest = read_manifest(spec.folder)
         subject, seed = subject_of(manifest), manifest.seed
-        if suite.validation and max(subject, seed) < VALIDATION:
+        if suite.validation and subject < VALIDATION:
             raise InputError(
                 f"{spec.folder}: subject {subject} is for tables, expected one from {VALIDATION} on to choose by"
             )
