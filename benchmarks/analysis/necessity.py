@@ -41,9 +41,9 @@ EXPECTED = {
     "loose": ("unlearned",),
 }
 # Where a surprise has an experiment: the scene that shows why, and what is different there.
-SHADELESS = ("shadeless", "under an even sky, where no shade depends on the pose")
+OVERCAST = ("overcast", "under an even sky, where no lamp casts shadows")
 EXPERIMENTS = {
-    **{(scene, "wo_mot"): SHADELESS for scene in ("skinned", "lit", "turning")},
+    **{(scene, "wo_mot"): OVERCAST for scene in ("skinned", "lit", "turning")},
     ("turning", "wo_heading"): ("turned_wrinkles", "with wrinkles to decode at headings never seen"),
     ("wrinkles", "wo_disp"): ("wrinkles_twice", "with wrinkles twice as large"),
 }

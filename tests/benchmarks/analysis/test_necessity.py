@@ -105,10 +105,10 @@ def test_surprises_are_what_contradicts_the_expected_diagonal(ladder: Scores) ->
 def test_a_surprise_names_the_experiment_that_explains_it_where_it_was_run() -> None:
     base = {"ash": 27.0, "wo_mot": 26.0, "wo_disp": 27.0}
     shown = people("skinned", base) + people("wrinkles", base)
-    run = [*shown, *people("shadeless", base | {"wo_mot": 26.9}), *people("wrinkles_twice", base | {"wo_disp": 25.0})]
+    run = [*shown, *people("overcast", base | {"wo_mot": 26.9}), *people("wrinkles_twice", base | {"wo_disp": 25.0})]
     told = {need.surprise.partition(":")[0]: need.surprise for need in view(scores_of(run)).needs if need.surprise}
     assert "asks for it. By experiment, under an even sky" in told["skinned, w/o mot."]
-    assert "+0.10 dB" in told["skinned, w/o mot."].partition("(shadeless)")[2]
+    assert "+0.10 dB" in told["skinned, w/o mot."].partition("(overcast)")[2]
     assert "+2.00 dB" in told["wrinkles, w/o disp."].partition("(wrinkles_twice)")[2]
     assert not any("experiment" in need.surprise for need in view(scores_of(shown)).needs)
     ladder = {scene.name: set(scene.methods) for scene in find_suite("ladder").scenes}
