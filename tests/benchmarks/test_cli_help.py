@@ -1,0 +1,100 @@
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from helpers.commands import ash_bench, refused
+
+from benchmarks import cli
+from benchmarks.verbs import arguments
+
+pytestmark = pytest.mark.usefixtures("installed_fakes")
+
+
+def test_help_tells_a_methods_configuration(capsys) -> None:
+    with pytest.raises(SystemExit) as end:
+        cli.main(["train", "fake_tuned", "--help"])
+    assert end.value.code == 0
+    told = " ".join(re.sub("[│╭╮╰╯─]", " ", capsys.readouterr().out).split())
+    assert "--detail FLOAT" in told and "(default: 0.9)" in told and "--shift-m" in told
+
+
+def test_help_lists_every_verb_and_how_to_go_on(capsys) -> None:
+    assert cli.main(["--help"]) == arguments.DONE
+    told = capsys.readouterr().out
+    for verb in cli.VERBS:
+        assert re.search(rf"^  {verb} +[A-Z]", told, re.MULTILINE), verb
+    assert f"{arguments.own_name()} run my.toml" in told
+
+
+def test_a_verbs_help_needs_nothing_heavy() -> None:
+    code = """
+import sys
+from benchmarks.cli import VERBS, main
+for verb in VERBS:
+    try:
+        main([verb, "--help"])
+    except SystemExit as end:
+        assert end.code == 0, verb
+    heavy = {"torch", "mitsuba", "pandas", "altair", "scipy", "matplotlib"} & set(sys.modules)
+    assert not heavy, (verb, heavy)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert [verb for verb in cli.VERBS if f"ash-bench {verb}" not in done.stdout] == []
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("", "expected a verb"),
+        ("rn", "unknown verb 'rn', did you mean run"),
+        ("run --seeds 0", "--seeds: expected at least 1, got 0"),
+        ("run ci --subjects 101", "subjects: expected 1 to 100, got 101: those from 100 on are for validation"),
+        ("synth loose --subject -1", "--subject: expected at least 0, got -1"),
+        ("sheets --subjects 2 --scene tight", "--subjects shows people in both outfits: expected it or --scene"),
+        ("run --workers x", "--workers: expected a whole number, got 'x'"),
+        ("run --sedes 3", "unknown option '--sedes', did you mean --seeds"),
+        ("run ci extra", "unexpected 'extra'"),
+        ("run --scenes nosuch", "unknown scene 'nosuch', expected one of mannequin, "),
+        ("run --methods nosuch", "unknown method 'nosuch', expected one of"),
+        ("run --size huge --dry-run", "unknown size 'huge', expected one of ci, rung, quick, long, table, paper"),
+        ("speed else", "WHAT: expected one of kernels, frame, got 'else'"),
+        ("verify", "expected FOLDER"),
+        ("export", "expected FOLDER and --format"),
+        ("suites qiuck", "unknown suite 'qiuck', did you mean quick"),
+        ("synth tihgt", "unknown scene 'tihgt', did you mean tight"),
+        ("synth mannequin --rig.camers 24", "unknown option '--rig.camers', did you mean --rig.cameras"),
+        ("synth mannequin --rig.cameras many", "--rig.cameras: invalid literal"),
+        ("synth mannequin --size ci --rig.cameras 2000", "held out, expected 1 to all but one"),
+        ("train ash nowhere --model.texel 3", "unknown option '--model.texel', did you mean --model.texels"),
+        ("train ash nowhere --model.texels 3", "texels: expected a multiple of shuffle"),
+        ("train nearest nowhere --model.texels 3", "unknown option '--model.texels', expected one of --preset"),
+        ("train ash nowhere --preset chaep", "preset: expected one of ci, brief, cpu"),
+    ],
+)
+def test_wrong_use_is_one_line_and_exits_with_2(command: str, message: str, capsys) -> None:
+    assert message in refused(capsys, *command.split())
+
+
+def test_a_shell_can_complete_verbs_and_flags(tmp_path: Path) -> None:
+    script = ash_bench("--tyro-print-completion", "bash").stdout
+    (tmp_path / "completion").write_text(script)
+    asked = (
+        f"source {tmp_path}/completion; COMP_WORDS=(ash-bench {{}}); COMP_CWORD={{}}; "
+        "$(complete -p ash-bench | sed -E 's/.*-F ([^ ]+) .*/\\1/'); echo ${{COMPREPLY[@]}}"
+    )
+    for words, wanted in (("sy", "synth"), ("run --see", "--seeds")):
+        done = subprocess.run(
+            ["bash", "-c", asked.format(words, len(words.split()))], capture_output=True, text=True, check=True
+        )
+        assert wanted in done.stdout.split(), done
+
+
+def test_help_on_a_scene_and_on_a_method_lists_their_fields(capsys) -> None:
+    for command, flag in (("synth mannequin", "--rig.cameras"), ("train ash", "--model.texels"), ("synth", "--seed")):
+        with pytest.raises(SystemExit) as end:
+            cli.main([*command.split(), "--help"])
+        assert end.value.code == 0
+        assert flag in capsys.readouterr().out, command
