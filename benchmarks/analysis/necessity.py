@@ -1,7 +1,8 @@
 """What each scene needs: the loss when one part of ASH is taken away, scene by scene, against what should be needed.
 
-The parts are the rows that a run has. Significance is corrected over all cells of a matrix (Benjamini and Hochberg
-1995), so that one in twenty of what is called needed, at most, is so by chance.
+The parts are the rows that a run has. Few people tell little about how far a loss spreads over people, so the cells of
+a matrix lend each other their variances (Smyth 2004). Significance is corrected over all of them (Benjamini and
+Hochberg 1995), so that one in twenty of what is called needed, at most, is so by chance.
 """
 
 import math
@@ -15,7 +16,7 @@ from scipy import stats
 from benchmarks.analysis.contrasts import difference
 from benchmarks.analysis.names import look_of
 from benchmarks.analysis.scores import Scores
-from benchmarks.analysis.statistics import Difference
+from benchmarks.analysis.statistics import Difference, moderated
 from benchmarks.cell.methods import is_oracle
 from synth.presets import RUNGS
 
@@ -24,9 +25,9 @@ Verdict = Literal["needed", "not needed", "harmful", "unclear", "unknown"]
 WHOLE = "ash"  # the row that has every part
 REFERENCES = ("static", "nearest")  # They are less than ASH without one part.
 RIVAL = "ddc"  # a column of its own: what a mesh would lose in ASH's place
-# Of spherical harmonics ASH has degree 0 in our presets: what a degree is worth is told against degree 3.
-PAIRS = {"sh_3": ("sh_3", WHOLE), "sh_1": ("sh_3", "sh_1"), "sh_2": ("sh_3", "sh_2")}
-TITLES = {"sh_3": "SH 0, not 3", "sh_1": "SH 1, not 3", "sh_2": "SH 2, not 3"}
+# Of spherical harmonics ASH has degree 0 in our presets: what a degree is worth is told against the highest that ran.
+COLOUR = "sh_3"  # what the part is called, whichever degree was the highest
+DEGREES = {COLOUR: 3, "sh_2": 2, "sh_1": 1}
 # The expected diagonal: which rows lack what the one phenomenon of a scene asks for. Who lacks all motion lacks its
 # window as well; decoders are off without motion, which `skinned` should not need.
 EXPECTED = {
@@ -36,7 +37,7 @@ EXPECTED = {
     "wrinkles": ("wo_mot", "wo_disp", "wo_offset"),
     "swing": ("wo_mot", "window_1", "unlearned"),
     "lit": ("wo_phi", "wo_light", "wo_phi_and_light"),
-    "glossy": ("sh_3",),
+    "glossy": (COLOUR,),
     "turning": ("wo_heading",),
     "loose": ("unlearned",),
 }
@@ -58,14 +59,16 @@ LEVEL = 0.05
 class Part:
     """A column: what is lost from the row that has the part to the row that has not."""
 
-    row: str  # that the run has it by
+    row: str  # by which a scene asks for it
     within: str
     without: str
 
     @property
     def title(self) -> str:
         """What is missing, for readers."""
-        return TITLES.get(self.row, look_of(self.row).title)
+        if self.row not in DEGREES:
+            return look_of(self.row).title
+        return f"SH {DEGREES.get(self.without, 0)}, not {DEGREES[self.within]}"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -158,7 +161,7 @@ def matrix(scores: Scores, split: str) -> Matrix | None:
         for scene in scenes
         for part in parts
     ]
-    return Matrix(split=split, scenes=scenes, parts=parts, needs=corrected(needs))
+    return Matrix(split=split, scenes=scenes, parts=parts, needs=corrected(shared(needs)))
 
 
 def _elsewhere(scores: Scores, scene: str, part: Part, split: str) -> Difference | None:
@@ -175,18 +178,29 @@ def told(loss: Difference) -> str:
 def parts_of(scores: Scores, scenes: Sequence[str]) -> tuple[Part, ...]:
     """The columns: every row of the scenes that competes with ASH, those of the expected diagonal first."""
     rows = dict.fromkeys(row for scene in scenes for row in scores.methods(scene))
+    highest = next((row for row in DEGREES if row in rows), "")
     parts = []
     for row in sorted(rows, key=_column):
-        within, without = PAIRS.get(row, (WHOLE, row))
-        if row != WHOLE and row not in REFERENCES and not is_oracle(row) and within in rows:
-            parts.append(Part(row=row, within=within, without=without))
+        if row == WHOLE or row in REFERENCES or is_oracle(row):
+            continue
+        if row == highest:
+            parts.append(Part(row=COLOUR, within=highest, without=WHOLE))
+        elif (within := highest if row in DEGREES else WHOLE) in rows:
+            parts.append(Part(row=row, within=within, without=row))
     return tuple(parts)
 
 
-def _column(row: str) -> int:
-    """Where a row stands: in the order of the expected diagonal, degrees beside each other, all others behind."""
-    beside = next(iter(PAIRS)) if row in PAIRS else row
-    return ON_TRIAL.index(beside) if beside in ON_TRIAL else len(ON_TRIAL)
+def _column(row: str) -> tuple[int, int]:
+    """Where a row stands: in the order of the expected diagonal, degrees from the highest on, all others behind."""
+    beside = COLOUR if row in DEGREES else row
+    return ON_TRIAL.index(beside) if beside in ON_TRIAL else len(ON_TRIAL), -DEGREES.get(row, 0)
+
+
+def shared(needs: Sequence[Need]) -> list[Need]:
+    """The cells with variances that they lend each other; the rival, which spreads as it does, lends none."""
+    losses = {i: need.loss for i, need in enumerate(needs) if need.loss is not None and need.part.row != RIVAL}
+    found = dict(zip(losses, moderated(list(losses.values())), strict=True))
+    return [replace(need, loss=found.get(i, need.loss)) for i, need in enumerate(needs)]
 
 
 def corrected(needs: Sequence[Need]) -> tuple[Need, ...]:

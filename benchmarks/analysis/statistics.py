@@ -13,10 +13,13 @@ from typing import Any
 
 import numpy as np
 from scipy import stats
-from scipy.special import nctdtrinc
+from scipy.optimize import brentq
+from scipy.special import digamma, nctdtrinc, polygamma
 
 LEVEL = 0.95
 EXACT = 1e-12  # A spread of this share of the difference is rounding.
+ALIKE = 1e4  # Half of the degrees of freedom of variances that differ by chance alone: as good as infinite.
+LENDERS = 10  # Fewer variances say too little about what they have in common: 7 % false alarms of five.
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -243,6 +246,59 @@ def _difference(mean: float, spread: float, test: Callable[[], Any], level: floa
         spread=spread,
         effect=mean / spread,
         detectable=noncentrality(float(found.df), quantile) * error,
+    )
+
+
+def moderated(differences: Sequence[Difference], *, level: float = LEVEL) -> list[Difference]:
+    """Paired differences of many kinds over few captures, each with the variance that all of them make likely.
+
+    Three captures hardly tell how far a difference spreads over people. So each variance is drawn towards what the
+    others have in common, the more the more alike they are, and its interval counts with the freedom that this lends
+    it (the moderated t of Smyth 2004, prior by moments of log variances). The prior counts half: it comes from the
+    same few numbers, and in full raises 6.5 % false alarms at 5 % where variances spread as ours do; so, 4 to 5.3 %.
+
+    Fewer than ten differences, and those that are no pairs or do not spread, stay as they are; `spread` and `effect`
+    stay those of the captures.
+    """
+    lends = [each.pairs > 1 and each.spread > 0 for each in differences]
+    lenders = [each for each, able in zip(differences, lends, strict=True) if able]
+    if len(lenders) < LENDERS:
+        return list(differences)
+    prior = _prior([each.spread**2 for each in lenders], [each.pairs - 1 for each in lenders])
+    return [_moderated(each, prior, level) if able else each for each, able in zip(differences, lends, strict=True)]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Prior:
+    """What variances have in common: a typical one, and as how many degrees of freedom it counts."""
+
+    variance: float
+    freedom: float  # the more, the more alike they are
+
+
+def _prior(variances: Sequence[float], freedoms: Sequence[int]) -> _Prior:
+    """The scaled inverse chi-squared distribution that has the mean and spread of the variances' logarithms."""
+    half = np.asarray(freedoms) / 2
+    logs = np.log(variances) - digamma(half) + np.log(half)
+    apart = float(np.var(logs, ddof=1) - polygamma(1, half).mean())
+    least = float(polygamma(1, ALIKE))
+    own = brentq(lambda x: float(polygamma(1, x)) - apart, 1e-6, ALIKE) if apart > least else ALIKE
+    typical = float(np.exp(logs.mean() + digamma(own) - np.log(own)))
+    return _Prior(variance=typical, freedom=own)  # Half of Smyth's, see `moderated`.
+
+
+def _moderated(difference: Difference, prior: _Prior, level: float) -> Difference:
+    own = difference.pairs - 1
+    freedom = prior.freedom + own
+    variance = (prior.freedom * prior.variance + own * difference.spread**2) / freedom
+    error = math.sqrt(variance / difference.pairs)
+    quantile = float(stats.t.ppf((1 + level) / 2, freedom))
+    return replace(
+        difference,
+        low=difference.mean - quantile * error,
+        high=difference.mean + quantile * error,
+        p=float(2 * stats.t.sf(abs(difference.mean) / error, freedom)),
+        detectable=noncentrality(freedom, quantile) * error,
     )
 
 

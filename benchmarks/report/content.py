@@ -3,6 +3,7 @@
 The page and the Markdown are two templates over these; a new section is a few of them, and appears in both.
 """
 
+import base64
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -147,7 +148,22 @@ class Flipbook:
     chart: Figure
 
 
-Block = Text | Bullets | Table | Chart | Strips | Flipbook
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Sheet:
+    """A PNG of pictures that an earlier report left; `data` is the file's content."""
+
+    kind: ClassVar[str] = "sheet"
+    file: str
+    title: str
+    data: bytes
+
+    @property
+    def uri(self) -> str:
+        """The picture as an address that needs no other file."""
+        return f"data:image/png;base64,{base64.b64encode(self.data).decode()}"
+
+
+Block = Text | Bullets | Table | Chart | Strips | Flipbook | Sheet
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -21,6 +21,8 @@ LIMIT_DB = 2.0  # A loss of more has the deepest colour.
 NOTE = (
     "Foreground PSNR in dB that is lost when the column's row takes ASH's place, with its 95 % interval. Needed: a "
     f"loss of more than {necessity.MARGIN_DB} dB that is sure at 5 %, corrected over all cells (Benjamini-Hochberg). "
+    "Few people tell little about how far a loss spreads over people, so cells over several lend each other their "
+    "variances (moderated t, Smyth 2004), the mesh's column apart. "
     "Harmful: as sure and as large a gain. Not needed: surely less is lost. One seed on one capture tells nothing."
 )
 UNTOLD = "One seed on one capture: what is needed cannot be told; --seeds 3 or --subjects 8 can."

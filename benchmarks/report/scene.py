@@ -31,6 +31,7 @@ from benchmarks.report.content import (
     Head,
     Row,
     Section,
+    Sheet,
     Strips,
     Table,
     Text,
@@ -59,6 +60,8 @@ ON_SHEETS = ("ash", "ddc", "ash_truth", "ddc_truth")
 AT_MOST_ON_SHEETS = 5
 WORST, FEW_WORST, MANY = 3, 1, 24  # worst frames of each method; of more than so many methods on all scenes, one
 COLOURS = ("blue", "orange", "red", "ochre", "grey")  # of the regions
+SHEETS = {"pictures": "Truth, methods and errors", "pictures_people": "Everybody", "worst": "The worst frames"}
+KEPT = "Sheets of an earlier report of this run: the capture or the pictures of its cells are not here any more."
 SMALL = ("ci",)  # sizes and presets of smoke tests
 
 
@@ -260,7 +263,9 @@ def _picture_sections(
         strips, worst_sheet = _worst(data, capture, shown)
     except InputError as error:
         reason = trouble or f"No pictures: {error}. The numbers come from {data.run.folder} and do not need it."
-        return [Section(title=title, blocks=(Text(text=reason, note=True),))], {}
+        kept = _kept_sheets(data)
+        told = Text(text=KEPT if kept else reason, note=True)
+        return [Section(title=title, blocks=(*kept, told))], {sheet.file: sheet.data for sheet in kept}
     note = (
         "Cropped to the subject, on grey; compressed for this page, while scores come from the stored pictures. "
         "First seed. "
@@ -280,6 +285,14 @@ def _picture_sections(
             Section(title=f"The worst frames on {data.scene}, and why", blocks=(strips, Text(text=regions, note=True)))
         )
     return sections, sheets | cast_sheet | worst_sheet
+
+
+def _kept_sheets(data: SceneData) -> tuple[Sheet, ...]:
+    """What an earlier report left in the run's folder, for cells whose pictures are not here."""
+    places = {title: data.run.folder / f"{kind}_{data.scene}.png" for kind, title in SHEETS.items()}
+    return tuple(
+        Sheet(file=path.name, title=title, data=path.read_bytes()) for title, path in places.items() if path.is_file()
+    )
 
 
 def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Flipbook, dict[str, bytes]]:

@@ -79,6 +79,18 @@ def test_verdicts_are_what_the_numbers_allow(ladder: Scores) -> None:
     assert set(verdicts(scores_of(single)).values()) == {"unknown"}
 
 
+def test_degrees_of_colour_are_told_against_the_highest_that_was_run() -> None:
+    base = {"ash": 27.0, "sh_1": 27.9, "sh_2": 28.0}
+    results = people("skinned", {"ash": 27.0, "wo_mot": 26.0}) + people("glossy", base)
+    found = {need.part.title: need for need in view(scores_of(results)).needs if need.scene == "glossy"}
+    assert [title for title in found if title.startswith("SH")] == ["SH 0, not 2", "SH 1, not 2"]
+    assert found["SH 0, not 2"].expected and found["SH 0, not 2"].verdict == "needed"
+    assert not found["SH 1, not 2"].expected and found["SH 1, not 2"].verdict == "not needed"
+    alone = people("skinned", {"ash": 27.0, "wo_mot": 26.0}) + people("glossy", {"ash": 27.0, "sh_1": 27.9})
+    told = {need.part.title: need for need in view(scores_of(alone)).needs if need.scene == "glossy"}
+    assert told["SH 0, not 1"].expected and told["SH 0, not 1"].verdict == "needed"
+
+
 def test_one_scene_or_no_part_makes_no_matrix() -> None:
     assert matrix(scores_of(people("still", {"ash": 27.0, "wo_mot": 26.0})), "novel_view") is None
     alone = people("still", {"ash": 27.0, "ash_truth": 30.0}) + people("swing", {"ash": 27.0, "static": 20.0})
@@ -155,7 +167,7 @@ def test_the_matrix_is_a_picture_with_the_expected_cells_framed(ladder: Scores) 
     assert list(figures) == ["needs_novel_view", "needs_novel_pose", "doses_novel_view", "doses_novel_pose"]
     drawn = ElementTree.fromstring(figures["needs_novel_view"].svg())
     text = "".join(drawn.itertext())
-    assert "+1.50" in text and "1.4 to 1.6" in text and "SH 0, not 3" in text
+    assert "+1.50" in text and "1.5 to 1.5" in text and "SH 0, not 3" in text
     framed = [path for path in drawn.iter("{http://www.w3.org/2000/svg}path") if path.get("stroke-width") == "2.5"]
     expected = sum(need.expected for need in view(ladder).needs)
     assert len(framed) == expected == 5 - 1

@@ -3,6 +3,7 @@ import pytest
 from scipy import optimize, stats
 
 from benchmarks.analysis.statistics import (
+    Difference,
     compared,
     detectable,
     hierarchical_bootstrap,
@@ -11,6 +12,7 @@ from benchmarks.analysis.statistics import (
     intervals,
     kendall,
     mean_interval,
+    moderated,
     noncentrality,
     paired,
     redrawn,
@@ -86,6 +88,64 @@ def test_false_alarms_and_power_on_our_design() -> None:
         test = welch(list(rng.normal(effect, sigma, 3)), list(rng.normal(0, sigma, 3)))
         found += test.p < 0.05
     assert 0.65 < found / rounds < 0.88
+
+
+# Standard deviations of losses over people, dB, as far apart as those that the ladder shows.
+SPREADS = (
+    0.04,
+    0.31,
+    0.18,
+    0.64,
+    0.93,
+    0.96,
+    0.30,
+    0.25,
+    0.64,
+    0.03,
+    0.05,
+    0.16,
+    0.12,
+    0.13,
+    0.28,
+    0.28,
+    0.09,
+    0.20,
+    0.37,
+)
+
+
+def null_losses(rng: np.random.Generator, *, mean: float = 0.0, captures: int = 3) -> list[Difference]:
+    return [paired(list(rng.normal(mean, spread, captures)), [0.0] * captures) for spread in SPREADS]
+
+
+def test_variances_that_cells_lend_each_other_raise_no_more_alarms_and_find_more() -> None:
+    rng, rounds = np.random.default_rng(5), 150
+    nothing = [null_losses(rng) for _ in range(rounds)]
+    alarms = sum(each.p < 0.05 for losses in nothing for each in moderated(losses))
+    trials = rounds * len(SPREADS)
+    assert stats.binomtest(alarms, trials, 0.05, alternative="greater").pvalue > 0.01, alarms / trials
+    assert alarms / trials > 0.03, "a test that never alarms is none"
+    something = [null_losses(rng, mean=0.5) for _ in range(rounds)]
+    plain = sum(each.p < 0.05 for losses in something for each in losses)
+    assert sum(each.p < 0.05 for losses in something for each in moderated(losses)) > 1.1 * plain
+
+
+def test_variances_that_are_alike_count_as_known() -> None:
+    """A variance of two degrees of freedom is exp(gamma) times too small in the mean of its logarithm."""
+    alike = [paired([mean - 0.1, mean, mean + 0.1], [0.0, 0.0, 0.0]) for mean in np.linspace(-1, 1, 10)]
+    half = 1.96 * 0.1 * np.exp(np.euler_gamma / 2) / np.sqrt(3)
+    for before, after in zip(alike, moderated(alike), strict=True):
+        assert (after.low, after.high) == pytest.approx((before.mean - half, before.mean + half), abs=2e-4)
+        assert (after.mean, after.spread, after.pairs) == (before.mean, before.spread, 3)
+
+
+def test_what_is_too_few_or_no_pairs_keeps_its_variance() -> None:
+    losses = null_losses(np.random.default_rng(6))
+    assert moderated(losses[:9]) == losses[:9]
+    seeds, same = welch([1.0, 1.1], [2.0, 2.3]), paired([1.0, 1.0], [0.0, 0.0])
+    found = moderated([seeds, *losses, same])
+    assert (found[0], found[-1]) == (seeds, same) and found[1:-1] == moderated(losses)
+    assert sum(after.low > before.low for before, after in zip(losses, found[1:-1], strict=True)) > len(losses) / 2
 
 
 def power_of_80_percent(freedom: int) -> float:

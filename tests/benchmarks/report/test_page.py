@@ -1,3 +1,4 @@
+import base64
 import re
 import shutil
 import xml.etree.ElementTree as ElementTree
@@ -127,6 +128,15 @@ def test_the_report_does_without_the_capture(run: Run, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(run.folder, tmp_path / "copy"))
     for path in copy.rglob("config.json"):
         path.write_text(re.sub(r'"capture_folder": "[^"]*"', '"capture_folder": "/gone"', path.read_text()))
+    sheets = sorted(copy.glob("*_*.png"))
+    assert {"pictures_boxes.png", "worst_boxes.png"} <= {path.name for path in sheets}
+    kept = {path: path.read_bytes() for path in sheets}
+    write_report(read_run(copy))
+    page, plain = (copy / "report.html").read_text(), (copy / "report.md").read_text()
+    assert all(f"]({path.name})" in plain and base64.b64encode(data).decode() in page for path, data in kept.items())
+    assert kept == {path: path.read_bytes() for path in sheets}, "sheets of the earlier report"
+    for path in sheets:
+        path.unlink()
     write_report(read_run(copy))
     assert "No pictures: /gone/manifest.json" in (copy / "report.html").read_text()
     before, after = ((folder / "results.csv").read_text() for folder in (run.folder, copy))
