@@ -147,26 +147,41 @@ class Dose:
 
 def matrix(scores: Scores, split: str) -> Matrix | None:
     """The necessity matrix of a run, or None where it has fewer than two scenes with ASH and an ablation of it."""
-    scenes = tuple(scene for scene in scores.scenes if WHOLE in scores.methods(scene) and not _is_dose(scene))
-    parts = parts_of(scores, scenes)
+    scenes = tuple(scene for scene in _scenes(scores) if not _is_dose(scene))
+    parts = parts_of(scores)
     if len(scenes) < 2 or all(part.row == RIVAL for part in parts):
         return None
+    found = losses(scores, split)
     needs = [
         Need(
             scene=scene,
             part=part,
-            loss=difference(scores, scene, part.within, part.without, split),
-            elsewhere=_elsewhere(scores, scene, part, split),
+            loss=found.get((scene, part)),
+            elsewhere=found.get((EXPERIMENTS.get((scene, part.row), ("", ""))[0], part)),
         )
         for scene in scenes
         for part in parts
     ]
-    return Matrix(split=split, scenes=scenes, parts=parts, needs=corrected(shared(needs)))
+    return Matrix(split=split, scenes=scenes, parts=parts, needs=corrected(needs))
 
 
-def _elsewhere(scores: Scores, scene: str, part: Part, split: str) -> Difference | None:
-    place, _ = EXPERIMENTS.get((scene, part.row), ("", ""))
-    return difference(scores, place, part.within, part.without, split) if place in scores.scenes else None
+def losses(scores: Scores, split: str) -> dict[tuple[str, Part], Difference]:
+    """What every scene loses without every part that was tried there, with variances that these lend each other.
+
+    The rival's column spreads over people by causes of its own, and neither lends nor borrows.
+    """
+    found = {
+        (scene, part): loss
+        for scene in _scenes(scores)
+        for part in parts_of(scores)
+        if (loss := difference(scores, scene, part.within, part.without, split)) is not None
+    }
+    lenders = [place for place in found if place[1].row != RIVAL]
+    return found | dict(zip(lenders, moderated([found[place] for place in lenders]), strict=True))
+
+
+def _scenes(scores: Scores) -> tuple[str, ...]:
+    return tuple(scene for scene in scores.scenes if WHOLE in scores.methods(scene))
 
 
 def told(loss: Difference) -> str:
@@ -175,9 +190,9 @@ def told(loss: Difference) -> str:
     return f"{loss.mean:+z.2f} dB{interval}"
 
 
-def parts_of(scores: Scores, scenes: Sequence[str]) -> tuple[Part, ...]:
-    """The columns: every row of the scenes that competes with ASH, those of the expected diagonal first."""
-    rows = dict.fromkeys(row for scene in scenes for row in scores.methods(scene))
+def parts_of(scores: Scores) -> tuple[Part, ...]:
+    """The columns: every row that competes with ASH somewhere, those of the expected diagonal first."""
+    rows = dict.fromkeys(row for scene in _scenes(scores) for row in scores.methods(scene))
     highest = next((row for row in DEGREES if row in rows), "")
     parts = []
     for row in sorted(rows, key=_column):
@@ -196,13 +211,6 @@ def _column(row: str) -> tuple[int, int]:
     return ON_TRIAL.index(beside) if beside in ON_TRIAL else len(ON_TRIAL), -DEGREES.get(row, 0)
 
 
-def shared(needs: Sequence[Need]) -> list[Need]:
-    """The cells with variances that they lend each other; the rival, which spreads as it does, lends none."""
-    losses = {i: need.loss for i, need in enumerate(needs) if need.loss is not None and need.part.row != RIVAL}
-    found = dict(zip(losses, moderated(list(losses.values())), strict=True))
-    return [replace(need, loss=found.get(i, need.loss)) for i, need in enumerate(needs)]
-
-
 def corrected(needs: Sequence[Need]) -> tuple[Need, ...]:
     """The cells with their p corrected for how many of them there are."""
     known = [need.loss.p for need in needs if need.loss is not None and not math.isnan(need.loss.p)]
@@ -215,20 +223,18 @@ def corrected(needs: Sequence[Need]) -> tuple[Need, ...]:
 
 def doses(scores: Scores, split: str) -> tuple[Dose, ...]:
     """A course per rung and expected part, for rungs of which a run has two strengths or more."""
-    found = []
+    found = losses(scores, split)
+    parts = {part.row: part for part in parts_of(scores)}
+    courses = []
     for rung in RUNGS:
         places = {0.0: ZERO_DOSE} | {dose: f"{rung}{ending}" for ending, dose in DOSES.items()}
-        parts = {part.row: part for part in parts_of(scores, list(places.values()))}
-        for row in EXPECTED[rung]:
-            losses = _losses(scores, parts[row], places, split) if row in parts else ()
-            if len(losses) > 1 and any(dose == 1 for dose, _ in losses):
-                found.append(Dose(scene=rung, part=parts[row], losses=losses))
-    return tuple(found)
-
-
-def _losses(scores: Scores, part: Part, places: dict[float, str], split: str) -> tuple[tuple[float, Difference], ...]:
-    there = {dose: difference(scores, places[dose], part.within, part.without, split) for dose in sorted(places)}
-    return tuple((dose, loss) for dose, loss in there.items() if loss is not None)
+        for part in [parts[row] for row in EXPECTED[rung] if row in parts]:
+            course = tuple(
+                (dose, found[places[dose], part]) for dose in sorted(places) if (places[dose], part) in found
+            )
+            if len(course) > 1 and any(dose == 1 for dose, _ in course):
+                courses.append(Dose(scene=rung, part=part, losses=course))
+    return tuple(courses)
 
 
 def _is_dose(scene: str) -> bool:

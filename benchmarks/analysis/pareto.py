@@ -5,7 +5,7 @@ Qualities are larger-is-better (dB), costs smaller-is-better (ms). Oracles take 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -75,6 +75,33 @@ def smallest_sufficient(candidates: Sequence[Contender], *, margin: float = SUFF
         if candidate is best or loss.high < margin:
             return Sufficient(name=candidate.name, best=best.name, loss_bound_db=loss.high)
     return None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Confirmation:
+    """What choosing the smallest sufficient costs on captures that had no say in it."""
+
+    loss_db: float  # mean over the captures left out: the choice against the best, both found on the others
+    same: int  # of how many captures left out the others choose what all choose
+    captures: int
+
+
+def confirmed(candidates: Sequence[Contender]) -> Confirmation | None:
+    """Choose on all captures but one, look at that one, and so for each in turn; None of fewer than three."""
+    chosen = smallest_sufficient(candidates)
+    captures = list(candidates[0].samples) if candidates else []
+    if chosen is None or len(captures) < 3:
+        return None
+    losses, same = [], 0
+    for capture in captures:
+        others = [replace(c, samples={k: own for k, own in c.samples.items() if k != capture}) for c in candidates]
+        found = smallest_sufficient(others)
+        if found is None:
+            return None
+        here = {c.name: float(np.mean(c.samples[capture])) for c in candidates}
+        losses.append(here[found.best] - here[found.name])
+        same += found.name == chosen.name
+    return Confirmation(loss_db=float(np.mean(losses)), same=same, captures=len(captures))
 
 
 def _area(qualities: Sequence[float], costs: Sequence[float]) -> float:

@@ -174,10 +174,13 @@ def _sufficient_section(scores: Scores) -> list[Section]:
     heads = [Head(title=title) for title in ("split", "cheapest that suffices")]
     heads += [Head(title="frame", unit="ms"), Head(title="parameters")]
     heads += [Head(title="loss at most", unit="dB"), Head(title="best"), Head(title="frame of the best", unit="ms")]
+    heads += [Head(title="lost on people left out", unit="dB")]
     table = Table(title="", corner="scene", columns=tuple(heads), rows=tuple(rows))
     note = (
         f"The cheapest row by milliseconds per frame whose loss to the best is below {pareto.SUFFICIENT_DB} dB (upper "
-        "95 % bound). Rows that were given the exact surface take no part."
+        "95 % bound). Rows that were given the exact surface take no part. Lost on people left out: each person in "
+        "turn has no say in the choice, which then loses so much there to the best of the others, in the mean; behind "
+        "it, in how many of these choices it is the same row."
     )
     return [Section(title="The smallest that suffices, per scene", blocks=(table, Text(text=note, note=True)))]
 
@@ -196,5 +199,12 @@ def _sufficient(scores: Scores, scene: str, split: str) -> Row | None:
         Entry(text=f"{found.loss_bound_db:.2f}", sort=found.loss_bound_db),
         Entry(text=look_of(found.best).title),
         Entry(text=f"{frames[found.best]:.1f}", sort=frames[found.best]),
+        _confirmation(pareto.confirmed(competing)),
     )
     return Row(name=scene, entries=entries)
+
+
+def _confirmation(found: pareto.Confirmation | None) -> Entry:
+    if found is None:
+        return Entry(text="n/a")
+    return Entry(text=f"{found.loss_db:z.2f}, {found.same} of {found.captures}", sort=found.loss_db)

@@ -154,6 +154,7 @@ class TestVerb:
         }
         # A worker that dies ends the run and names its test: xdist would wait for ever for what it was given.
         spread = ["-n", str(cores()), "--dist", "loadfile", "--no-loadscope-reorder", "--max-worker-restart", "0"]
+        spread += ["--durations", "15"]  # The slowest, told at the end.
         # Hundreds of processes import the same modules, so their bytecode is kept whatever is set outside.
         settings = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
         run = partial(subprocess.run, cwd=root, env={**settings, "OMP_NUM_THREADS": "1"}, check=False)

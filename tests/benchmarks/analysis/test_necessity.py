@@ -237,7 +237,8 @@ def test_the_smallest_that_suffices_is_told_where_there_is_a_choice() -> None:
     table = section.blocks[0]
     assert isinstance(table, Table) and [row.name for row in table.rows] == ["tight", "tight"]
     texts = [entry.text for entry in table.rows[0].entries]
-    assert texts[:4] == ["Novel view", "w/o mot.", "5.0", "2M"] and texts[5:] == ["ASH", "12.0"]
+    assert texts[:4] == ["Novel view", "w/o mot.", "5.0", "2M"] and texts[5:7] == ["ASH", "12.0"]
+    assert texts[7] == "0.05, 3 of 3", "what w/o mot. lacks, on each person left out"
     assert 0.04 < float(texts[4]) < 0.2
     assert needs.sections(scores_of(people("tight", {"ash": 27.0, "wo_mot": 26.9}))) == []
 

@@ -1,7 +1,16 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from benchmarks.analysis.pareto import Contender, front, hypervolume, hypervolume_interval, smallest_sufficient
+from benchmarks.analysis.pareto import (
+    Contender,
+    confirmed,
+    front,
+    hypervolume,
+    hypervolume_interval,
+    smallest_sufficient,
+)
 
 
 def candidate(name: str, quality: float, cost: float, spread: float = 0.05) -> Contender:
@@ -55,3 +64,20 @@ def test_captures_are_compared_and_drawn_in_pairs() -> None:
     low, high = hypervolume_interval([best, cheap], rng=np.random.default_rng(0), resamples=300)
     assert high - low > 5, "which captures there are matters"
     assert smallest_sufficient([best, Contender(name="x", cost=1.0, samples={"elsewhere": (20.0, 21.0)})]) is None
+
+
+def test_a_choice_is_confirmed_on_the_captures_that_had_no_say_in_it() -> None:
+    """Cheap is level with the best on a, b and c, and falls by 2 dB on d: with d nobody would have chosen it."""
+    levels = {"a": 20.0, "b": 25.0, "c": 30.0, "d": 27.0}
+    best = Contender(name="best", cost=50.0, samples={name: (level,) for name, level in levels.items()})
+    losses = {"a": 0.10, "b": 0.12, "c": 0.11, "d": 2.0}
+    fallen = Contender(name="cheap", cost=5.0, samples={k: (levels[k] - loss,) for k, loss in losses.items()})
+    found = confirmed([best, fallen])
+    assert found is not None and (found.same, found.captures) == (3, 4), "without d the others choose cheap"
+    assert found.loss_db == pytest.approx(2.0 / 4)
+    steady = replace(fallen, samples={k: (level - 0.1,) for k, level in levels.items()})
+    always = confirmed([best, steady])
+    assert always is not None and (always.same, always.captures) == (4, 4)
+    assert always.loss_db == pytest.approx(0.1)
+    two = [replace(c, samples={k: c.samples[k] for k in "ab"}) for c in (best, steady)]
+    assert confirmed(two) is None and confirmed([]) is None
