@@ -9,13 +9,23 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any, NoReturn
 
-from ash.fields import nearest
-from ash.files import InputError, disk_problem
-from benchmarks.verbs.arguments import DONE, INTERRUPTED, WRONG_INPUT, Verb, completion, own_name, read_verb
-
 # How often an idle thread of OpenMP looks for work before it sleeps: for the time between two operations. By itself the
 # runtime looks 300,000 times, for 20 ms: whatever else has work for that core waits, at times the team's own thread.
 SPINS = "1000"
+
+
+def _set_threads() -> None:
+    """Settle how many threads OpenMP and BLAS have and how they wait, unless the user did."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # As cells run.
+    if "OMP_WAIT_POLICY" not in os.environ:
+        os.environ.setdefault("GOMP_SPINCOUNT", SPINS)
+
+
+_set_threads()  # Read as NumPy, torch and FLIP are loaded, the first of them by the imports below.
+
+from ash.fields import nearest
+from ash.files import InputError, disk_problem
+from benchmarks.verbs.arguments import DONE, INTERRUPTED, WRONG_INPUT, Verb, completion, own_name, read_verb
 
 VERBS = {
     "run": "runs:RunVerb",
@@ -75,7 +85,6 @@ exit codes: 0 done, 1 a cell or check failed, 2 wrong input, 130 interrupted (th
 def main(argv: list[str] | None = None) -> int:
     """Run a verb and return the exit code."""
     _open_closed_streams()
-    _set_threads()
     try:
         with _terminate_as_interrupt():
             verb = _parse(sys.argv[1:] if argv is None else argv)
@@ -93,13 +102,6 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("\nash-bench: interrupted; the same command goes on where it was", file=sys.stderr)
         return INTERRUPTED
-
-
-def _set_threads() -> None:
-    """Settle how many threads OpenMP has and how they wait, unless the user did. Read as torch and FLIP are loaded."""
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # As cells run.
-    if "OMP_WAIT_POLICY" not in os.environ:
-        os.environ.setdefault("GOMP_SPINCOUNT", SPINS)
 
 
 def _open_closed_streams() -> None:

@@ -38,6 +38,20 @@ def test_the_door_settles_how_threads_wait_unless_the_user_did(given: dict[str, 
     assert found["OMP_NUM_THREADS"] == ["1"]
 
 
+def test_blas_has_one_thread_behind_the_door_as_in_cells() -> None:
+    """Times of `eval` and `train` are taken in this process: a second thread that waits busily falsifies them."""
+    code = """
+import os
+from benchmarks import cli
+import numpy as np
+np.ones((500, 500)) @ np.ones((500, 500))
+print(len(os.listdir("/proc/self/task")))
+"""
+    kept = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    done = subprocess.run([sys.executable, "-c", code], env=kept, capture_output=True, text=True, check=True)
+    assert done.stdout == "1\n"
+
+
 def test_each_way_of_waiting_has_a_process_that_is_told_so(monkeypatch: pytest.MonkeyPatch, capfd) -> None:
     monkeypatch.setenv("OMP_DISPLAY_ENV", "verbose")
     monkeypatch.setenv("GOMP_SPINCOUNT", "1000")
