@@ -149,7 +149,7 @@ class Flipbook:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Sheet:
+class KeptSheet:
     """A PNG of pictures that an earlier report left; `data` is the file's content."""
 
     kind: ClassVar[str] = "sheet"
@@ -163,7 +163,7 @@ class Sheet:
         return f"data:image/png;base64,{base64.b64encode(self.data).decode()}"
 
 
-Block = Text | Bullets | Table | Chart | Strips | Flipbook | Sheet
+Block = Text | Bullets | Table | Chart | Strips | Flipbook | KeptSheet
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

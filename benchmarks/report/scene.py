@@ -29,9 +29,9 @@ from benchmarks.report.content import (
     Entry,
     Flipbook,
     Head,
+    KeptSheet,
     Row,
     Section,
-    Sheet,
     Strips,
     Table,
     Text,
@@ -287,11 +287,13 @@ def _picture_sections(
     return sections, sheets | cast_sheet | worst_sheet
 
 
-def _kept_sheets(data: SceneData) -> tuple[Sheet, ...]:
+def _kept_sheets(data: SceneData) -> tuple[KeptSheet, ...]:
     """What an earlier report left in the run's folder, for cells whose pictures are not here."""
     places = {title: data.run.folder / f"{kind}_{data.scene}.png" for kind, title in SHEETS.items()}
     return tuple(
-        Sheet(file=path.name, title=title, data=path.read_bytes()) for title, path in places.items() if path.is_file()
+        KeptSheet(file=path.name, title=title, data=path.read_bytes())
+        for title, path in places.items()
+        if path.is_file()
     )
 
 
