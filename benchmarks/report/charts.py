@@ -296,19 +296,17 @@ def _text(chart: alt.Chart, at: dict[str, Any], text: str, **mark: Any) -> alt.C
 
 
 def _labels(chart: alt.Chart, at: dict[str, Any], points: pd.DataFrame) -> list[alt.Chart]:
-    """Names beside their points, for each side that is used a layer, and one below it that parts them from lines."""
+    """Names beside their points, a layer for each side that is used."""
     places = {
         "right": (10, 0, "left"),
         "left": (-10, 0, "right"),
         "above": (0, -14, "center"),
         "under": (0, 15, "center"),
     }
-    halo: dict[str, Any] = {"color": PAPER, "stroke": PAPER, "strokeWidth": 4}
     return [
-        _text(chart.transform_filter(f"datum.side == '{side}'"), at, "series:N", dx=dx, dy=dy, align=align, **drawn)
+        _text(chart.transform_filter(f"datum.side == '{side}'"), at, "series:N", dx=dx, dy=dy, align=align)
         for side, (dx, dy, align) in places.items()
         if (points["side"] == side).any()
-        for drawn in (halo, {})
     ]
 
 
