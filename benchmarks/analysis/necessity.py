@@ -170,10 +170,11 @@ def losses(scores: Scores, split: str) -> dict[tuple[str, Part], Difference]:
 
     The rival's column spreads over people by causes of its own, and neither lends nor borrows.
     """
+    parts = parts_of(scores)
     found = {
         (scene, part): loss
         for scene in _scenes(scores)
-        for part in parts_of(scores)
+        for part in parts
         if (loss := difference(scores, scene, part.within, part.without, split)) is not None
     }
     lenders = [place for place in found if place[1].row != RIVAL]
