@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.analysis.statistics import Samples, compared, redrawn
+from benchmarks.analysis.statistics import Difference, Samples, compared, redrawn
 
 SUFFICIENT_DB = 0.5  # A loss that readers of images do not see, and three seeds can establish.
 REFERENCE_MS, REFERENCE_DB = 1000.0, 10.0  # The hypervolume's fixed corner: a frame per second of noise.
@@ -102,6 +102,33 @@ def confirmed(candidates: Sequence[Contender]) -> Confirmation | None:
         losses.append(here[found.best] - here[found.name])
         same += found.name == chosen.name
     return Confirmation(loss_db=float(np.mean(losses)), same=same, captures=len(captures))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Judged:
+    """A choice that other captures made, judged on these: what the chosen row loses to the one that was best there."""
+
+    name: str
+    best: str
+    loss: Difference  # on these captures; 90 % interval, whose upper bound is the one-sided one of the choice
+
+    @property
+    def suffices(self) -> bool:
+        """Whether the loss stays below the margin here, too."""
+        return self.loss.high < SUFFICIENT_DB
+
+
+def chosen_elsewhere(candidates: Sequence[Contender], elsewhere: Sequence[Contender]) -> Judged | None:
+    """The smallest sufficient by other captures, judged on these; among the rows that both have.
+
+    None where the others bound nothing, or no row is shared.
+    """
+    here = {c.name: c for c in candidates}
+    found = smallest_sufficient([c for c in elsewhere if c.name in here])
+    if found is None:
+        return None
+    loss = compared(here[found.best].samples, here[found.name].samples, level=0.90)
+    return None if loss is None else Judged(name=found.name, best=found.best, loss=loss)
 
 
 def _area(qualities: Sequence[float], costs: Sequence[float]) -> float:

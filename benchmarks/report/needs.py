@@ -30,9 +30,12 @@ MANY_ROWS = 3  # from which on it is worth asking which of them would suffice
 PARAMETERS = Quantity("memory", "", "params")
 
 
-def sections(scores: Scores) -> list[Section]:
-    """What is needed, where parts were taken away; and what suffices, where there is a choice."""
-    return [*_matrix_section(scores), *_dose_section(scores), *_sufficient_section(scores)]
+def sections(scores: Scores, chosen_on: Scores | None = None) -> list[Section]:
+    """What is needed, where parts were taken away; and what suffices, where there is a choice.
+
+    `chosen_on`: the same rows on people for validation, whose choice is judged on the people here.
+    """
+    return [*_matrix_section(scores), *_dose_section(scores), *_sufficient_section(scores, chosen_on)]
 
 
 def _matrix_section(scores: Scores) -> list[Section]:
@@ -166,23 +169,39 @@ def _dose_sentence(dose: Dose) -> str:
     return f"{dose.scene}, {dose.part.title}: {course}; it {rises} with every dose."
 
 
-def _sufficient_section(scores: Scores) -> list[Section]:
-    """The smallest sufficient row of every scene that has many."""
-    rows = [row for scene in scores.scenes for split in RANKED_SPLITS if (row := _sufficient(scores, scene, split))]
-    if not rows:
-        return []
+def _sufficient_section(scores: Scores, chosen_on: Scores | None) -> list[Section]:
+    """The smallest sufficient row of every scene that has many, and how the rows do that were chosen elsewhere."""
+    places = [(scene, split) for scene in scores.scenes for split in RANKED_SPLITS]
+    rows = [row for scene, split in places if (row := _sufficient(scores, scene, split))]
+    judged = [row for scene, split in places if chosen_on and (row := _judged(scores, chosen_on, scene, split))]
+    blocks = (*(_sufficient_table(rows) if rows else ()), *(_judged_table(judged) if judged else ()))
+    return [Section(title="The smallest that suffices, per scene", blocks=blocks)] if blocks else []
+
+
+def _sufficient_table(rows: Sequence[Row]) -> tuple[Block, ...]:
     heads = [Head(title=title) for title in ("split", "cheapest that suffices")]
     heads += [Head(title="frame", unit="ms"), Head(title="parameters")]
     heads += [Head(title="loss at most", unit="dB"), Head(title="best"), Head(title="frame of the best", unit="ms")]
     heads += [Head(title="lost on people left out", unit="dB")]
-    table = Table(title="", corner="scene", columns=tuple(heads), rows=tuple(rows))
     note = (
         f"The cheapest row by milliseconds per frame whose loss to the best is below {pareto.SUFFICIENT_DB} dB (upper "
         "95 % bound). Rows that were given the exact surface take no part. Lost on people left out: each person in "
         "turn has no say in the choice, which then loses so much there to the best of the others, in the mean; behind "
         "it, in how many of these choices it is the same row."
     )
-    return [Section(title="The smallest that suffices, per scene", blocks=(table, Text(text=note, note=True)))]
+    return Table(title="", corner="scene", columns=tuple(heads), rows=tuple(rows)), Text(text=note, note=True)
+
+
+def _judged_table(rows: Sequence[Row]) -> tuple[Block, ...]:
+    title = "Chosen on people for validation"
+    heads = [Head(title=title) for title in ("split", "cheapest that suffices there", "best there")]
+    heads += [Head(title="lost here", unit="dB"), Head(title="suffices here")]
+    note = (
+        "The same choice, made on people whom no other table has, and judged on the people here: what the chosen row "
+        "loses to the one that was best there, with the 90 % interval. It suffices where the upper end is below "
+        f"{pareto.SUFFICIENT_DB} dB."
+    )
+    return Table(title=title, corner="scene", columns=tuple(heads), rows=tuple(rows)), Text(text=note, note=True)
 
 
 def _sufficient(scores: Scores, scene: str, split: str) -> Row | None:
@@ -200,6 +219,24 @@ def _sufficient(scores: Scores, scene: str, split: str) -> Row | None:
         Entry(text=look_of(found.best).title),
         Entry(text=f"{frames[found.best]:.1f}", sort=frames[found.best]),
         _confirmation(pareto.confirmed(competing)),
+    )
+    return Row(name=scene, entries=entries)
+
+
+def _judged(scores: Scores, chosen_on: Scores, scene: str, split: str) -> Row | None:
+    if scene not in chosen_on.scenes:
+        return None
+    here, there = (contrasts.candidates(each, scene, split) for each in (scores, chosen_on))
+    found = pareto.chosen_elsewhere(here, there)
+    if found is None:
+        return None
+    interval = "" if math.isnan(found.loss.low) else f" [{found.loss.low:z.2f}, {found.loss.high:z.2f}]"
+    entries = (
+        Entry(text=SPLIT_NAMES[split].title),
+        Entry(text=look_of(found.name).title),
+        Entry(text=look_of(found.best).title),
+        Entry(text=f"{found.loss.mean:z.2f}{interval}", sort=found.loss.mean),
+        Entry(text="yes" if found.suffices else "no"),
     )
     return Row(name=scene, entries=entries)
 

@@ -27,8 +27,10 @@ PICTURE_BYTES = 10_000_000  # of all pictures that are stepped through; worst fr
 LATEX_HEAD = "% Needs booktabs and colortbl, and \\definecolor{antiquebrass}{rgb}{0.98, 0.92, 0.84}\n"
 
 
-def write_report(run: Run) -> list[str]:
+def write_report(run: Run, chosen_on: Run | None = None) -> list[str]:
     """Write report.html, report.md, tables.tex, results.csv, charts and pictures; returns what to tell the user.
+
+    `chosen_on`: the same rows on people for validation, whose choice of the smallest that suffices is judged here.
 
     Raises:
         InputError: no cell is finished, or a result is damaged; nothing is written then.
@@ -42,7 +44,7 @@ def write_report(run: Run) -> list[str]:
         title=f"Report of suite {run.suite}",
         sections=(
             Section(title="", blocks=(content.Text(text=run.about[:1].upper() + run.about[1:] + "."),)),
-            *needs.sections(scores),
+            *needs.sections(scores, None if chosen_on is None else scores_of(results_of(chosen_on))),
             *sections.stabilities(scores),
             *findings,
             *(section for scene in scenes.values() for section in scene.sections),

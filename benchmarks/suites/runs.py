@@ -184,6 +184,17 @@ def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
     return Run(folder=out, suite=out.name, about=about, command=command, cells=tuple(named))
 
 
+def for_choosing(run: Run) -> Run:
+    """The run, if it is one of people for validation.
+
+    Raises:
+        InputError: it is of people whom tables of results have.
+    """
+    if any(cell.config.subject < VALIDATION for cell in run.cells):
+        raise InputError(f"{run.folder}: expected a run of `--validation`, on people from {VALIDATION} on alone")
+    return run
+
+
 def _told_apart(cell: Cell) -> Cell:
     """The cell on a scene that is called as its capture's folder is."""
     return replace(cell, config=replace(cell.config, scene=cell.capture_folder.resolve().name))

@@ -3,7 +3,7 @@
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -155,10 +155,11 @@ class ReportVerb:
     runs: Positional[tuple[Path, ...]]  # folders of runs or of single cells
     out: Folder | None = None  # where the report goes; default: the run's own folder, for several runs/report
     publish: Folder | None = None  # copy it there, to be committed: all but the page, and every cell's numbers
+    chosen_on: Folder | None = None  # a run of the same rows with --validation: how what suffices there does here
 
     def __call__(self) -> int:
         """Write it, and copy it where that is asked for."""
-        from benchmarks.suites.runs import gathered, read_run
+        from benchmarks.suites.runs import for_choosing, gathered, read_run
 
         if not self.runs:
             raise InputError("expected the folder of a run or of a cell")
@@ -166,7 +167,10 @@ class ReportVerb:
             run = read_run(self.runs[0])
         else:
             run = gathered(self.runs, self.out or Path("runs/report"), command=typed())
-        code = _report(run)
+        chosen_on = None if self.chosen_on is None else for_choosing(read_run(self.chosen_on))
+        if chosen_on is not None:
+            run = replace(run, command=" && ".join(filter(None, (run.command, typed()))))
+        code = _report(run, chosen_on)
         if self.publish is not None:
             from benchmarks.report.page import publish
 
@@ -311,11 +315,11 @@ def _use_lpips(weights: Path | None) -> None:
     Lpips(weights)
 
 
-def _report(run: "RunOnDisk") -> int:
+def _report(run: "RunOnDisk", chosen_on: "RunOnDisk | None" = None) -> int:
     from benchmarks.report.page import write_report
     from benchmarks.suites.runs import failures, results_of
 
-    lines = write_report(run)
+    lines = write_report(run, chosen_on)
     print("\n".join(lines))
     failed = failures(results_of(run))
     for result in failed:

@@ -171,6 +171,9 @@ def test_people_to_choose_by_have_runs_of_their_own_which_say_so(capture: Path, 
     assert "subject 0 is for tables, expected one from 100 on" in refused_last(capsys, *run, *own)
     mixed = ("report", str(search), str(table), "--out", str(tmp_path / "both"))
     assert "expected a report without the others" in refused_last(capsys, *mixed)
+    assert cli.main(["report", str(table), "--chosen-on", str(search)]) == arguments.DONE
+    assert "--chosen-on" in (table / "report.md").read_text(), "the command says by whom was chosen"
+    assert "expected a run of `--validation`" in refused_last(capsys, "report", str(search), "--chosen-on", str(table))
 
 
 def test_a_scene_that_a_suite_has_under_other_names_only_is_asked_for_by_them(tmp_path: Path, capsys) -> None:

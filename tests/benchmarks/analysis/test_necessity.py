@@ -233,7 +233,8 @@ def test_the_smallest_that_suffices_is_told_where_there_is_a_choice() -> None:
         )
         return replace(result, summary=rows)
 
-    (section,) = needs.sections(scores_of(list(map(timed, results))))
+    scores = scores_of(list(map(timed, results)))
+    (section,) = needs.sections(scores)
     table = section.blocks[0]
     assert isinstance(table, Table) and [row.name for row in table.rows] == ["tight", "tight"]
     texts = [entry.text for entry in table.rows[0].entries]
@@ -241,6 +242,12 @@ def test_the_smallest_that_suffices_is_told_where_there_is_a_choice() -> None:
     assert texts[7] == "0.05, 3 of 3", "what w/o mot. lacks, on each person left out"
     assert 0.04 < float(texts[4]) < 0.2
     assert needs.sections(scores_of(people("tight", {"ash": 27.0, "wo_mot": 26.9}))) == []
+    here = scores_of(list(map(timed, people("tight", levels | {"wo_mot": 26.0}))))
+    judged = {table.title: table for table in blocks_of(needs.sections(here, scores), Table)}
+    texts = [entry.text for entry in judged["Chosen on people for validation"].rows[0].entries]
+    assert texts[:3] == ["Novel view", "w/o mot.", "ASH"] and texts[3].startswith("1.00 [") and texts[4] == "no"
+    elsewhere = scores_of(people("loose", levels))
+    assert needs.sections(scores, elsewhere) == needs.sections(scores), "of other scenes nothing was chosen"
 
 
 def test_the_ladder_has_a_row_for_every_expected_part_and_doses_of_known_strength() -> None:

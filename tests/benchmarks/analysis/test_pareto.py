@@ -5,6 +5,7 @@ import pytest
 
 from benchmarks.analysis.pareto import (
     Contender,
+    chosen_elsewhere,
     confirmed,
     front,
     hypervolume,
@@ -81,3 +82,19 @@ def test_a_choice_is_confirmed_on_the_captures_that_had_no_say_in_it() -> None:
     assert always.loss_db == pytest.approx(0.1)
     two = [replace(c, samples={k: c.samples[k] for k in "ab"}) for c in (best, steady)]
     assert confirmed(two) is None and confirmed([]) is None
+
+
+def test_a_choice_is_judged_on_captures_that_made_none() -> None:
+    def row(name: str, cost: float, *qualities: float) -> Contender:
+        return Contender(name=name, samples={f"{i}": (q,) for i, q in enumerate(qualities)}, cost=cost)
+
+    there = [row("best", 50.0, 30.0, 25.0), row("cheap", 5.0, 29.9, 24.92), row("theirs", 1.0, 30.0, 25.0)]
+    best = row("best", 50.0, 20.0, 26.0, 23.0)
+    here = [best, row("cheap", 5.0, 19.6, 25.5, 22.7), row("ours", 90.0, 40.0, 40.0, 40.0)]
+    found = chosen_elsewhere(here, there)
+    assert found is not None and (found.name, found.best) == ("cheap", "best"), "among rows that both have"
+    assert found.loss.mean == pytest.approx(0.4) and 0.5 < found.loss.high < 0.6 and not found.suffices
+    level = [best, row("cheap", 5.0, 19.9, 25.9, 22.8)]
+    assert chosen_elsewhere(level, there).suffices
+    assert chosen_elsewhere(here, [row("theirs", 1.0, 30.0, 25.0)]) is None
+    assert chosen_elsewhere([], there) is None
