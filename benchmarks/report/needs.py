@@ -187,7 +187,8 @@ def _sufficient_table(rows: Sequence[Row]) -> tuple[Block, ...]:
         f"The cheapest row by milliseconds per frame whose loss to the best is below {pareto.SUFFICIENT_DB} dB (upper "
         "95 % bound). Rows that were given the exact surface take no part. Lost on people left out: each person in "
         "turn has no say in the choice, which then loses so much there to the best of the others, in the mean; behind "
-        "it, in how many of these choices it is the same row."
+        "it, in how many of these choices it is the same row. Joules of a frame: `speed frame --avatar CELL`, where "
+        "the machine tells them."
     )
     return Table(title="", corner="scene", columns=tuple(heads), rows=tuple(rows)), Text(text=note, note=True)
 
