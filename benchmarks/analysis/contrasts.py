@@ -50,13 +50,7 @@ def contrasts(
 
     One call is one family of tests: the splits that are not ranked, asked for apart, cost the ranked ones no power.
     """
-    tests = [
-        (split, theirs, test)
-        for split in splits
-        for theirs in scores.methods(scene)
-        if theirs != reference and not is_oracle(theirs)
-        if (test := difference(scores, scene, reference, theirs, split)) is not None and not np.isnan(test.p)
-    ]
+    tests = [found for found in differences(scores, scene, reference, splits) if not np.isnan(found[2].p)]
     adjusted = holm([test.p for _, _, test in tests])
     return tuple(
         Contrast(
@@ -64,6 +58,19 @@ def contrasts(
         )
         for (split, m, test), p in zip(tests, adjusted, strict=True)
     )
+
+
+def differences(
+    scores: Scores, scene: str, reference: str = "ash", splits: Sequence[str] = RANKED_SPLITS
+) -> list[tuple[str, str, Difference]]:
+    """Split, method and what the reference is ahead of it, for every other method that is no oracle."""
+    return [
+        (split, theirs, test)
+        for split in splits
+        for theirs in scores.methods(scene)
+        if theirs != reference and not is_oracle(theirs)
+        if (test := difference(scores, scene, reference, theirs, split)) is not None
+    ]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

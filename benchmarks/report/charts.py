@@ -113,13 +113,15 @@ def bars(rows: pd.DataFrame, series: Sequence[Series], *, x: str) -> tuple[alt.L
 def forest(effects: pd.DataFrame, series: Sequence[Series], *, x: str) -> tuple[alt.LayerChart, ...]:
     """Differences with their intervals, a row each: `effects` has panel, row, mean, low, high, series (who is ahead).
 
-    Rows are in the order of the first panel's means. One wide interval does not press the rest together: it is cut.
+    Rows are in the order of the first panel's means, all of which are shown. One wide interval does not press the rest
+    together: it is cut.
     """
     order = list(effects.sort_values("mean", ascending=False, kind="stable")["row"].drop_duplicates())
     first = effects[effects["panel"] == effects["panel"].iloc[0]].sort_values("mean", ascending=False)
     order = [*first["row"], *(row for row in order if row not in set(first["row"]))]
     ends = effects[["low", "high"]].to_numpy()
-    usual = 1.6 * max(0.1, float(pd.Series(abs(ends).ravel()).quantile(0.8)))
+    most = float(effects["mean"].abs().max())
+    usual = max(0.16, 1.6 * float(pd.Series(abs(ends).ravel()).quantile(0.8)), 1.06 * most)
     low, high = max(-usual, min(0.0, float(ends.min()))), min(usual, max(0.0, float(ends.max())))
     room = 0.03 * (high - low)
     cut = effects.assign(

@@ -22,14 +22,15 @@ SIGHT_NOTE = (
 
 
 def sections(scores: Scores, scene: str, found: Sequence[Contrast], beside: Sequence[Contrast] = ()) -> list[Section]:
-    """The differences with their intervals, and what more captures would show; none without two seeds or captures.
+    """The differences with their intervals, and what more captures would show; of one seed a chart of many rows alone.
 
     `beside`: those on splits that are not ranked, in a table of their own.
     """
-    if not found:
-        return []
-    figure = figures.effects_figure(found, scene, over=scores.unit(scene))
+    told = [(c.split, c.method, c.test) for c in found] or contrasts.differences(scores, scene)
+    figure = figures.effects_figure(told, scene, over=scores.unit(scene))
     charted: tuple[Block, ...] = (Chart(figure=figure),) if figure else ()
+    if not found:
+        return [Section(title=f"Differences to ASH on {scene}", blocks=charted)] if charted else []
     apart = (_table(scores, scene, beside, title="On near and far motion"),) if beside else ()
     blocks = (*charted, _table(scores, scene, found), *apart, Text(text=NOTE, note=True), *_sights(found))
     return [Section(title=f"Which differences are established on {scene}", blocks=blocks)]

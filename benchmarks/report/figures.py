@@ -1,14 +1,15 @@
 """The charts of a scene: its numbers as the tables that `charts.py` draws, with their captions."""
 
+import math
+from collections import Counter
 from collections.abc import Sequence
 
 import pandas as pd
 
 from benchmarks.analysis import contrasts, pareto
-from benchmarks.analysis.contrasts import Contrast
 from benchmarks.analysis.names import EXACT, SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Score, Scores, foreground
-from benchmarks.analysis.statistics import intervals
+from benchmarks.analysis.statistics import Difference, intervals
 from benchmarks.cell.methods import WRONG_BY_MM
 from benchmarks.report import charts, vega
 from benchmarks.report.vega import Figure, Series
@@ -22,6 +23,7 @@ STAGES = {
 }
 STAGE_METRICS = tuple(stage for stage in STAGES if stage)
 MANY_CONTRASTS = 5  # Rows from which contrasts are drawn as well as listed.
+UNKNOWN = "one seed each on one capture: another seed moves a score by a few tenths of a dB."
 PLANTED = {method for mm, row in WRONG_BY_MM.items() if mm > 0 for method in row}  # They have a chart of their own.
 SPAN_DB = 9.0  # that a chart shows below its best point: what lies lower would press the rest together
 
@@ -113,31 +115,36 @@ AHEAD = (
     Series(title="the row is ahead", colour=vega.ORANGE),
     Series(title="the interval holds zero", colour=vega.LINE),
 )
+UNTOLD = (Series(title="one seed: no interval", colour=vega.LINE),)
 
 
-def effects_figure(found: Sequence[Contrast], scene: str, *, over: str) -> Figure | None:
-    """The contrasts as a chart, where they are many enough for a table to be hard to read, over seeds or captures."""
+def effects_figure(found: Sequence[tuple[str, str, Difference]], scene: str, *, over: str) -> Figure | None:
+    """What ASH is ahead by (split, method, difference), where rows are so many that a table is hard to read.
+
+    `over`: what intervals are taken over; where there are none, the differences alone are shown.
+    """
+    told = not any(math.isnan(test.p) for _, _, test in found)
+    series = AHEAD if told else UNTOLD
     rows = [
         {
-            "panel": SPLIT_NAMES[c.split].title,
-            "row": c.title,
-            "mean": c.test.mean,
-            "low": c.test.low,
-            "high": c.test.high,
-            "series": AHEAD[0 if c.test.low > 0 else 1 if c.test.high < 0 else 2].title,
+            "panel": SPLIT_NAMES[split].title,
+            "row": look_of(method).title,
+            "mean": test.mean,
+            "low": test.low if told else test.mean,
+            "high": test.high if told else test.mean,
+            "series": series[0 if not told or test.low > 0 else 1 if test.high < 0 else 2].title,
         }
-        for c in found
+        for split, method, test in found
     ]
-    table = pd.DataFrame(rows)
-    if table.groupby("panel").size().max() < MANY_CONTRASTS:
+    if max(Counter(split for split, _, _ in found).values(), default=0) < MANY_CONTRASTS:
         return None
+    known = f"with the 95 % interval over {over}. Arrows: it goes on beyond the scale." if told else UNKNOWN
     return Figure(
         name=f"effects_{scene}",
-        title="Differences with intervals",
-        caption=f"Foreground PSNR of ASH minus that of the row, with the 95 % interval over {over}. Arrows: it goes on "
-        "beyond the scale.",
-        panels=charts.forest(table, AHEAD, x="ASH minus the row [dB]"),
-        series=AHEAD,
+        title="Differences with intervals" if told else "Differences of one seed",
+        caption=f"Foreground PSNR of ASH minus that of the row, {known}",
+        panels=charts.forest(pd.DataFrame(rows), series, x="ASH minus the row [dB]"),
+        series=series,
     )
 
 

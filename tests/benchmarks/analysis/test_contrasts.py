@@ -107,7 +107,13 @@ def test_a_report_says_what_was_compared_and_what_could_be_seen() -> None:
     assert table.columns[2].unit == "seeds, Welch" and isinstance(section.blocks[-1], Text)
     assert "nothing about other people" in established.note(one, "loose", contrasts(one, "loose"))
     alone = scores_of(people({"ash": (20.0,), "ddc": (19.0,)}))
-    assert established.sections(alone, "loose", contrasts(alone, "loose")) == []
+    assert established.sections(alone, "loose", contrasts(alone, "loose")) == [], "so few rows are read in their table"
+    levels = {"ash": (20.0,), "ddc": (19.0,), "mlp": (17.5,), "wo_mot": (19.8,), "res_128": (20.1,), "res_64": (18.0,)}
+    (section,) = established.sections(scores_of(people(levels)), "loose", ())
+    (chart,) = section.blocks
+    drawn = chart.figure.svg()
+    assert chart.figure.name == "effects_loose" and "one seed: no interval" in drawn
+    assert drawn.index("w/ MLP") < drawn.index("DDC") < drawn.index("w/o mot."), "by what ASH is ahead"
     assert (
         established.note(alone, "loose", contrasts(alone, "loose"))
         == "One value per row: no difference between rows is established."

@@ -287,7 +287,7 @@ def test_a_report_says_what_each_rows_template_was_learned_from() -> None:
     images, scans = "learned from images: ridge 1", "learned from scans: ridge 3"
     results = [on("ash", images), on("ash", images, 1), on("ddc", images), on("by_scans", scans), on("static", "")]
     remarks = sentences.remarks(scores_of(results), "loose")
-    assert f"Templates: {images} (ASH, DDC); {scans} (by_scans)." in remarks
+    assert f"Templates: {images} (ASH, DDC); {scans} (template by scans)." in remarks
 
 
 def test_the_main_table_is_followed_by_what_training_saw_of_the_views() -> None:

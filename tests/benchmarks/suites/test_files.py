@@ -8,6 +8,7 @@ import pytest
 from helpers import fakes
 
 from ash.files import InputError
+from benchmarks.analysis.names import is_ours
 from benchmarks.cell.methods import WRONG_BY_MM, is_oracle
 from benchmarks.suites.captures import described
 from benchmarks.suites.files import find_suite, given_captures, line_of, read_suite, suite_files
@@ -183,6 +184,12 @@ def test_our_suites_are_such_files() -> None:
         assert suite.name == name and suite.about and list(suite.cells)
     template = {row.name for row in find_suite("template").methods}
     assert {method for row in WRONG_BY_MM.values() for method in row} <= template
+
+
+def test_no_row_of_our_suites_is_taken_for_a_users_own() -> None:
+    for name in suite_files():
+        assert [row.name for row in find_suite(name).methods if not is_ours(row.name)] == [], name
+    assert not is_ours("mine")
 
 
 def test_every_row_of_our_suites_has_an_identity(tmp_path: Path) -> None:
