@@ -23,7 +23,7 @@ STAGES = {
 }
 STAGE_METRICS = tuple(stage for stage in STAGES if stage)
 MANY_CONTRASTS = 5  # Rows from which contrasts are drawn as well as listed.
-UNKNOWN = "one seed each on one capture: another seed moves a score by a few tenths of a dB."
+UNKNOWN = "which has one seed on one capture: another seed moves a score by a few tenths of a dB."
 PLANTED = {method for mm, row in WRONG_BY_MM.items() if mm > 0 for method in row}  # They have a chart of their own.
 SPAN_DB = 9.0  # that a chart shows below its best point: what lies lower would press the rest together
 
