@@ -26,6 +26,7 @@ NOTE = (
     "Harmful: as sure and as large a gain. Not needed: surely less is lost. One seed on one capture tells nothing."
 )
 UNTOLD = "One seed on one capture: what is needed cannot be told; --seeds 3 or --subjects 8 can."
+NOT_CHOSEN = "On people for validation nothing was chosen: they share no scene or row with those here, or are too few."
 MANY_ROWS = 3  # from which on it is worth asking which of them would suffice
 PARAMETERS = Quantity("memory", "", "params")
 
@@ -175,6 +176,8 @@ def _sufficient_section(scores: Scores, chosen_on: Scores | None) -> list[Sectio
     rows = [row for scene, split in places if (row := _sufficient(scores, scene, split))]
     judged = [row for scene, split in places if chosen_on and (row := _judged(scores, chosen_on, scene, split))]
     blocks = (*(_sufficient_table(rows) if rows else ()), *(_judged_table(judged) if judged else ()))
+    if chosen_on and not judged:
+        blocks = (*blocks, Text(text=NOT_CHOSEN))
     return [Section(title="The smallest that suffices, per scene", blocks=blocks)] if blocks else []
 
 
@@ -231,13 +234,14 @@ def _judged(scores: Scores, chosen_on: Scores, scene: str, split: str) -> Row | 
     found = pareto.chosen_elsewhere(here, there)
     if found is None:
         return None
-    interval = "" if math.isnan(found.loss.low) else f" [{found.loss.low:z.2f}, {found.loss.high:z.2f}]"
+    told = not math.isnan(found.loss.high)
+    interval = f" [{found.loss.low:z.2f}, {found.loss.high:z.2f}]" if told else ""
     entries = (
         Entry(text=SPLIT_NAMES[split].title),
         Entry(text=look_of(found.name).title),
         Entry(text=look_of(found.best).title),
         Entry(text=f"{found.loss.mean:z.2f}{interval}", sort=found.loss.mean),
-        Entry(text="yes" if found.suffices else "no"),
+        Entry(text=("yes" if found.suffices else "no") if told else "n/a"),
     )
     return Row(name=scene, entries=entries)
 
