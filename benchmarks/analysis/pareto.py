@@ -6,6 +6,7 @@ Qualities are larger-is-better (dB), costs smaller-is-better (ms). Oracles take 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -113,9 +114,11 @@ class Judged:
     loss: Difference  # on these captures; 90 % interval, whose upper bound is the one-sided one of the choice
 
     @property
-    def suffices(self) -> bool:
-        """Whether the loss stays below the margin here, too."""
-        return self.loss.high < SUFFICIENT_DB
+    def verdict(self) -> Literal["suffices", "too little", "unclear"]:
+        """Whether the loss is surely below the margin here, too, or surely above it."""
+        if self.loss.high < SUFFICIENT_DB:
+            return "suffices"
+        return "too little" if self.loss.low > SUFFICIENT_DB else "unclear"
 
 
 def chosen_elsewhere(candidates: Sequence[Contender], elsewhere: Sequence[Contender]) -> Judged | None:

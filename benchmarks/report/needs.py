@@ -190,8 +190,8 @@ def _sufficient_table(rows: Sequence[Row]) -> tuple[Block, ...]:
         f"The cheapest row by milliseconds per frame whose loss to the best is below {pareto.SUFFICIENT_DB} dB (upper "
         "95 % bound). Rows that were given the exact surface take no part. Lost on people left out: each person in "
         "turn has no say in the choice, which then loses so much there to the best of the others, in the mean; behind "
-        "it, in how many of these choices it is the same row. Joules of a frame: `speed frame --avatar CELL`, where "
-        "the machine tells them."
+        "it, in how many of these choices it is the same row. Joules of a frame: speed frame --avatar, where the "
+        "machine tells them."
     )
     return Table(title="", corner="scene", columns=tuple(heads), rows=tuple(rows)), Text(text=note, note=True)
 
@@ -199,11 +199,11 @@ def _sufficient_table(rows: Sequence[Row]) -> tuple[Block, ...]:
 def _judged_table(rows: Sequence[Row]) -> tuple[Block, ...]:
     title = "Chosen on people for validation"
     heads = [Head(title=title) for title in ("split", "cheapest that suffices there", "best there")]
-    heads += [Head(title="lost here", unit="dB"), Head(title="suffices here")]
+    heads += [Head(title="lost here", unit="dB"), Head(title="verdict here")]
     note = (
         "The same choice, made on people whom no other table has, and judged on the people here: what the chosen row "
         "loses to the one that was best there, with the 90 % interval. It suffices where the upper end is below "
-        f"{pareto.SUFFICIENT_DB} dB."
+        f"{pareto.SUFFICIENT_DB} dB, is too little where the lower end is above, and unclear otherwise."
     )
     return Table(title=title, corner="scene", columns=tuple(heads), rows=tuple(rows)), Text(text=note, note=True)
 
@@ -234,14 +234,13 @@ def _judged(scores: Scores, chosen_on: Scores, scene: str, split: str) -> Row | 
     found = pareto.chosen_elsewhere(here, there)
     if found is None:
         return None
-    told = not math.isnan(found.loss.high)
-    interval = f" [{found.loss.low:z.2f}, {found.loss.high:z.2f}]" if told else ""
+    interval = "" if math.isnan(found.loss.low) else f" [{found.loss.low:z.2f}, {found.loss.high:z.2f}]"
     entries = (
         Entry(text=SPLIT_NAMES[split].title),
         Entry(text=look_of(found.name).title),
         Entry(text=look_of(found.best).title),
         Entry(text=f"{found.loss.mean:z.2f}{interval}", sort=found.loss.mean),
-        Entry(text=("yes" if found.suffices else "no") if told else "n/a"),
+        Entry(text=found.verdict),
     )
     return Row(name=scene, entries=entries)
 

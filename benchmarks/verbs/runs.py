@@ -169,7 +169,7 @@ class ReportVerb:
             run = gathered(self.runs, self.out or Path("runs/report"), command=typed())
         chosen_on = None if self.chosen_on is None else for_choosing(read_run(self.chosen_on))
         if chosen_on is not None:
-            run = replace(run, command=" && ".join(filter(None, (run.command, typed()))))
+            run = replace(run, command="; ".join(filter(None, (run.command, typed()))))
         code = _report(run, chosen_on)
         if self.publish is not None:
             from benchmarks.report.page import publish

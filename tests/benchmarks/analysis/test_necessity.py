@@ -245,7 +245,7 @@ def test_the_smallest_that_suffices_is_told_where_there_is_a_choice() -> None:
     here = scores_of(list(map(timed, people("tight", levels | {"wo_mot": 26.0}))))
     judged = {table.title: table for table in blocks_of(needs.sections(here, scores), Table)}
     texts = [entry.text for entry in judged["Chosen on people for validation"].rows[0].entries]
-    assert texts[:3] == ["Novel view", "w/o mot.", "ASH"] and texts[3].startswith("1.00 [") and texts[4] == "no"
+    assert texts[:3] == ["Novel view", "w/o mot.", "ASH"] and texts[3].startswith("1.00 [") and texts[4] == "too little"
     (section,) = needs.sections(scores, scores_of(people("loose", levels)))
     assert section.blocks[:-1] == needs.sections(scores)[0].blocks and "nothing was chosen" in section.blocks[-1].text
 

@@ -93,8 +93,10 @@ def test_a_choice_is_judged_on_captures_that_made_none() -> None:
     here = [best, row("cheap", 5.0, 19.6, 25.5, 22.7), row("ours", 90.0, 40.0, 40.0, 40.0)]
     found = chosen_elsewhere(here, there)
     assert found is not None and (found.name, found.best) == ("cheap", "best"), "among rows that both have"
-    assert found.loss.mean == pytest.approx(0.4) and 0.5 < found.loss.high < 0.6 and not found.suffices
+    assert found.loss.mean == pytest.approx(0.4) and 0.5 < found.loss.high < 0.6 and found.verdict == "unclear"
     level = [best, row("cheap", 5.0, 19.9, 25.9, 22.8)]
-    assert chosen_elsewhere(level, there).suffices
+    assert chosen_elsewhere(level, there).verdict == "suffices"
+    fallen = [best, row("cheap", 5.0, 18.0, 24.1, 21.0)]
+    assert chosen_elsewhere(fallen, there).verdict == "too little"
     assert chosen_elsewhere(here, [row("theirs", 1.0, 30.0, 25.0)]) is None
     assert chosen_elsewhere([], there) is None
