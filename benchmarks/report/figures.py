@@ -115,7 +115,7 @@ AHEAD = (
     Series(title="the row is ahead", colour=vega.ORANGE),
     Series(title="the interval holds zero", colour=vega.LINE),
 )
-UNTOLD = (Series(title="one seed: no interval", colour=vega.LINE),)
+UNTOLD = Series(title="one seed: no interval", colour=vega.LINE)
 
 
 def effects_figure(found: Sequence[tuple[str, str, Difference]], scene: str, *, over: str) -> Figure | None:
@@ -123,8 +123,9 @@ def effects_figure(found: Sequence[tuple[str, str, Difference]], scene: str, *, 
 
     `over`: what intervals are taken over; where there are none, the differences alone are shown.
     """
+    if max(Counter(split for split, _, _ in found).values(), default=0) < MANY_CONTRASTS:
+        return None
     told = not any(math.isnan(test.p) for _, _, test in found)
-    series = AHEAD if told else UNTOLD
     rows = [
         {
             "panel": SPLIT_NAMES[split].title,
@@ -132,12 +133,11 @@ def effects_figure(found: Sequence[tuple[str, str, Difference]], scene: str, *, 
             "mean": test.mean,
             "low": test.low if told else test.mean,
             "high": test.high if told else test.mean,
-            "series": series[0 if not told or test.low > 0 else 1 if test.high < 0 else 2].title,
+            "series": _ahead(test).title,
         }
         for split, method, test in found
     ]
-    if max(Counter(split for split, _, _ in found).values(), default=0) < MANY_CONTRASTS:
-        return None
+    series = AHEAD if told else (UNTOLD,)
     known = f"with the 95 % interval over {over}. Arrows: it goes on beyond the scale." if told else UNKNOWN
     return Figure(
         name=f"effects_{scene}",
@@ -146,6 +146,12 @@ def effects_figure(found: Sequence[tuple[str, str, Difference]], scene: str, *, 
         panels=charts.forest(pd.DataFrame(rows), series, x="ASH minus the row [dB]"),
         series=series,
     )
+
+
+def _ahead(test: Difference) -> Series:
+    if math.isnan(test.p):
+        return UNTOLD
+    return AHEAD[0 if test.low > 0 else 1 if test.high < 0 else 2]
 
 
 def training_figure(scores: Scores, curves: pd.DataFrame, scene: str) -> Figure | None:

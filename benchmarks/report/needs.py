@@ -174,11 +174,11 @@ def _sufficient_section(scores: Scores, chosen_on: Scores | None) -> list[Sectio
     """The smallest sufficient row of every scene that has many, and how the rows do that were chosen elsewhere."""
     places = [(scene, split) for scene in scores.scenes for split in RANKED_SPLITS]
     rows = [row for scene, split in places if (row := _sufficient(scores, scene, split))]
-    judged = [row for scene, split in places if chosen_on and (row := _judged(scores, chosen_on, scene, split))]
-    blocks = (*(_sufficient_table(rows) if rows else ()), *(_judged_table(judged) if judged else ()))
-    if chosen_on and not judged:
-        blocks = (*blocks, Text(text=NOT_CHOSEN))
-    return [Section(title="The smallest that suffices, per scene", blocks=blocks)] if blocks else []
+    blocks = [*_sufficient_table(rows)] if rows else []
+    if chosen_on:
+        judged = [row for scene, split in places if (row := _judged(scores, chosen_on, scene, split))]
+        blocks += _judged_table(judged) if judged else [Text(text=NOT_CHOSEN)]
+    return [Section(title="The smallest that suffices, per scene", blocks=tuple(blocks))] if blocks else []
 
 
 def _sufficient_table(rows: Sequence[Row]) -> tuple[Block, ...]:

@@ -184,7 +184,7 @@ def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
     return Run(folder=out, suite=out.name, about=about, command=command, cells=tuple(named))
 
 
-def for_choosing(run: Run) -> Run:
+def require_for_choosing(run: Run) -> Run:
     """The run, if it is one of people for validation.
 
     Raises:

@@ -159,7 +159,7 @@ class ReportVerb:
 
     def __call__(self) -> int:
         """Write it, and copy it where that is asked for."""
-        from benchmarks.suites.runs import for_choosing, gathered, read_run
+        from benchmarks.suites.runs import gathered, read_run, require_for_choosing
 
         if not self.runs:
             raise InputError("expected the folder of a run or of a cell")
@@ -167,10 +167,12 @@ class ReportVerb:
             run = read_run(self.runs[0])
         else:
             run = gathered(self.runs, self.out or Path("runs/report"), command=typed())
-        chosen_on = None if self.chosen_on is None else for_choosing(read_run(self.chosen_on))
-        if chosen_on is not None:
-            run = replace(run, command="; ".join(filter(None, (run.command, typed()))))
-        code = _report(run, chosen_on)
+        if self.chosen_on is None:
+            code = _report(run)
+        else:  # The report says so; the run that --publish leaves is as it was.
+            commands = dict.fromkeys(filter(None, (run.command, typed())))
+            told = replace(run, command="; ".join(commands))
+            code = _report(told, require_for_choosing(read_run(self.chosen_on)))
         if self.publish is not None:
             from benchmarks.report.page import publish
 
