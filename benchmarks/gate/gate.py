@@ -45,6 +45,7 @@ TIMED_AGAIN = 10  # cells for times alone: for a baseline always, for a run one 
 OTHER_TRAINING = 1.25  # ratio of training times, either way
 STAGE_FLOOR = 0.1  # stages below this share of the reference workload are noise
 MORE_MEMORY = 1.10
+NOT_IN_BASELINE = "the baseline has no results of this row; --update-baseline adds it"
 SINGLE_SEED_FACTOR = 5.0  # one seed knows no spread: only losses of several margins are believed
 
 
@@ -123,18 +124,50 @@ def read_baseline(path: Path) -> Baseline:
         raise InputError(f"{path}: expected a baseline of the gate ({error})") from error
 
 
+def replacement(path: Path, head: Baseline) -> Baseline:
+    """The run, if it may replace the baseline at `path`, which need not exist.
+
+    Raises:
+        InputError: a cell of the run failed, or the run lacks a row that the baseline has.
+    """
+    if failed := [entry.title for entry in head.entries if entry.failed]:
+        raise InputError(f"a baseline needs cells that are done, and cells of {', '.join(failed)} failed")
+    rows = {entry.title for entry in head.entries}
+    before = read_baseline(path).entries if path.exists() else ()
+    if dropped := [entry.title for entry in before if entry.title not in rows]:
+        raise InputError(
+            f"{path} holds {', '.join(dropped)}, which this run lacks; to drop them, remove that file first"
+        )
+    return head
+
+
 def judge(baseline: Baseline, head: Baseline) -> list[Check]:
-    """Every comparison of a run with the baseline."""
+    """Every comparison of a run with the baseline.
+
+    Raises:
+        InputError: they are of different suites, or have no row in common that has results.
+    """
     if baseline.suite != head.suite:
         raise InputError(f"expected a run of suite {baseline.suite}, as the baseline is, got {head.suite}")
     found = {(entry.scene, entry.method): entry for entry in head.entries}
-    checks: list[Check] = []
+    judged = {(entry.scene, entry.method) for entry in baseline.entries if entry.seeds}
+    checks = [
+        _check(entry, "present", "not judged", NOT_IN_BASELINE)
+        for entry in head.entries
+        if (entry.scene, entry.method) not in judged
+    ]
+    if not judged & found.keys():
+        held = ", ".join(entry.title for entry in baseline.entries if entry.seeds) or "no finished cell"
+        ran = ", ".join(entry.title for entry in head.entries) or "no finished cell"
+        raise InputError(f"nothing was compared: the baseline has {held}; the run has {ran}")
     compared: list[tuple[BaselineEntry, BaselineEntry]] = []
     for base in baseline.entries:
         now = found.get((base.scene, base.method))
+        if (base.scene, base.method) not in judged:
+            continue
         if now is None:
-            checks.append(_check(base, "present", "fail", "no such cell in this run"))
-        elif now.failed > base.failed:
+            checks.append(_check(base, "present", "fail", "the baseline has this row and the run lacks it"))
+        elif now.failed > base.failed or not now.seeds:
             checks.append(_check(base, "came through", "fail", f"{now.failed} seeds failed"))
         else:
             compared.append((base, now))

@@ -2,22 +2,23 @@
 
 from collections.abc import Sequence
 
+from ash.files import InputError
+from benchmarks.cell.methods import DECIDING_PACKAGES, find_method, named_method
 from benchmarks.gate.gate import FINE, Baseline, Check
 from benchmarks.report import escaping
 
-# Where a moved number is made. What all methods share is looked for in other places than what one of them alone does.
+# Sources that decide a time, by its name, and a template; all else follows from where a method's factory is.
 STAGES = {
     "stg1": ("ash/template/",),
-    "stg2": ("ash/textures.py", "ash/native/texels.inc"),
-    "stg3": ("ash/decoders.py", "ash/blendshapes.py", "ash/inference.py"),
-    "stg4": ("ash/gaussians/", "ash/native/", "baselines/display.py"),
-    "training": ("ash/training/", "ash/losses.py", "ash/presets.py"),
-    "frame": ("ash/model.py", "ash/avatar.py", "ash/gaussians/", "ash/native/"),
+    "stg2": ("ash/textures.py", "ash/native/"),
+    "stg3": ("ash/decoders.py", "ash/native/"),
+    "stg4": ("ash/gaussians/", "ash/native/"),
+    "training": ("ash/training/",),
+    "frame": ("ash/",),
 }
-SHARED = ("synth/", "ash/capture/", "benchmarks/cell/", "ash/mesh/", "ash/native/", "ash/rotations.py")
-MAKING_SCENES = ("synth/", "ash/capture/")
 TEMPLATE = ("ash/template/", "ash/template_learning/")
-METHODS = {"ddc": ("baselines/ddc.py", "ash/mesh/"), "ash": ("ash/",)}
+MAKING_SCENES = ("synth/", "ash/capture/")
+SHARED = ("ash/", "synth/", "benchmarks/cell/")  # by all methods
 SOURCES = ("ash/", "baselines/", "synth/", "benchmarks/cell/", "pyproject.toml", "constraints.txt")
 SHOWN_FILES = 20
 
@@ -33,8 +34,12 @@ def terminal(baseline: Baseline, head: Baseline, checks: Sequence[Check], change
         lines += ["", f"What moved: {pattern(checks)}.", *suspects(bad, changed, one_of_many=one_of_many)]
     else:
         lines += [f"  {check.what}: {check.detail}" for check in checks]
-    untold = [check for check in checks if check.verdict == "not judged"]
-    lines += [f"Not judged: {untold[0].detail}." if untold else "", verdict(checks)]
+    not_judged: dict[str, list[str]] = {}
+    for check in checks:
+        if check.verdict == "not judged":
+            not_judged.setdefault(check.detail, []).append(f"{check.what.partition(': ')[0]}")
+    lines += [f"Not judged: {', '.join(rows)}: {detail}." for detail, rows in not_judged.items()]
+    lines.append(verdict(checks))
     return "\n".join(escaping.CONTROLS.sub(" ", line) for k, line in enumerate(lines) if line or k)
 
 
@@ -92,6 +97,17 @@ def _places(bad: Sequence[Check], one_of_many: bool) -> tuple[str, ...]:
         elif len(methods) > 1:
             found += MAKING_SCENES if one_of_many else SHARED
         else:
-            family = check.method.split("_")[0]
-            found += METHODS.get(family, ("baselines/", "the method's own sources"))
+            found += sources_of(check.method)
     return tuple(dict.fromkeys(found))
+
+
+def sources_of(row: str) -> tuple[str, ...]:
+    """The module of a row's factory, and the package that all methods of ours are made of."""
+    try:
+        module = find_method(named_method(row)).target.partition(":")[0]
+    except InputError:  # A suite gave the row a name of its own.
+        return ("the method's own sources",)
+    package = module.split(".")[0]
+    if package not in DECIDING_PACKAGES:
+        return (f"{package}, the method's own package",)
+    return tuple(dict.fromkeys(("ash/" if package == "ash" else f"{module.replace('.', '/')}.py", "ash/")))

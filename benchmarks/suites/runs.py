@@ -31,6 +31,7 @@ class Run:
     about: str
     command: str
     cells: tuple[Cell, ...]
+    absent: tuple[str, ...] = ()  # keys of cells that have no folder: other shards have them
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -157,8 +158,22 @@ def read_run(folder: Path) -> Run:
     if told.protocol != PROTOCOL:
         raise InputError(f"{path}: expected protocol {PROTOCOL}, got {told.protocol}; results do not mix")
     names = {"suite": told.suite, "about": told.about, "command": told.command}
-    found = [folder / "cells" / key for key in keys if (folder / "cells" / key / "config.json").exists()]
-    return Run(folder=folder, cells=tuple(read_cell(cell) for cell in found), **names)
+    found = [key for key in keys if (folder / "cells" / key / "config.json").exists()]
+    cells = tuple(read_cell(folder / "cells" / key) for key in found)
+    return Run(folder=folder, cells=cells, absent=tuple(key for key in keys if key not in found), **names)
+
+
+def require_complete(run: Run) -> Run:
+    """The run, if every cell of it has a result.
+
+    Raises:
+        InputError: it was interrupted, or is one shard of several.
+    """
+    done = sum(result_of(cell) is not None for cell in run.cells)
+    if done < (total := len(run.cells) + len(run.absent)):
+        finish = f"; finish it with: {run.command}" if run.command else ""
+        raise InputError(f"{run.folder}: the run is incomplete, {done} of {total} cells have a result{finish}")
+    return run
 
 
 def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:

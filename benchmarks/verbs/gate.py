@@ -2,11 +2,17 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tyro.conf import FlagCreatePairsOff
 
+from ash.files import InputError
 from benchmarks.verbs.arguments import DONE, FAILED, Count, File, Folder, Natural
 from benchmarks.verbs.runs import run_and_report
+
+if TYPE_CHECKING:
+    from benchmarks.gate.gate import Baseline
+    from benchmarks.suites.suites import Suite
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,7 +21,7 @@ class GateVerb:
 
     baseline: File = Path("reports/baseline.json")  # what the run is compared with
     head: Folder | None = None  # the run to judge; default: run the suite now
-    suite: str = "ci"  # of a new baseline
+    suite: str | None = None  # a name or FILE.toml; default: the baseline's, of a new baseline ci
     seeds: Count = 3  # of the run
     data: Folder = Path("data")  # where captures are kept
     markdown: File | None = None  # write the summary there, for a pull request
@@ -29,16 +35,15 @@ class GateVerb:
         from benchmarks.gate.again import run_again
         from benchmarks.gate.words import terminal
         from benchmarks.provenance import changed_since, cores
-        from benchmarks.suites.files import find_suite
-        from benchmarks.suites.runs import RunOptions, read_run, results_of
+        from benchmarks.suites.runs import RunOptions, read_run, require_complete, results_of
 
         baseline = None if self.update_baseline else rules.read_baseline(self.baseline)
         if self.head is not None:
-            found = read_run(self.head)
+            found = require_complete(read_run(self.head))
             head = rules.summarise(found.suite, results_of(found))
             checks = rules.judge(baseline, head) if baseline else []
         else:
-            suite = find_suite(self.suite if baseline is None else baseline.suite).narrowed(seeds=self.seeds)
+            suite = self._suite(baseline).narrowed(seeds=self.seeds)
             # One cell at a time: a neighbour slows the stages of a frame by more than it slows the reference workload.
             options = RunOptions(out=Path("runs/gate"), data=self.data, workers=cores(), cells=1)
             code = run_and_report(suite, options)
@@ -53,7 +58,7 @@ class GateVerb:
                     baseline, suite.name, results, lambda slow, k: run_again(suite, options, [suite.seeds + k], slow)
                 )
         if baseline is None:
-            rules.write_baseline(self.baseline, head)
+            rules.write_baseline(self.baseline, rules.replacement(self.baseline, head))
             print(f"{self.baseline}: now holds {len(head.entries)} methods at commit {head.commit}")
             return DONE
         print(terminal(baseline, head, checks, changed_since(baseline.commit)))
@@ -62,6 +67,19 @@ class GateVerb:
         if self.junit:
             write_atomic(self.junit, rules.junit(checks).encode())
         return DONE if all(check.verdict in rules.FINE for check in checks) else FAILED
+
+    def _suite(self, baseline: "Baseline | None") -> "Suite":
+        """The suite to run."""
+        from benchmarks.suites.files import find_suite, suite_files
+
+        if self.suite is None and baseline is not None and baseline.suite not in suite_files():
+            raise InputError(f"{self.baseline} is of the suite {baseline.suite!r}: expected its file in --suite")
+        suite = find_suite(self.suite or (baseline.suite if baseline else "ci"))
+        if baseline is not None and suite.name != baseline.suite:
+            raise InputError(
+                f"--suite {self.suite}: expected the suite {baseline.suite!r}, which {self.baseline} is of"
+            )
+        return suite
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,3 +1,4 @@
+import subprocess
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection
 from dataclasses import replace
@@ -9,8 +10,11 @@ from helpers.hostile import HOSTILE, Text
 from markdown_it import MarkdownIt
 
 from ash.files import InputError
+from benchmarks import provenance
 from benchmarks.cell.cells import CellConfig, CellResult, Summary, Timing, ViewScore, failed_result
+from benchmarks.cell.methods import methods
 from benchmarks.cell.metrics import PROTOCOL
+from benchmarks.gate import words as summary
 from benchmarks.gate.gate import (
     TIMED_AGAIN,
     Check,
@@ -18,12 +22,12 @@ from benchmarks.gate.gate import (
     junit,
     markdown,
     read_baseline,
+    replacement,
     settle,
     summarise,
     write_baseline,
 )
 from benchmarks.gate.words import terminal
-from benchmarks.provenance import changed_since
 from benchmarks.report import escaping
 
 
@@ -120,8 +124,44 @@ def test_on_another_machine_qualities_are_judged_and_costs_are_not() -> None:
 def test_failed_and_missing_cells() -> None:
     failed = [*run([25.0, 25.1]), failed_result(result(2, psnr=0.0).config, "diverged", "nan")]
     assert verdicts(failed)["came through"] == "fail"
-    other = [replace(r, config=replace(r.config, method="ddc")) for r in run([25.0, 25.1])]
-    assert verdicts(other)["present"] == "fail"
+    both, ash = two({PLACES[0]: GOOD, PLACES[1]: GOOD}), two({PLACES[0]: GOOD})
+    missing = judge(summarise("ci", both), summarise("ci", ash))
+    assert [(c.what, c.verdict) for c in missing if c.kind == "presence"] == [("boxes · ddc: present", "fail")]
+    crashed = [failed_result(r.config, "crashed", "") for r in run([25.0, 25.1, 24.9])]
+    assert verdicts(crashed) == {"came through": "fail"}
+
+
+def test_a_row_that_the_baseline_lacks_is_named_and_not_judged() -> None:
+    base, head = summarise("ci", two({PLACES[0]: GOOD})), summarise("ci", two({PLACES[0]: GOOD, PLACES[1]: WORSE}))
+    checks = judge(base, head)
+    assert [c.what for c in checks if c.verdict == "not judged"] == ["boxes · ddc: present"]
+    assert "Not judged: boxes · ddc: the baseline has no results of this row" in terminal(base, head, checks, ())
+
+
+def test_a_gate_that_compares_nothing_is_refused() -> None:
+    other = summarise("ci", two({PLACES[1]: GOOD}))
+    crashed = summarise("ci", [failed_result(r.config, "crashed", "") for r in run([25.0, 25.1])])
+    for base, head, said in (
+        (replace(BASE, entries=()), BASE, "the baseline has no finished cell; the run has boxes · ash"),
+        (BASE, other, "the baseline has boxes · ash; the run has boxes · ddc"),
+        (crashed, crashed, "the baseline has no finished cell"),
+    ):
+        with pytest.raises(InputError, match=f"^nothing was compared: {said}"):
+            judge(base, head)
+
+
+def test_a_baseline_is_not_made_of_failed_cells_and_loses_no_row_silently(tmp_path: Path) -> None:
+    path = tmp_path / "baseline.json"
+    half = [*run([25.0, 25.1]), failed_result(result(2, psnr=0.0).config, "crashed", "killed")]
+    with pytest.raises(InputError, match="needs cells that are done, and cells of boxes · ash failed"):
+        replacement(path, summarise("ci", half))
+    both, ash = summarise("ci", two(dict.fromkeys(PLACES, GOOD))), summarise("ci", two({PLACES[0]: GOOD}))
+    assert replacement(path, ash) == ash
+    write_baseline(path, both)
+    with pytest.raises(InputError, match="holds boxes · ddc, cones · ash, cones · ddc, which this run lacks"):
+        replacement(path, ash)
+    write_baseline(path, ash)
+    assert replacement(path, both) == both
 
 
 def test_another_capture_cannot_be_compared() -> None:
@@ -233,9 +273,38 @@ def test_the_smallest_visible_change_is_seen() -> None:
     assert smallest < 1 and found >= 45
 
 
-def test_git_tells_which_files_changed() -> None:
-    found = changed_since("0" * 12)
-    assert found is None and changed_since("unknown; rm -rf") is None
+def test_every_source_that_is_named_exists() -> None:
+    root = Path(__file__).parents[3]
+    named = {name for places in summary.STAGES.values() for name in places}
+    named |= {*summary.TEMPLATE, *summary.MAKING_SCENES, *summary.SHARED, *summary.SOURCES}
+    for method in methods():
+        places = summary.sources_of(method)
+        assert len(places) == (1 if places[0] == "ash/" else 2), method
+        named |= set(places)
+    assert {"ash/", "baselines/ddc.py", "ash/training/"} <= named
+    assert [name for name in sorted(named) if not (root / name).exists()] == []
+    assert summary.sources_of("a row of the user's") == ("the method's own sources",)
+
+
+def test_git_tells_which_files_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def git(*words: str) -> str:
+        who = ("-c", "user.name=a", "-c", "user.email=a@b")
+        return subprocess.run(["git", *who, *words], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+
+    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "benchmarks" / "provenance.py"))
+    git("init", "-q")
+    for name in ("same.py", "edited.py", "committed.py"):
+        (tmp_path / name).write_text("1\n")
+    git("add", ".")
+    git("commit", "-qm", "base")
+    base = git("rev-parse", "--short=12", "HEAD").strip()
+    assert provenance.changed_since(base) == ()
+    (tmp_path / "committed.py").write_text("2\n")
+    git("commit", "-qam", "one more")
+    (tmp_path / "edited.py").write_text("2\n")
+    (tmp_path / "new.py").write_text("1\n")
+    assert provenance.changed_since(f"{base}+") == ("committed.py", "edited.py", "new.py")
+    assert provenance.changed_since("0" * 12) is None and provenance.changed_since("unknown; rm -rf") is None
 
 
 def test_summary_and_junit() -> None:
