@@ -157,6 +157,7 @@ class CellResult:
     snapshots: tuple[Snapshot, ...] = ()
     provenance: Provenance | None = None
     drawn_on: str = ""  # device of its pictures: `eval` may take another than the one that learned; empty: unknown
+    evaluated_code: str = ""  # of `eval`, where it is not the code of the config, which trained; empty: the same code
     isolated: bool | None = None  # whether the method had a room of its own; None: an oracle, a failure, an old result
 
     def value(self, split: str, region: str, metric: str) -> float | None:

@@ -47,7 +47,6 @@ MOST_POINTS, MOST_COUNT = 10_000_000, 10**13
 LOWEST, HIGHEST = -0.5, 2.0  # of a picture; rounding and overbright colours leave 0..1 a little, other units far
 CLOCK_SLACK_MS, CLOCK_SLACK = 2.0, 0.1
 CLOCK_LIE_MS, TRAINING_SLACK_S = 20.0, 5.0  # what a busy machine's scheduler may add
-ISOLATION = "ASH_BENCH_ISOLATION"  # "off": do without namespaces, as where the kernel has none
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -254,7 +253,7 @@ def hosted(
         "room": None,
     }
     kernels = give_kernels(cell.config.device, place)
-    wanted = not oracle and os.environ.get(ISOLATION) != "off"
+    wanted = not oracle and os.environ.get(isolation.ISOLATION) != "off"
     if wanted:
         if store is not None:
             store.mkdir(parents=True, exist_ok=True)

@@ -9,9 +9,12 @@ import ctypes
 import os
 import resource
 import signal
+import subprocess
 import sys
+import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 CLONE_NEWNS, CLONE_NEWIPC, CLONE_NEWUSER, CLONE_NEWPID, CLONE_NEWNET = 1 << 17, 1 << 27, 1 << 28, 1 << 29, 1 << 30
@@ -25,6 +28,7 @@ CAPSET_VERSION = 0x20080522
 
 SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32", "/etc", "/opt", "/sys", "/nix")
 EMPTY = ("/tmp", "/var/tmp", "/dev/shm", "/run", "/root", "/home")
+ISOLATION = "ASH_BENCH_ISOLATION"  # "off": do without namespaces, as where the kernel has none
 REFUSED = 77  # exit code of a process that could not have its room; why is on standard error
 
 
@@ -71,6 +75,21 @@ def enter(room: Room) -> None:
     if worker:
         os._exit(_exit_code(os.waitpid(worker, 0)[1]))
     _die_with_parent()
+
+
+def problem() -> str | None:
+    """Why methods cannot be isolated on this machine, in one line; None where they can."""
+    return f"{ISOLATION}=off" if os.environ.get(ISOLATION) == "off" else _kernel_problem()
+
+
+@cache
+def _kernel_problem() -> str | None:
+    """What the kernel says when an empty file system of its own is asked for: tried in a process without threads."""
+    with tempfile.TemporaryDirectory() as base:
+        command = [sys.executable, "-P", "-m", "benchmarks.cell.isolation", base]
+        tried = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    lines = tried.stderr.strip().splitlines()
+    return None if tried.returncode == 0 else lines[-1] if lines else f"the trial ended with {tried.returncode}"
 
 
 def end_with_parent() -> None:
@@ -216,3 +235,11 @@ def _syscall(name: str, number: int, *arguments: object) -> None:
     if _libc().syscall(ctypes.c_long(number), *arguments) != 0:
         error = ctypes.get_errno()
         raise Refused(error, f"{name}: {os.strerror(error)}")
+
+
+if __name__ == "__main__":
+    try:
+        enter(Room(readable=libraries(), writable=(), hidden=(), base=sys.argv[1]))
+    except Refused as error:
+        print(error, file=sys.stderr, flush=True)
+        sys.exit(REFUSED)

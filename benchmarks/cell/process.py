@@ -2,11 +2,12 @@
 
 No code of the method runs in this process: it learns and draws in another (`benchmarks.cell.host`), and ends before
 anything is scored. So these exit codes are the harness's own word: 0 a result was written (also that of a method that
-failed), 2 wrong input or no room to write (on stderr), 130 interrupted, 76 the method's process was killed by somebody
-else; the last two without a result.
+failed), 2 wrong input (on stderr), 75 the disk is full, 130 interrupted, 76 the method's process was killed by somebody
+else; the last three without a result.
 """
 
 import argparse
+import errno
 import os
 import shutil
 import sys
@@ -40,12 +41,13 @@ from benchmarks.cell.children import adopt_orphans
 from benchmarks.cell.evaluation import _flicker_summary, _gap_summary, _image_summary, draw_all, judge, scored_views
 from benchmarks.cell.failing import Killed, MethodFailed, Spoilt
 from benchmarks.cell.host import WORK, Host, give_files, hosted, take_files
-from benchmarks.cell.methods import ORACLES, configured, find_method, offered
+from benchmarks.cell.methods import ORACLES, code_version, configured, find_method, offered
 from benchmarks.cell.sealing import seen_by_method, watched
 from benchmarks.cell.timing import Spent
 from benchmarks.cell.views import View
 
-KILLED = 76  # exit code
+DISK_FULL, KILLED = 75, 76  # exit codes
+FULL = 1 << 20  # bytes; a disk with less free space is full
 TEMPLATES = "templates"  # Beside the captures: learned once, shared by methods and runs.
 
 
@@ -65,6 +67,8 @@ def main(argv: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):  # Nothing can be printed: the log lies on that disk.
+            return DISK_FULL
         print(disk_problem(error) or _reraise(error), file=sys.stderr)
         return 2
     except KeyboardInterrupt as interruption:
@@ -113,7 +117,8 @@ def run_cell(cell: Cell) -> CellResult:
 def evaluate_cell(cell: Cell, *, device: str | None = None) -> CellResult:
     """Load a cell's checkpoint, render and score again, and write the result anew; training is not repeated.
 
-    It is drawn on `device`, which the result names, or where it learned.
+    It is drawn on `device`, which the result names, or where it learned. The result names the code that drew and
+    scored it, where that is not the code that trained it.
 
     Raises:
         InputError: the cell is unfinished, or its method does not load or draw any more.
@@ -126,7 +131,13 @@ def evaluate_cell(cell: Cell, *, device: str | None = None) -> CellResult:
         with trained_host(there, capture) as host:
             drawn = draw_all(cell, capture, host)
         judged = judge(cell, capture, drawn, spent, before.training)
-        result = replace(judged, provenance=before.provenance, drawn_on=there.config.device)
+        code = code_version(cell.config.source)
+        result = replace(
+            judged,
+            provenance=before.provenance,
+            drawn_on=there.config.device,
+            evaluated_code="" if code == cell.config.code else code,
+        )
     except (MethodFailed, Killed) as error:
         raise InputError(f"{cell.folder}: {error or 'its process was killed'}; the result stays as it was") from error
     write_result(cell.folder, result)
@@ -210,13 +221,27 @@ def _hosted(cell: Cell, capture: Capture, *, secret: tuple[Path, ...] = ()) -> I
             if not host.isolated and (damage := _damage(cell, capture)):
                 raise InputError(f"{cell.capture_folder}: {damage}")
             exposed = not host.isolated
-            yield host
+            try:
+                yield host
+            except MethodFailed as error:
+                require_disk(cell.folder, error)
+                raise
     except (MethodFailed, Killed) as error:
         if exposed and (damage := _damage(cell, capture)):
             raise Spoilt(damage) from error
         raise
     if exposed and (damage := _damage(cell, capture)):
         raise Spoilt(damage)
+
+
+def require_disk(folder: Path, failure: MethodFailed) -> None:
+    """Whether a method failed for want of disk, while its files are still there: a full disk is not its failure.
+
+    Raises:
+        OSError: the disk that holds the cell is full, so the cell has no result.
+    """
+    if shutil.disk_usage(folder).free < FULL:
+        raise OSError(errno.ENOSPC, f"the disk is full ({failure})", str(folder)) from failure
 
 
 def _damage(cell: Cell, capture: Capture) -> str:

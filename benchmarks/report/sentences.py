@@ -93,6 +93,9 @@ def doubts(results: Sequence[CellResult]) -> tuple[str, ...]:
             f"Not isolated: {', '.join(titles)}. The system had no room to lock the method in, so the truth was out of"
             " sight, and opening it was watched, but not impossible."
         )
+    for result in results:
+        if result.evaluated_code:
+            found.append(f"{result.config.title}: scored by other code ({result.evaluated_code}) than trained it.")
     for kind, words in DRAWN_BY.items():
         timed = (r.config.method for r in results if r.timing is not None and r.timing.drawn_by == kind)
         if names := [look_of(method).title for method in dict.fromkeys(timed)]:

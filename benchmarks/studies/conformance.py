@@ -14,8 +14,8 @@ from typing import Any
 from ash.capture.dataset import Capture
 from ash.capture.formats import load_capture, write_cameras, write_motion
 from ash.files import InputError, write_json
-from benchmarks.cell.host import BASE, EXAM, ISOLATION, WORK, room_for
-from benchmarks.cell.isolation import REFUSED
+from benchmarks.cell.host import BASE, EXAM, WORK, room_for
+from benchmarks.cell.isolation import ISOLATION, REFUSED
 from benchmarks.cell.methods import ORACLES, find_method
 from benchmarks.cell.sealing import copy, seen_by_method
 from benchmarks.studies.trial import Outcome, Trial, few_views, read_outcome

@@ -29,7 +29,7 @@ from benchmarks.cell.cells import (
     write_config,
     write_result,
 )
-from benchmarks.cell.process import KILLED
+from benchmarks.cell.process import DISK_FULL, KILLED
 from benchmarks.suites.gpus import lent_gpu
 from benchmarks.suites.progress import Progress
 
@@ -274,6 +274,8 @@ def _outcome(cell: Cell, ending: Ending, limits: Limits) -> CellResult:
     if failure is None:
         if ending.exit_code == WRONG_INPUT:
             raise InputError(last_line(cell.folder / "output.log"))
+        if ending.exit_code == DISK_FULL:
+            raise InputError(f"{cell.folder}: the disk is full; with more space the same command goes on")
         result = result_of(cell)
         peak = result.value("memory", "", "peak_rss_mb") if result is not None else None
         if result is not None and (peak is None or peak <= limits.memory_mb):

@@ -1,6 +1,7 @@
 """A run: a suite's captures, then its cells, then what they came to, all in one folder."""
 
 import contextlib
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from ash.capture.formats import load_capture
 from ash.capture.typed import from_json
 from ash.fields import for_json
 from ash.files import InputError, only_run_in, read_json, require_plain, write_json
+from benchmarks.cell import isolation
 from benchmarks.cell.cells import Cell, CellConfig, CellResult, read_cell, result_of
 from benchmarks.cell.methods import code_version, find_method
 from benchmarks.cell.metrics import PROTOCOL
@@ -69,9 +71,24 @@ def run_suite(suite: Suite, options: RunOptions) -> Run:
     """Make the captures, run the missing cells, and return the run; finished work is never repeated."""
     for method in suite.methods:
         find_method(method.of or method.name)
+    for folder in (options.out, options.data):
+        require_utf8(folder)
     options.out.mkdir(parents=True, exist_ok=True)
     with contextlib.nullcontext() if options.shard else only_run_in(options.out):
         return _run_suite(suite, options)
+
+
+def require_utf8(folder: Path) -> None:
+    """Refuse a folder whose path cannot be written to JSON.
+
+    Raises:
+        InputError: its absolute path is not UTF-8.
+    """
+    path = os.fsencode(folder.resolve())
+    try:
+        path.decode()
+    except UnicodeDecodeError:
+        raise InputError(f"expected a folder whose path is UTF-8, got {path!r}") from None
 
 
 def _run_suite(suite: Suite, options: RunOptions) -> Run:
@@ -94,6 +111,8 @@ def run_missing(cells: Sequence[Cell], suite: Suite, options: RunOptions) -> Non
         progress.say(reason)
     if plan.done:
         progress.say(f"{len(plan.done)} of {len(plan.done) + len(plan.todo)} cells are there already")
+    if plan.todo and options.executor == "local" and (problem := isolation.problem()):
+        progress.say(f"methods are not isolated here: {problem}; rows say so")
     gpu = any(cell.config.device != "cpu" for cell in plan.todo)
     with make_executor(options.executor, workers=options.side_by_side, gpu=gpu) as executor:
         run_cells(plan, executor, limits, progress, gpus=options.gpus)

@@ -34,7 +34,7 @@ def examine(folder: Path, device: str | None = None) -> list[Finding]:
     if device is None and _has_usable_gpu():
         device = "cuda"
     timed = [] if device is None else [_training(device)]
-    rest = [_lpips(), _threads(), _memory(), _disk(folder)]
+    rest = [_isolation(), _lpips(), _threads(), _memory(), _disk(folder)]
     return [_renderer(), _compiler(), _kernels(), _gpu(), *timed, *rest]
 
 
@@ -132,6 +132,15 @@ def _lpips() -> Finding:
     if path is not None:
         return Finding(what="LPIPS weights", found=str(path), consequence="LPIPS is computed")
     return Finding(what="LPIPS weights", found="none", consequence="LPIPS is n/a; FLIP is the perceptual metric")
+
+
+def _isolation() -> Finding:
+    from benchmarks.cell import isolation
+
+    if problem := isolation.problem():
+        consequence = "a method is only watched: its process could reach truth, and its row says so"
+        return Finding(what="isolation", found=problem, consequence=consequence)
+    return Finding(what="isolation", found="namespaces", consequence="a method's process sees training data alone")
 
 
 def _threads() -> Finding:

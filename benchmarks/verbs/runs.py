@@ -351,5 +351,7 @@ def _tell(folder: Path, result: Any) -> int:
         if (value := result.value(split, "foreground", "psnr")) is not None:
             parts.append(f"{split.replace('_', ' ')} {value:.2f} dB")
     parts.append(f"{result.value('speed', '', 'frame_ms'):.1f} ms per frame")
+    if result.evaluated_code:
+        parts.append(f"scored by code {result.evaluated_code}, trained by {result.config.code}")
     print(f"{result.config.title}: {', '.join(parts)} (foreground PSNR) in {folder}")
     return DONE

@@ -13,7 +13,7 @@ from helpers import fakes, thieves
 from ash.capture.formats import load_capture
 from ash.capture.manifest import verify_capture
 from ash.files import InputError, sha256_of
-from benchmarks.cell import host, kernels
+from benchmarks.cell import host, isolation, kernels
 from benchmarks.cell.cells import Cell, failed_result, read_result, result_of, write_result
 from benchmarks.cell.failing import MethodFailed
 from benchmarks.cell.methods import find_method
@@ -175,7 +175,7 @@ def test_printing_is_bounded_and_processes_end_with_their_cell(capture: Path, tm
 
 
 def test_without_namespaces_the_row_says_so(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(host.ISOLATION, "off")
+    monkeypatch.setenv(isolation.ISOLATION, "off")
     plain = cell("fake_good", capture, tmp_path)
     run([plain])
     result = read_result(plain.folder)
@@ -190,7 +190,7 @@ def test_isolation_costs_a_cell_at_most_half_a_second(
     method = find_method("fake_good")
 
     def seconds(way: str) -> float:
-        monkeypatch.setenv(host.ISOLATION, way)
+        monkeypatch.setenv(isolation.ISOLATION, way)
         start = time.perf_counter()
         with seen_by_method(whole, tmp_path / "input", oracle=way == "off") as seen:
             with host.hosted(target, whole, seen, method, oracle=False) as guest:
@@ -210,7 +210,7 @@ def test_kernels_are_compiled_once_and_every_cell_has_its_own_copy(
 ) -> None:
     """On Warp's CPU device, as if it were a GPU."""
     monkeypatch.setattr(kernels, "runs_kernels", lambda device: seeded)
-    monkeypatch.setenv(host.ISOLATION, way)
+    monkeypatch.setenv(isolation.ISOLATION, way)
     target, whole = cell("warps", capture, tmp_path), load_capture(capture)
     method = find_method("warps")
     with (
@@ -243,7 +243,7 @@ def test_a_capture_that_a_method_changed_is_seen_and_used_no_more(
     truth = mine / "frames" / "cam4" / "000000.png"
     whole = truth.read_bytes()
     monkeypatch.setenv("ASH_BENCH_TEST_TRUTH", str(truth))
-    monkeypatch.setenv(host.ISOLATION, "off")
+    monkeypatch.setenv(isolation.ISOLATION, "off")
     cheat = cell("spoils", mine, tmp_path)
     run([cheat])
     result = read_result(cheat.folder)
