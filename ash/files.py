@@ -31,7 +31,7 @@ LIMITS = {
     "message characters": 1000,
 }
 PLAIN = re.compile(r"[\w][\w .:+=@-]{0,199}")
-ARRAY_KINDS = "biufU"  # no objects, records, dates or complex numbers
+ARRAY_KINDS = "biufSU"  # no objects, records, dates or complex numbers
 PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 SOURCE_SUFFIXES = frozenset({".py", ".cpp", ".h", ".inc", ".txt"})  # CMakeLists.txt decides how kernels are compiled.
 
@@ -194,6 +194,21 @@ def read_arrays(path: Path, *, expected: tuple[str, ...], most: int = LIMITS["np
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise InputError(f"{path}: {name} holds NaN or infinity, expected finite numbers")
     return arrays
+
+
+def array_names(path: Path, *, most: int = LIMITS["npz bytes"]) -> list[str]:
+    """The names of the arrays in an `.npz`.
+
+    Raises:
+        InputError: the file is missing, damaged or too large.
+    """
+    try:
+        with open_regular(path, most=most) as file, zipfile.ZipFile(file) as archive:
+            return [name.removesuffix(".npy") for name in archive.namelist()[: LIMITS["npz entries"]]]
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{path}: expected an .npz archive ({error})") from error
 
 
 def _promised_bytes(archive: zipfile.ZipFile, name: str) -> int:

@@ -53,6 +53,13 @@ def rotation_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     return rotvec_to_rotmat(axis / np.where(sine < 1e-12, 1.0, sine) * angle)
 
 
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """The rotation `[3, 3]` that is nearest to a matrix in the Frobenius norm."""
+    u, _, vt = np.linalg.svd(matrix)
+    rotation: np.ndarray = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return rotation
+
+
 def bone_frames(skeleton: Skeleton, dofs: np.ndarray) -> np.ndarray:
     """Forward kinematics: degrees of freedom `[t, 3 + 3 j]` to world frames G `[t, j, 4, 4]` (see `Skeleton`)."""
     count = len(skeleton.names)

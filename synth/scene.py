@@ -33,6 +33,8 @@ class Take:
     length: float | None = None  # seconds of the file that are taken; none: up to its end
     stride: int = 1  # every so many-th frame is taken: the motion goes so many times as fast
     joints: tuple[tuple[str, str], ...] = ()  # joints of ours, each with the file's name for it
+    fps: float | None = None  # frames per second of the file, where it does not say or is wrong
+    rest_frame: int | None = None  # the frame of a BVH file in which the person stands as in a rest pose
 
     def __post_init__(self) -> None:
         if self.up not in UPS:
@@ -41,6 +43,10 @@ class Take:
             raise InputError(f"a take from {self.start} s, {self.length} s long, expected 0 or more, and more than 0")
         if not 1 <= self.stride <= 10_000:
             raise InputError(f"a stride of {self.stride} frames, expected 1 to 10000")
+        if self.fps is not None and not 0.1 <= self.fps <= 10_000:
+            raise InputError(f"a motion of {self.fps} frames per second, expected 0.1 to 10000")
+        if self.rest_frame is not None and not 0 <= self.rest_frame < 10**6:
+            raise InputError(f"rest frame {self.rest_frame}, expected 0 to 999999")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -210,6 +216,10 @@ class Scene:
             del clip["path"]
             if clip["take"] == asdict(Take()):
                 del clip["take"]
+                continue
+            for name in ("fps", "rest_frame"):  # Captures of earlier versions do not have them.
+                if clip["take"][name] is None:
+                    del clip["take"][name]
         return parameters
 
     @property

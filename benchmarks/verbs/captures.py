@@ -24,6 +24,8 @@ class Excerpt:
     length: float | None = None  # take so many seconds of the file
     stride: Count = 1  # take every N-th frame: N times as fast
     joint_map: File | None = None  # JSON: our joints' names in the BVH file
+    motion_fps: float | None = None  # frames per second of the file, where it has no rate or a wrong one
+    rest_frame: int | None = None  # BVH: the frame in which the person stands straight, if the rest pose is none
 
     @property
     def take(self) -> "Take":
@@ -32,7 +34,15 @@ class Excerpt:
         from synth.scene import Take
 
         joints = read_joint_map(self.joint_map) if self.joint_map else ()
-        return Take(up=self.up, start=self.start, length=self.length, stride=self.stride, joints=joints)
+        return Take(
+            up=self.up,
+            start=self.start,
+            length=self.length,
+            stride=self.stride,
+            joints=joints,
+            fps=self.motion_fps,
+            rest_frame=self.rest_frame,
+        )
 
 
 Excerpts = Annotated[Excerpt, arg(name="", prefix_name=False)]
@@ -125,9 +135,16 @@ class SynthVerb:
         from ash.capture.novelty import novelty_deg
         from synth.capture import make_body
         from synth.motion.clips import make_motion
+        from synth.motion.importing import read_motion_file
+        from synth.motion.strip import describe
         from synth.presets import with_motion
 
         skeleton = make_body(scene).skeleton
+        for path, clips in ((self.motion, scene.train), (self.test_motion, scene.test)):
+            if path is not None:
+                most = sum(clip.frames for clip in clips)
+                read = read_motion_file(path, skeleton, fps=scene.fps, most=most, take=self.excerpt.take)
+                print(describe(read), file=sys.stderr)
         moved = with_motion(scene, skeleton, train=self.motion, test=self.test_motion, take=self.excerpt.take)
         motion = make_motion(skeleton, moved.clips, fps=moved.fps, seed=0)
         count = sum(clip.frames for clip in moved.train)
@@ -222,19 +239,18 @@ class MotionsVerb:
 
     def __call__(self) -> int:
         """Draw it, and refuse a person who stands on the head."""
-        from ash.files import write_image
         from synth.motion.importing import read_motion_file, require_upright
-        from synth.motion.strip import describe, draw_strip
+        from synth.motion.strip import describe, draw_strip, write_strip
         from synth.person.mannequin import heads
         from synth.skeleton import make_skeleton
 
         skeleton = make_skeleton(heads())
-        found = read_motion_file(self.file, skeleton, fps=self.fps, take=self.excerpt.take)
+        imported = read_motion_file(self.file, skeleton, fps=self.fps, take=self.excerpt.take)
         out = self.out or Path(f"{self.file.stem}.png")
-        write_image(out, draw_strip(skeleton, found.motion))
-        print(describe(found), file=sys.stderr)
+        write_strip(out, draw_strip(skeleton, imported.motion))
+        print(describe(imported), file=sys.stderr)
         print(out)
-        require_upright(found)
+        require_upright(imported)
         return DONE
 
 

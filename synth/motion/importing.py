@@ -5,6 +5,7 @@ the world direction that its bone takes in the file, so bone lengths and rest po
 scaled by the ratio of leg lengths. Which axes are up, in the rest pose and in the world, is found or given.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -13,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from ash.capture.dataset import Motion, Skeleton
-from ash.files import InputError, read_arrays, read_json
+from ash.files import InputError, array_names, read_arrays, read_json
 from synth.motion import bvh
 from synth.motion.plans import continuous
-from synth.posing import bone_frames, rotation_between, rotmat_to_rotvec, rotvec_to_rotmat
+from synth.posing import bone_frames, nearest_rotation, rotation_between, rotmat_to_rotvec, rotvec_to_rotmat
 from synth.scene import Take
 from synth.skeleton import JOINTS, SIDES
 
@@ -43,6 +44,8 @@ SMPL_DIRECTIONS = {
     **{f"foot_{side}": (0.0, -0.4, 1.0) for side in ("left", "right")},
 }  # fmt: skip
 
+UPRIGHT = ("pelvis", "shin_left", "shin_right", "thigh_left", "thigh_right")  # joints that tell what is up
+
 CHILD = {
     "thigh": "shin",
     "shin": "foot",
@@ -61,9 +64,13 @@ class Source:
     directions: dict[str, np.ndarray]  # [3] direction of the joint's bone at rest
     rest: np.ndarray  # [3, 3] rows: which directions at rest are left, up and forward
     usual_up: np.ndarray  # [3] what is up in the world of such files, if their motion does not say otherwise
-    root: np.ndarray  # [t, 3] position of the root, in the file's units
+    root: np.ndarray  # [t, 3] position of the pelvis, in the file's units
     leg: float  # length from hip to ankle, in the file's units
     fps: float
+    joints: dict[str, str]  # joints of ours that follow the file, each with the file's name for it
+    unmatched: tuple[str, ...] = ()  # joints of the file without a partner
+    roots: int = 1  # of the file
+    rest_pose: str = "the file's"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -73,6 +80,9 @@ class Imported:
     path: Path
     motion: Motion
     up: str  # the axis that is up in the file
+    unmatched: tuple[str, ...]  # joints of the file without a partner
+    roots: int  # of the file
+    rest: str  # where the rest pose comes from
     joints: dict[str, str]  # joints of ours that follow the file, each with the file's name for it
     frames: int  # of the whole file
     fps: float  # of the file
@@ -108,11 +118,11 @@ def read_motion_file(
         return _chosen(path, frames, rate, fps=fps, most=most, take=take)
 
     if path.suffix.lower() == ".bvh":
-        source, joints = _from_bvh(path, choose, take)
-    elif take.joints:
-        raise InputError(f"{path}: its joints are SMPL's, expected no joint map")
+        source = _from_bvh(path, choose, take)
+    elif take.joints or take.rest_frame is not None:
+        raise InputError(f"{path}: its joints and rest pose are SMPL's, expected no joint map and no rest frame")
     else:
-        source, joints = read_amass(path, choose), {name: name for name, _ in SMPL_JOINTS if name}
+        source = read_amass(path, choose, fps=take.fps)
     up = take.up if take.up != "auto" else up_axis(path, source)
     motion = retarget(skeleton, stood_up(source, up))
     (frames, rate) = whole[0]
@@ -120,7 +130,18 @@ def read_motion_file(
     names = list(skeleton.names)
     heads = bone_frames(skeleton, motion.dofs)[:, [names.index("head"), names.index("pelvis")], 1, 3]
     share = float(np.mean(heads[:, 0] > heads[:, 1]))
-    return Imported(path=path, motion=motion, up=up, joints=joints, frames=frames, fps=rate, head_above_hips=share)
+    return Imported(
+        path=path,
+        motion=motion,
+        up=up,
+        joints=source.joints,
+        unmatched=source.unmatched,
+        roots=source.roots,
+        rest=source.rest_pose,
+        frames=frames,
+        fps=rate,
+        head_above_hips=share,
+    )
 
 
 def require_upright(found: Imported) -> None:
@@ -180,31 +201,40 @@ def _chosen(path: Path, frames: int, rate: float, *, fps: float | None, most: in
     return chosen
 
 
-def _from_bvh(path: Path, choose: Callable[[int, float], np.ndarray], take: Take) -> tuple[Source, dict[str, str]]:
-    found = bvh.read_bvh(path, choose=choose, given=dict(take.joints))
-    names = [name for name in ("shin_left", "foot_left") if name in found.rest]
-    joints = [found.rest[name] for name in ("thigh_left", *names)]
+def _from_bvh(path: Path, choose: Callable[[int, float], np.ndarray], take: Take) -> Source:
+    read = bvh.read_bvh(path, choose=choose, given=dict(take.joints), rest_frame=take.rest_frame, fps=take.fps)
+    names = [name for name in ("shin_left", "foot_left") if name in read.rest]
+    joints = [read.rest[name] for name in ("thigh_left", *names)]
     leg = float(sum(np.linalg.norm(lower - upper) for upper, lower in pairwise(joints)))
     if not leg > 0:
         raise InputError(f"{path}: the legs have no length")
-    rest = _rest_axes(path, found.rest)
+    rest, fallen = _rest_axes(read.rest)
     source = Source(
-        rotations=found.rotations,
-        directions={name: found.directions[name] for name in found.directions if name.rpartition("_")[0] in CHILD},
+        rotations=read.rotations,
+        directions={name: bone for name, bone in read.directions.items() if name.rpartition("_")[0] in CHILD},
         rest=rest,
         usual_up=rest[1],
-        root=found.root,
+        root=read.path,
         leg=leg,
-        fps=found.fps,
+        fps=read.fps,
+        joints=read.joints,
+        unmatched=read.unmatched,
+        roots=read.roots,
+        rest_pose="the file's" if take.rest_frame is None else f"frame {take.rest_frame}",
     )
-    return source, found.joints
+    if not fallen:
+        return source
+    if take.rest_frame is not None:
+        raise InputError(
+            f"{path}: in frame {take.rest_frame} {fallen} does not stand upright; give another --rest-frame"
+        )
+    return _without_rest_pose(path, source, read.rest, fallen)
 
 
-def _rest_axes(path: Path, rest: dict[str, np.ndarray]) -> np.ndarray:
-    """Which axes of the file are left, up and forward in its rest pose, `[3, 3]` rows; a person stands upright there.
+def _rest_axes(rest: dict[str, np.ndarray]) -> tuple[np.ndarray, str]:
+    """Which axes of the file are left, up and forward in its rest pose, `[3, 3]` rows, and a bone that does not stand.
 
-    Raises:
-        InputError: the torso or the legs do not stand in the rest pose, as where all bones rest along x.
+    The bone is of the torso or a leg, and empty where all stand; where all bones rest along x, most do not.
     """
     torso = [name for name in bvh.TORSO if name in rest]
     legs = [[f"{name}_{side}" for name in ("foot", "shin", "thigh") if f"{name}_{side}" in rest] for side in SIDES]
@@ -214,12 +244,58 @@ def _rest_axes(path: Path, rest: dict[str, np.ndarray]) -> np.ndarray:
     up = _axis_along(np.sum(list(bones.values()), axis=0))
     left = _axis_along(across * (1 - np.abs(up)))
     fallen = [name for name, bone in bones.items() if bone @ up < STANDING]
-    if fallen or not across.any():
+    if not across.any():
+        fallen.append("the hips")
+    return np.stack([left, up, np.cross(left, up)]), fallen[0] if fallen else ""
+
+
+def _without_rest_pose(path: Path, source: Source, rest: dict[str, np.ndarray], fallen: str) -> Source:
+    """The motion against a T-pose where the file's rest pose is none, from the directions of the bones.
+
+    Every joint's rotation is completed by a constant one, which turns the bone of the T-pose onto the file's. What the
+    direction leaves open, the twist about the bone, is chosen so that over the motion the joint twists least against
+    its parent. The pelvis is known from its hips and spine; the spine of a T-pose is straight.
+
+    Raises:
+        InputError: the motion does not stand either: legs and torso point the same way.
+    """
+    torso = [name for name in ("spine", "chest", "neck", "head") if name in rest]
+    across = _unit(rest["thigh_left"] - rest["thigh_right"])
+    up = rest[torso[0]] - rest["pelvis"] if torso else np.zeros(3)
+    up = _unit(up - across * (up @ across))
+    legs = [source.rotations[f"thigh_{side}"] @ source.directions[f"thigh_{side}"] for side in SIDES]
+    upright = np.einsum("ta,ta->t", source.rotations["pelvis"] @ up, np.sum(legs, axis=0))
+    if not across.any() or not up.any() or np.median(upright) >= 0:
         raise InputError(
-            f"{path}: in its rest pose {fallen[0] if fallen else 'the hips'} does not stand upright; "
-            "export the motion with a T-pose for rest pose"
+            f"{path}: in its rest pose {fallen} does not stand upright, nor does its motion; give a frame in which "
+            "the person stands by --rest-frame, or export the motion with a T-pose for rest pose"
         )
-    return np.stack([left, up, np.cross(left, up)])
+    directions = {name: np.array(bone) for name, bone in SMPL_DIRECTIONS.items()}
+    bones = {name: (directions[name], bone) for name, bone in source.directions.items() if name in directions}
+    for low, high in pairwise(name for name in ("spine", "chest", "neck") if name in rest):
+        if (rest[high] - rest[low]).any():
+            bones[low] = (np.array([0.0, 1.0, 0.0]), rest[high] - rest[low])
+    rotations = {"pelvis": source.rotations["pelvis"] @ np.stack([across, up, np.cross(across, up)], axis=1)}
+    for name, parent in JOINTS:
+        if name not in source.rotations or name == "pelvis":
+            continue
+        above = parent
+        while above not in rotations:
+            above = dict(JOINTS)[above]
+        given, swung = source.rotations[name], rotations[above]
+        if name in bones:
+            ours, theirs = bones[name]
+            swung = rotation_between(swung @ ours, given @ theirs) @ swung
+        mean = np.mean(np.swapaxes(given, 1, 2) @ swung, axis=0)
+        rotations[name] = given @ nearest_rotation(mean)
+    return replace(
+        source,
+        rotations=rotations,
+        directions={name: directions[name] for name in source.directions if name in directions},
+        rest=np.eye(3),
+        usual_up=_axis_along(np.mean([rotations[name][:, :, 1] for name in UPRIGHT], axis=(0, 1))),
+        rest_pose="by bone directions",
+    )
 
 
 def _axis_along(direction: np.ndarray) -> np.ndarray:
@@ -239,7 +315,7 @@ def up_axis(path: Path, source: Source) -> str:
     Raises:
         InputError: neither posture nor path tells.
     """
-    upright = [source.rotations[name] @ source.rest[1] for name in sorted(bvh.NEEDED)]
+    upright = [source.rotations[name] @ source.rest[1] for name in UPRIGHT]
     posture = np.mean(upright, axis=(0, 1))
     usual, seen = source.usual_up, _axis_along(posture)
     if (usual == seen).all():
@@ -319,23 +395,40 @@ def _lowest_foot(skeleton: Skeleton, dofs: np.ndarray) -> float:
     return float(height.min())
 
 
-def read_amass(path: Path, choose: Callable[[int, float], np.ndarray]) -> Source:
-    """Read `poses` `[t, >= 66]` (axis-angle of SMPL's joints), `trans` `[t, 3]`, `mocap_framerate`; mostly z is up."""
-    arrays = read_arrays(path, expected=("poses", "trans", "mocap_framerate"), most=MAX_BYTES)
-    poses, trans, rate = arrays["poses"], arrays["trans"], arrays["mocap_framerate"]
-    if poses.dtype.kind != "f" or poses.ndim != 2 or poses.shape[1] < 66 or not 0 < len(poses) <= MAX_FRAMES:
+RATES = ("mocap_framerate", "mocap_frame_rate", "framerate", "frame_rate", "fps")
+PATHS = ("trans", "transl")
+POSES = (("poses",), ("root_orient", "pose_body"), ("global_orient", "body_pose"))
+
+
+def read_amass(path: Path, choose: Callable[[int, float], np.ndarray], *, fps: float | None = None) -> Source:
+    """Read SMPL's, SMPL-H's or SMPL-X's joints as axis-angle, the path and the rate; mostly z is up.
+
+    The poses are `poses` `[t, >= 66]` or its parts (`root_orient` and `pose_body`), the path is `trans` or `transl`
+    `[t, 3]`, the rate `mocap_framerate`, `mocap_frame_rate` or `fps`, unless `fps` gives it.
+    """
+    names = array_names(path, most=MAX_BYTES)
+    layout = next((layout for layout in POSES if set(layout) <= set(names)), POSES[0])
+    where = next((name for name in PATHS if name in names), PATHS[0])
+    rates = [name for name in RATES if name in names][:1]
+    arrays = read_arrays(path, expected=(*layout, where, *(rates if fps is None else ())), most=MAX_BYTES)
+    parts, trans = [arrays[name] for name in layout], arrays[where]
+    if any(part.dtype.kind != "f" or part.ndim not in (2, 3) or len(part) != len(parts[0]) for part in parts):
+        raise InputError(f"{path}: expected {' and '.join(layout)} of shape [t, 66 or more]")
+    poses = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+    if poses.shape[1] < 66 or not 0 < len(poses) <= MAX_FRAMES:
         raise InputError(f"{path}: expected poses of shape [1 to {MAX_FRAMES}, 66 or more], got {poses.shape}")
     if trans.shape != (len(poses), 3) or trans.dtype.kind != "f":
-        raise InputError(f"{path}: expected trans of shape {(len(poses), 3)}, got {trans.dtype} {trans.shape}")
-    if rate.shape != () or rate.dtype.kind not in "fiu" or not 0 < float(rate) <= 10_000:
-        raise InputError(f"{path}: expected a mocap_framerate of 0 to 10000, got {rate.dtype} {rate.shape}")
-    chosen = choose(len(poses), float(rate))
+        raise InputError(f"{path}: expected {where} of shape {(len(poses), 3)}, got {trans.dtype} {trans.shape}")
+    rate = fps if fps is not None else _rate(path, rates[0], arrays[rates[0]]) if rates else None
+    if rate is None:
+        raise InputError(f"{path}: no frame rate (expected {', '.join(RATES)}); give it by --motion-fps")
+    chosen = choose(len(poses), rate)
     if len(chosen) * len(SMPL_JOINTS) > bvh.MAX_JOINT_FRAMES:
         most = bvh.MAX_JOINT_FRAMES // len(SMPL_JOINTS)
         raise InputError(f"{path}: {len(chosen)} frames, expected at most {most}; take fewer with --length or --stride")
     angles, root = poses[chosen, :66].astype(np.float64), trans[chosen].astype(np.float64)
     if max(np.abs(angles).max(), np.abs(root).max()) > bvh.MAX_NUMBER:
-        raise InputError(f"{path}: expected poses and trans below {bvh.MAX_NUMBER:g}")
+        raise InputError(f"{path}: expected {', '.join(layout)} and {where} below {bvh.MAX_NUMBER:g}")
     local = rotvec_to_rotmat(angles.reshape(len(chosen), 22, 3))
     world: list[np.ndarray] = []
     rotations = {}
@@ -350,5 +443,19 @@ def read_amass(path: Path, choose: Callable[[int, float], np.ndarray]) -> Source
         usual_up=np.array([0.0, 0.0, 1.0]),
         root=root,
         leg=SMPL_LEG,
-        fps=float(rate),
+        fps=rate,
+        joints={name: name for name, _ in SMPL_JOINTS if name},
     )
+
+
+def _rate(path: Path, name: str, value: np.ndarray) -> float:
+    """A rate as a number, a list of one, or text."""
+    try:
+        rate = float(value.reshape(-1)[0]) if value.size == 1 and value.dtype.kind in "fiuSU" else math.nan
+    except ValueError:
+        rate = math.nan
+    if not 0 < rate <= 10_000:
+        raise InputError(
+            f"{path}: expected a {name} of 0 to 10000, got {value.dtype} {value.shape}; give it by --motion-fps"
+        )
+    return rate

@@ -27,15 +27,35 @@ ROOT Hips
  {
   OFFSET 0 10 0
   CHANNELS 3 Zrotation Xrotation Yrotation
-  End Site
+  JOINT Neck
   {
    OFFSET 0 40 0
+   CHANNELS 0
+   End Site
+   {
+    OFFSET 0 10 0
+   }
   }
- }
+%s%s }
 %s%s}
 MOTION
 Frames: 2
 Frame Time: 0.04
+"""
+ARM = """  JOINT %sArm
+  {
+   OFFSET %d 40 0
+   CHANNELS 0
+   JOINT %sForeArm
+   {
+    OFFSET %d 0 0
+    CHANNELS 0
+    End Site
+    {
+     OFFSET %d 0 0
+    }
+   }
+  }
 """
 LEG = """ JOINT %sUpLeg
  {
@@ -61,7 +81,9 @@ LEG = """ JOINT %sUpLeg
 
 def bvh_file(path: Path, *, frames: str | None = None) -> Path:
     """Two frames at 25 per second: upright, then a quarter turn with a bent left knee."""
-    text = BVH % tuple(LEG % (side, sign * 10, side, side) for side, sign in (("Left", 1), ("Right", -1)))
+    sides = (("Left", 1), ("Right", -1))
+    arms = [ARM % (side, sign * 15, side, sign * 28, sign * 25) for side, sign in sides]
+    text = BVH % (*arms, *(LEG % (side, sign * 10, side, side) for side, sign in sides))
     still = ["0"] * 3 + ["0"] * 3 + ["0"] * 3 + ["0"] * 18
     moved = ["0", "0", "40"] + ["0", "0", "90"] + ["0"] * 3 + ["0"] * 3 + ["0", "60", "0"] + ["0"] * 12
     path.write_text(text + (frames if frames is not None else " ".join(still) + "\n" + " ".join(moved) + "\n"))
