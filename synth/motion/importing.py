@@ -226,7 +226,7 @@ def _from_bvh(path: Path, choose: Callable[[int, float], np.ndarray], take: Take
         return source
     if take.rest_frame is not None:
         raise InputError(
-            f"{path}: in frame {take.rest_frame} {fallen} does not stand upright; give another --rest-frame"
+            f"{path}: {fallen} does not stand upright in frame {take.rest_frame}; give another --rest-frame"
         )
     return _without_rest_pose(path, source, read.rest, fallen)
 
