@@ -7,6 +7,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NoReturn
 
 # How often an idle thread of OpenMP looks for work before it sleeps: for the time between two operations. By itself the
@@ -25,7 +26,10 @@ _set_threads()  # Read as NumPy, torch and FLIP are loaded, the first of them by
 
 from ash.fields import nearest
 from ash.files import InputError, disk_problem
+from benchmarks.cell.children import METHOD_PATH, add_method_paths
 from benchmarks.verbs.arguments import DONE, INTERRUPTED, WRONG_INPUT, Verb, completion, own_name, read_verb
+
+METHOD_PATH_FLAG = "--method-path"
 
 VERBS = {
     "run": "runs:RunVerb",
@@ -76,6 +80,8 @@ examples:
   {name} train ash data/mannequin-ci-0 --preset ci
   {name} doctor               what this machine has, and what follows from it
 
+of every verb: --method-path DIR  find your methods in DIR as well; may be repeated
+
 completion in bash (zsh, fish and tcsh likewise):
   {name} --tyro-print-completion bash > ~/.local/share/bash-completion/completions/ash-bench
 
@@ -87,7 +93,7 @@ def main(argv: list[str] | None = None) -> int:
     _open_closed_streams()
     try:
         with _terminate_as_interrupt():
-            verb = _parse(sys.argv[1:] if argv is None else argv)
+            verb = _parse(_take_method_paths(sys.argv[1:] if argv is None else argv))
             return DONE if verb is None else verb()
     except InputError as error:
         return _refuse(str(error))
@@ -102,6 +108,26 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("\nash-bench: interrupted; the same command goes on where it was", file=sys.stderr)
         return INTERRUPTED
+
+
+def _take_method_paths(tokens: Sequence[str]) -> list[str]:
+    """The command line without `--method-path DIR`, whose folders are searched for methods, here and in children."""
+    left, folders = [], []
+    waiting = iter(tokens)
+    for token in waiting:
+        flag, given, value = token.partition("=")
+        if flag != METHOD_PATH_FLAG:
+            left.append(token)
+            continue
+        folder = value if given else next(waiting, "")
+        if not folder or not Path(folder).is_dir():
+            raise InputError(f"{METHOD_PATH_FLAG}: expected a folder, got {folder!r}")
+        folders.append(str(Path(folder).resolve()))
+    if folders:
+        before = os.environ.get(METHOD_PATH)
+        os.environ[METHOD_PATH] = os.pathsep.join([*([before] if before else []), *folders])
+    add_method_paths()
+    return left
 
 
 def _open_closed_streams() -> None:
