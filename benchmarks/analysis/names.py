@@ -1,9 +1,15 @@
 """How methods are called and coloured in tables and charts; a method of someone else keeps its own name."""
 
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache
 
+from ash.files import hash_of
+from benchmarks.cell.cells import CellConfig
 from benchmarks.cell.methods import DECIDING_PACKAGES, methods
+from benchmarks.suites.files import our_rows
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -97,12 +103,42 @@ SPLIT_NAMES = {
     "memory": SplitName(title="Cost", words="cost"),
 }
 SPARE_COLOURS = ("#b8860b", "#c2415c", "#5b8c2a", "#7a869a", "#008fb3", "#a0522d")
+# Rows of published results that no suite has any more: name, factory, changes.
+FORMER_ROWS = (
+    ("ash_studio", "ash", {"training.background": "studio"}),
+    ("wo_bound", "ash", {"model.bound": "inf"}),
+)
 EXACT = {"ash": "ash_truth", "ddc": "ddc_truth"}  # A method and the same method given the exact surface.
+
+
+_USER_ROWS: ContextVar[frozenset[str]] = ContextVar("_USER_ROWS", default=frozenset())
+
+
+def user_rows(configs: Iterable[CellConfig]) -> frozenset[str]:
+    """Rows that have a name of ours but another factory or other changes than ours."""
+    ours = our_rows() | {(name, factory, hash_of(changes)) for name, factory, changes in FORMER_ROWS}
+    found = set()
+    for config in configs:
+        changes = {key: value for key, value in config.changes.items() if key != "device"}
+        plain = not config.factory and not changes  # the installed method itself
+        if not plain and (config.method, config.source, hash_of(changes)) not in ours:
+            found.add(config.method)
+    return frozenset(found)
+
+
+@contextmanager
+def titles_of(configs: Iterable[CellConfig]) -> Iterator[None]:
+    """In its block, `look_of` and `is_ours` give our titles to our own rows only, not to the user's."""
+    token = _USER_ROWS.set(user_rows(configs))
+    try:
+        yield
+    finally:
+        _USER_ROWS.reset(token)
 
 
 def look_of(method: str) -> Look:
     """The look of a method; unknown ones get a colour by the sum of their letters, the same in every report."""
-    if method in LOOKS:
+    if method in LOOKS and method not in _USER_ROWS.get():
         return LOOKS[method]
     name = method.rpartition(":")[2]
     title = name.replace("_", " ") if name != method else method  # A factory's name, where it came by its path.
@@ -114,6 +150,8 @@ def is_ours(method: str) -> bool:
 
     A user's own stand first in reports.
     """
+    if method in _USER_ROWS.get():
+        return False
     if ":" in method:
         return method.partition(".")[0] in DECIDING_PACKAGES
     return _installed().get(method, method in LOOKS)

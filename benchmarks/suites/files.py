@@ -25,8 +25,8 @@ from tomlkit.exceptions import NonExistentKey, TOMLKitError
 from tomlkit.items import AbstractTable, Table
 
 from ash.capture.manifest import read_manifest
-from ash.fields import WRITTEN, Changes, nearest
-from ash.files import InputError, open_regular
+from ash.fields import WRITTEN, Changes, for_json, nearest
+from ash.files import InputError, hash_of, open_regular
 from benchmarks.cell.methods import configured, find_method
 from benchmarks.suites.stress import Stress
 from benchmarks.suites.suites import MethodSpec, SceneSpec, Suite, varied_name
@@ -50,6 +50,18 @@ PLAIN: dict[str, type] = {
 def suite_files() -> dict[str, Path]:
     """Our own suites by name."""
     return {path.stem: path for path in sorted(FOLDER.glob("*.toml"))}
+
+
+def our_rows() -> frozenset[tuple[str, str, str]]:
+    """Name, factory and hash of the changes of every varied method in our own suites."""
+    found = set()
+    for path in suite_files().values():
+        for row in tomlkit.parse(path.read_text()).unwrap()["methods"]:
+            if isinstance(row, dict):
+                changes = _dotted({key: value for key, value in row.items() if key not in METHOD_KEYS})
+                name = row.get("name") or varied_name(row["of"], changes)
+                found.add((name, row["of"], hash_of(for_json(changes))))
+    return frozenset(found)
 
 
 def find_suite(name: str | Path) -> Suite:

@@ -12,7 +12,7 @@ from ash.capture.typed import from_json
 from ash.fields import for_json
 from ash.files import InputError, only_run_in, read_json, require_plain, write_json
 from benchmarks.cell import isolation
-from benchmarks.cell.cells import Cell, CellConfig, CellResult, read_cell, result_of
+from benchmarks.cell.cells import Cell, CellConfig, CellResult, printable, read_cell, result_of
 from benchmarks.cell.methods import code_version, find_method
 from benchmarks.cell.metrics import PROTOCOL
 from benchmarks.suites.captures import make_capture, require_intact, subject_of, truth_of
@@ -176,7 +176,7 @@ def read_run(folder: Path) -> Run:
         raise InputError(f"{path}: expected the description of a run ({error})") from error
     if told.protocol != PROTOCOL:
         raise InputError(f"{path}: expected protocol {PROTOCOL}, got {told.protocol}; results do not mix")
-    names = {"suite": told.suite, "about": told.about, "command": told.command}
+    names = {"suite": told.suite, "about": printable(told.about), "command": printable(told.command)}
     found = [key for key in keys if (folder / "cells" / key / "config.json").exists()]
     cells = tuple(read_cell(folder / "cells" / key) for key in found)
     return Run(folder=folder, cells=cells, absent=tuple(key for key in keys if key not in found), **names)

@@ -8,7 +8,7 @@ import pytest
 from helpers import fakes
 
 from ash.files import InputError
-from benchmarks.analysis.names import is_ours
+from benchmarks.analysis.names import is_ours, look_of, titles_of, user_rows
 from benchmarks.cell.methods import WRONG_BY_MM, is_oracle
 from benchmarks.suites.captures import described
 from benchmarks.suites.files import find_suite, given_captures, line_of, read_suite, suite_files
@@ -192,11 +192,24 @@ def test_no_row_of_our_suites_is_taken_for_a_users_own() -> None:
     assert not is_ours("mine")
 
 
+def test_a_users_row_does_not_take_our_title(tmp_path: Path) -> None:
+    capture = fakes.write_capture(tmp_path / "mine")
+    rows = '"ash", { of = "ash", name = "refined", model.width = 12 }, { of = "ash", name = "wo_mot", model.width = 4 }'
+    text = f'scenes = ["tight"]\npreset = "ci"\nmethods = [{rows}]\n'
+    suite = read_suite(written(tmp_path, text))
+    configs = [cell_for(cell, capture, tmp_path).config for cell in suite.cells]
+    with titles_of(configs):
+        assert [look_of(config.method).title for config in configs] == ["ASH", "refined", "wo_mot"]
+        assert [is_ours(config.method) for config in configs] == [True, False, False]
+    assert look_of("refined").title != "refined", "outside of the report the title is ours again"
+
+
 def test_every_row_of_our_suites_has_an_identity(tmp_path: Path) -> None:
     capture = fakes.write_capture(tmp_path / "mine")
     for suite in map(find_suite, suite_files()):
         rows = [cell_for(cell, capture, tmp_path).config for cell in islice(suite.cells, len(suite.methods))]
         assert len({row.key for row in rows}) == len(suite.methods)
+        assert not user_rows(rows)
 
 
 def test_every_subject_has_its_captures_and_subject_0_keeps_its_names(tmp_path: Path) -> None:
