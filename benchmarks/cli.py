@@ -7,6 +7,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -62,30 +63,7 @@ VERBS = {
     "test": "checkout:TestVerb",
 }
 
-HELP = """\
-usage: {name} VERB ...
-
-Judge animatable human avatars (ASH and its competitors) against exactly known ground truth:
-render a synthetic human, train every method on it, and report how accurate and how fast each one is.
-
-{verbs}
-
-`{name} VERB --help` tells what a verb takes.
-
-examples:
-  {name} run                  the main comparison; ends with runs/quick/report.html
-  {name} run ci               the same machinery, small, in about a minute
-  {name} run quick --seeds 3  with error bars
-  {name} run my.toml          your scenes, methods and ablations; `{name} suites` prints ours as a start
-  {name} train ash data/mannequin-ci-0 --preset ci
-  {name} doctor               what this machine has, and what follows from it
-
-of every verb: --method-path DIR  find your methods in DIR as well; may be repeated
-
-completion in bash (zsh, fish and tcsh likewise):
-  {name} --tyro-print-completion bash > ~/.local/share/bash-completion/completions/ash-bench
-
-exit codes: 0 done, 1 a cell or check failed, 2 wrong input, 130 interrupted (the same command goes on)"""
+HELP = Path(__file__).with_name("help.txt")  # Also printed by the launcher, which then needs no set-up.
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -158,7 +136,10 @@ def _parse(tokens: Sequence[str]) -> Verb | None:
         raise InputError(f"expected a verb, see {own_name()} --help")
     first = tokens[0]
     if first in ("-h", "--help"):
-        print(_help())
+        print(HELP.read_text().replace("{name}", own_name()), end="")
+        return None
+    if first == "--version":
+        print(f"ash-bench {version('ash-bench')}")
         return None
     if first.startswith("--tyro-"):
         completion({name: _verb(name) for name in VERBS}, tokens)
@@ -171,12 +152,6 @@ def _verb(name: str) -> type[Any]:
     module, _, verb = VERBS[name].partition(":")
     found: type[Any] = getattr(import_module(f"benchmarks.verbs.{module}"), verb)
     return found
-
-
-def _help() -> str:
-    width = max(map(len, VERBS))
-    lines = [f"  {name:<{width}}  {(_verb(name).__doc__ or '').splitlines()[0].rstrip('.')}" for name in VERBS]
-    return HELP.format(name=own_name(), verbs="\n".join(lines))
 
 
 def _refuse(line: str) -> int:
