@@ -1,6 +1,6 @@
 """How methods are called and coloured in tables and charts; a method of someone else keeps its own name."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -111,7 +111,7 @@ FORMER_ROWS = (
 EXACT = {"ash": "ash_truth", "ddc": "ddc_truth"}  # A method and the same method given the exact surface.
 
 
-_USER_ROWS: ContextVar[frozenset[str]] = ContextVar("_USER_ROWS", default=frozenset())
+_USER_ROWS: ContextVar[dict[str, str]] = ContextVar("_USER_ROWS")  # titles by name
 
 
 def user_rows(configs: Iterable[CellConfig]) -> frozenset[str]:
@@ -127,10 +127,23 @@ def user_rows(configs: Iterable[CellConfig]) -> frozenset[str]:
 
 
 @contextmanager
-def titles_of(configs: Iterable[CellConfig]) -> Iterator[None]:
-    """In its block, `look_of` and `is_ours` give our titles to our own rows only, not to the user's."""
-    token = _USER_ROWS.set(user_rows(configs))
+def titles_of(configs: Iterable[CellConfig], titles: Mapping[str, str] | None = None) -> Iterator[None]:
+    """In its block, `look_of` and `is_ours` give our titles to our own rows only, not to the user's.
+
+    `titles`: those that the suite gives. A title that another row has as well is followed by the row's name.
+    """
+    configs, titles = tuple(configs), titles or {}
+    names = dict.fromkeys(config.method for config in configs)
+    users = user_rows(configs)
+    given = {
+        name: titles.get(name) or (name if name in LOOKS else look_of(name).title)
+        for name in names
+        if name in titles or name in users
+    }
+    token = _USER_ROWS.set(given)
     try:
+        shown = [look_of(name).title for name in names]
+        _USER_ROWS.set({n: title if shown.count(title) == 1 else f"{title} ({n})" for n, title in given.items()})
         yield
     finally:
         _USER_ROWS.reset(token)
@@ -138,11 +151,12 @@ def titles_of(configs: Iterable[CellConfig]) -> Iterator[None]:
 
 def look_of(method: str) -> Look:
     """The look of a method; unknown ones get a colour by the sum of their letters, the same in every report."""
-    if method in LOOKS and method not in _USER_ROWS.get():
+    own = _USER_ROWS.get({})
+    if method in LOOKS and method not in own:
         return LOOKS[method]
     name = method.rpartition(":")[2]
     title = name.replace("_", " ") if name != method else method  # A factory's name, where it came by its path.
-    return Look(title=title, colour=SPARE_COLOURS[sum(method.encode()) % len(SPARE_COLOURS)])
+    return Look(title=own.get(method, title), colour=SPARE_COLOURS[sum(method.encode()) % len(SPARE_COLOURS)])
 
 
 def is_ours(method: str) -> bool:
@@ -150,7 +164,7 @@ def is_ours(method: str) -> bool:
 
     A user's own stand first in reports.
     """
-    if method in _USER_ROWS.get():
+    if method in _USER_ROWS.get({}):
         return False
     if ":" in method:
         return method.partition(".")[0] in DECIDING_PACKAGES

@@ -37,7 +37,7 @@ def write_report(run: Run, chosen_on: Run | None = None) -> list[str]:
     Raises:
         InputError: no cell is finished, or a result is damaged; nothing is written then.
     """
-    with titles_of(cell.config for cell in run.cells):
+    with titles_of((cell.config for cell in run.cells), run.titles):
         return _write_report(run, chosen_on)
 
 

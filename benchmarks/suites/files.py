@@ -11,6 +11,7 @@
     limit_minutes = 60           # of one cell, and limit_mb
     cell_minutes = 2.5           # what one cell takes, for estimates
 
+A method's table may have a `title` for reports: `{ of = "ash", name = "narrow", title = "Half the width", ... }`.
 `[[methods]]` and `[[scenes]]` as tables of their own mean the same; all further keys of such a table are replacements
 in the scene or in the method's configuration. Of a scene that names some of the methods, only those run on it.
 """
@@ -33,6 +34,7 @@ from benchmarks.suites.suites import MethodSpec, SceneSpec, Suite, varied_name
 
 FOLDER = Path(__file__).parent
 LARGEST = 1 << 20  # bytes of a suite's file
+LONGEST_TITLE = 60  # characters of a method's title
 MARK = "ba5e11ne"  # Found again where it was put; no file has it.
 Place = tuple[str | int, ...]  # A key of the file, from the top.
 PLAIN: dict[str, type] = {
@@ -92,7 +94,7 @@ def read_suite(path: Path) -> Suite:
 
 SUITE_KEYS = tuple(field.name for field in fields(Suite) if field.name not in ("name", "validation"))
 REQUIRED = ("scenes", "methods", "preset")
-SCENE_KEYS, METHOD_KEYS = ("name", "of", "size", "capture"), ("name", "of", "preset")
+SCENE_KEYS, METHOD_KEYS = ("name", "of", "size", "capture"), ("name", "of", "preset", "title")
 
 
 class _Reader:
@@ -158,8 +160,12 @@ class _Reader:
         own = known.get("preset", "")
         self.each(place, changes, lambda some: configured(of, own or preset, some))
         varied = changes + ((("preset", own),) if own else ())
-        name = known.get("name") or varied_name(of, varied)
-        return self.told(place, lambda: MethodSpec(name=name, of=of, preset=own, changes=changes))  # type: ignore[no-any-return]
+        name, title = known.get("name") or varied_name(of, varied), known.get("title", "")
+        if not title.isprintable() or len(title) > LONGEST_TITLE:
+            raise self.error((*place, "title"), f"title: expected at most {LONGEST_TITLE} printable characters")
+        if title and name == of and find_method(of).is_ours:
+            raise self.error((*place, "title"), f"title: {of} has one; expected it beside a name of the row's own")
+        return self.told(place, lambda: MethodSpec(name=name, of=of, preset=own, changes=changes, title=title))  # type: ignore[no-any-return]
 
     def stresses(self, table: Any) -> Iterator[Stress]:
         """Every step of every axis."""

@@ -3,7 +3,7 @@
 import contextlib
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ class Run:
     command: str
     cells: tuple[Cell, ...]
     absent: tuple[str, ...] = ()  # keys of cells that have no folder: other shards have them
+    titles: dict[str, str] = field(default_factory=dict)  # of methods, where the suite gives them
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -45,6 +46,7 @@ class RunFile:
     about: str
     command: str
     cells: tuple[str, ...]
+    titles: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -96,7 +98,14 @@ def _run_suite(suite: Suite, options: RunOptions) -> Run:
     for folder in folders.values():
         require_intact(folder)
     cells = [cell_for(spec, folders[spec.capture], options.out) for spec in suite.cells]
-    run = Run(folder=options.out, suite=suite.name, about=suite.about, command=options.command, cells=tuple(cells))
+    run = Run(
+        folder=options.out,
+        suite=suite.name,
+        about=suite.about,
+        command=options.command,
+        cells=tuple(cells),
+        titles={method.name: method.title for method in suite.methods if method.title},
+    )
     write_run(run)
     run_missing(shard_of(cells, options.shard) if options.shard else cells, suite, options)
     return run
@@ -154,6 +163,7 @@ def description_of(run: Run) -> dict[str, Any]:
         "about": run.about,
         "command": run.command,
         "cells": [cell.config.key for cell in run.cells],
+        **({"titles": run.titles} if run.titles else {}),
     }
 
 
@@ -177,9 +187,11 @@ def read_run(folder: Path) -> Run:
     if told.protocol != PROTOCOL:
         raise InputError(f"{path}: expected protocol {PROTOCOL}, got {told.protocol}; results do not mix")
     names = {"suite": told.suite, "about": printable(told.about), "command": printable(told.command)}
+    titles = {name: printable(title) for name, title in told.titles.items()}
     found = [key for key in keys if (folder / "cells" / key / "config.json").exists()]
     cells = tuple(read_cell(folder / "cells" / key) for key in found)
-    return Run(folder=folder, cells=cells, absent=tuple(key for key in keys if key not in found), **names)
+    absent = tuple(key for key in keys if key not in found)
+    return Run(folder=folder, cells=cells, absent=absent, titles=titles, **names)
 
 
 def require_complete(run: Run) -> Run:
@@ -215,7 +227,8 @@ def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
         )
     named = [_told_apart(cell) if cell.config.place in mixed else cell for cell in cells]
     about = f"cells of {', '.join(map(str, folders))}"
-    return Run(folder=out, suite=out.name, about=about, command=command, cells=tuple(named))
+    titles = {name: title for run in reversed(runs) for name, title in run.titles.items()}  # The first run's first.
+    return Run(folder=out, suite=out.name, about=about, command=command, cells=tuple(named), titles=titles)
 
 
 def require_for_choosing(run: Run) -> Run:

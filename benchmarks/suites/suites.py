@@ -34,6 +34,7 @@ class MethodSpec:
     of: str = ""  # the entry point or factory, where it has another name
     preset: str = ""  # none: the suite's
     changes: Changes = ()  # in the configuration that the preset means
+    title: str = ""  # in reports; none: the name
 
     def __post_init__(self) -> None:
         """Refuse an oracle under a competitor's name, and a competitor under an oracle's."""

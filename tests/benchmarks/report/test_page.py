@@ -122,6 +122,13 @@ def test_every_result_is_read_once(run: Run, monkeypatch: pytest.MonkeyPatch) ->
     assert read == [cell.folder for cell in run.cells]
 
 
+def test_a_title_of_the_suite_is_shown_in_every_form_of_the_report(run: Run, tmp_path: Path) -> None:
+    shown = write_report(replace(run, folder=tmp_path, titles={"fake_good": "Good row"}))
+    texts = [(tmp_path / name).read_text() for name in ("report.html", "report.md", "tables.tex")]
+    assert all("Good row" in text for text in ("\n".join(shown), *texts))
+    assert "Good row" not in (tmp_path / "results.csv").read_text(), "a table for programs keeps names"
+
+
 def test_rows_that_are_equal_are_not_told_as_a_win() -> None:
     rows = [scored("wide", view=23.04, pose=20.0), scored("narrow", view=23.01, pose=20.0)]
     assert sentences.headline(scores_of(rows), rows[0].config.scene) == (
