@@ -97,7 +97,7 @@ def test_a_capture_that_is_there_is_a_scene(tmp_path: Path) -> None:
     ("before", "after", "line", "message"),
     [
         ("seeds", "sedes", 10, "unknown key 'sedes', did you mean seeds"),
-        ("seeds = 2", "seeds = 0", 10, "seeds: expected at least 1"),
+        ("seeds = 2", "seeds = 0", 10, "seeds: expected 1 to 1000"),
         ("seeds = 2", "subjects = 0", 10, "subjects: expected 1 to 100, got 0"),
         ("seeds = 2", "subjects = 101", 10, "those from 100 on are for validation"),
         ("seeds = 2", 'seeds = "two"', 10, "seeds: expected a whole number, got 'two'"),
