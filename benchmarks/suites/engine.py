@@ -244,6 +244,7 @@ def make_executor(spec: str, *, workers: int, gpu: bool = False) -> Iterator[Exe
     Locally, threads suffice, for each only waits for the process of its cell. `gpu`: on Dask each job takes one of the
     resource GPU, which workers offer that were started with `--resources GPU=1`.
     """
+    require_executor(spec)
     if spec == "local":
         executor = ThreadPoolExecutor(workers)
         try:
@@ -251,8 +252,6 @@ def make_executor(spec: str, *, workers: int, gpu: bool = False) -> Iterator[Exe
         finally:
             executor.shutdown(wait=True, cancel_futures=True)
         return
-    if not spec.startswith("dask://"):
-        raise InputError(f"unknown executor {spec!r}, expected local or dask://HOST:PORT")
     try:
         from distributed import Client
     except ImportError:
@@ -266,6 +265,16 @@ def make_executor(spec: str, *, workers: int, gpu: bool = False) -> Iterator[Exe
         raise InputError(f"no Dask scheduler answers at {spec} ({error})") from error
     with client:
         yield client.get_executor(retries=2, pure=False, **_gpu_on(client, spec) if gpu else {})
+
+
+def require_executor(spec: str) -> None:
+    """Refuse the name of an executor that there is not.
+
+    Raises:
+        InputError: it is neither `local` nor a Dask scheduler's address.
+    """
+    if spec != "local" and not spec.startswith("dask://"):
+        raise InputError(f"unknown executor {spec!r}, expected local or dask://HOST:PORT")
 
 
 def _gpu_on(client: Any, spec: str) -> dict[str, Any]:

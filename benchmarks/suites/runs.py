@@ -25,7 +25,7 @@ from benchmarks.suites.captures import (
     subject_of,
     truth_of,
 )
-from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells, shard_of
+from benchmarks.suites.engine import Limits, make_executor, plan_cells, require_executor, run_cells, shard_of
 from benchmarks.suites.progress import Progress
 from benchmarks.suites.suites import CellSpec, Suite
 from synth.person.cast import VALIDATION
@@ -111,8 +111,7 @@ def require_runnable(suite: Suite, options: RunOptions) -> list[str]:
     """
     if options.shard:
         shard_of((), options.shard)
-    with make_executor(options.executor, workers=1):
-        pass
+    require_executor(options.executor)
     missing = missing_captures(suite, options.data)
     notes = []
     for row in suite.methods:
