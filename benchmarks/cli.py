@@ -7,6 +7,8 @@ import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any, NoReturn
 
 # How often an idle thread of OpenMP looks for work before it sleeps: for the time between two operations. By itself the
@@ -25,7 +27,10 @@ _set_threads()  # Read as NumPy, torch and FLIP are loaded, the first of them by
 
 from ash.fields import nearest
 from ash.files import InputError, disk_problem
+from benchmarks.cell.children import METHOD_PATH, add_method_paths
 from benchmarks.verbs.arguments import DONE, INTERRUPTED, WRONG_INPUT, Verb, completion, own_name, read_verb
+
+METHOD_PATH_FLAG = "--method-path"
 
 VERBS = {
     "run": "runs:RunVerb",
@@ -58,28 +63,7 @@ VERBS = {
     "test": "checkout:TestVerb",
 }
 
-HELP = """\
-usage: {name} VERB ...
-
-Judge animatable human avatars (ASH and its competitors) against exactly known ground truth:
-render a synthetic human, train every method on it, and report how accurate and how fast each one is.
-
-{verbs}
-
-`{name} VERB --help` tells what a verb takes.
-
-examples:
-  {name} run                  the main comparison; ends with runs/quick/report.html
-  {name} run ci               the same machinery, small, in about a minute
-  {name} run quick --seeds 3  with error bars
-  {name} run my.toml          your scenes, methods and ablations; `{name} suites` prints ours as a start
-  {name} train ash data/mannequin-ci-0 --preset ci
-  {name} doctor               what this machine has, and what follows from it
-
-completion in bash (zsh, fish and tcsh likewise):
-  {name} --tyro-print-completion bash > ~/.local/share/bash-completion/completions/ash-bench
-
-exit codes: 0 done, 1 a cell or check failed, 2 wrong input, 130 interrupted (the same command goes on)"""
+HELP = Path(__file__).with_name("help.txt")  # Also printed by the launcher, which then needs no set-up.
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -87,7 +71,7 @@ def main(argv: list[str] | None = None) -> int:
     _open_closed_streams()
     try:
         with _terminate_as_interrupt():
-            verb = _parse(sys.argv[1:] if argv is None else argv)
+            verb = _parse(_take_method_paths(sys.argv[1:] if argv is None else argv))
             return DONE if verb is None else verb()
     except InputError as error:
         return _refuse(str(error))
@@ -102,6 +86,26 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("\nash-bench: interrupted; the same command goes on where it was", file=sys.stderr)
         return INTERRUPTED
+
+
+def _take_method_paths(tokens: Sequence[str]) -> list[str]:
+    """The command line without `--method-path DIR`, whose folders are searched for methods, here and in children."""
+    left, folders = [], []
+    waiting = iter(tokens)
+    for token in waiting:
+        flag, given, value = token.partition("=")
+        if flag != METHOD_PATH_FLAG:
+            left.append(token)
+            continue
+        folder = value if given else next(waiting, "")
+        if not folder or not Path(folder).is_dir():
+            raise InputError(f"{METHOD_PATH_FLAG}: expected a folder, got {folder!r}")
+        folders.append(str(Path(folder).resolve()))
+    if folders:
+        before = os.environ.get(METHOD_PATH)
+        os.environ[METHOD_PATH] = os.pathsep.join([*([before] if before else []), *folders])
+    add_method_paths()
+    return left
 
 
 def _open_closed_streams() -> None:
@@ -132,7 +136,10 @@ def _parse(tokens: Sequence[str]) -> Verb | None:
         raise InputError(f"expected a verb, see {own_name()} --help")
     first = tokens[0]
     if first in ("-h", "--help"):
-        print(_help())
+        print(HELP.read_text().replace("{name}", own_name()), end="")
+        return None
+    if first == "--version":
+        print(f"ash-bench {version('ash-bench')}")
         return None
     if first.startswith("--tyro-"):
         completion({name: _verb(name) for name in VERBS}, tokens)
@@ -145,12 +152,6 @@ def _verb(name: str) -> type[Any]:
     module, _, verb = VERBS[name].partition(":")
     found: type[Any] = getattr(import_module(f"benchmarks.verbs.{module}"), verb)
     return found
-
-
-def _help() -> str:
-    width = max(map(len, VERBS))
-    lines = [f"  {name:<{width}}  {(_verb(name).__doc__ or '').splitlines()[0].rstrip('.')}" for name in VERBS]
-    return HELP.format(name=own_name(), verbs="\n".join(lines))
 
 
 def _refuse(line: str) -> int:

@@ -1,5 +1,6 @@
 """What must be known about a run so that someone else can repeat it: commit, machine, versions."""
 
+import math
 import os
 import platform
 import shutil
@@ -28,8 +29,10 @@ def commit() -> str:
     root = Path(__file__).parent.parent
     if not (root / ".git").exists() or shutil.which("git") is None:
         return "unknown"
-    revision = _output("git", "-C", str(root), "rev-parse", "--short=12", "HEAD")
-    changed = _output("git", "-C", str(root), "status", "--porcelain", "--untracked-files=no")
+    revision = _output("git", "-c", f"safe.directory={root}", "-C", str(root), "rev-parse", "--short=12", "HEAD")
+    changed = _output(
+        "git", "-c", f"safe.directory={root}", "-C", str(root), "status", "--porcelain", "--untracked-files=no"
+    )
     return revision + ("+" if changed else "") if revision else "unknown"
 
 
@@ -39,10 +42,22 @@ def changed_since(revision: str) -> tuple[str, ...] | None:
     known = revision.rstrip("+")
     if not (root / ".git").exists() or shutil.which("git") is None or not known.isalnum():
         return None
-    if not _output("git", "-C", str(root), "rev-parse", "--verify", "--quiet", f"{known}^{{commit}}"):
+    if not _output(
+        "git",
+        "-c",
+        f"safe.directory={root}",
+        "-C",
+        str(root),
+        "rev-parse",
+        "--verify",
+        "--quiet",
+        f"{known}^{{commit}}",
+    ):
         return None
-    changed = _output("git", "-C", str(root), "diff", "--name-only", known, "--")
-    added = _output("git", "-C", str(root), "ls-files", "--others", "--exclude-standard")
+    changed = _output("git", "-c", f"safe.directory={root}", "-C", str(root), "diff", "--name-only", known, "--")
+    added = _output(
+        "git", "-c", f"safe.directory={root}", "-C", str(root), "ls-files", "--others", "--exclude-standard"
+    )
     return tuple(sorted({*changed.splitlines(), *added.splitlines()}))
 
 
@@ -71,8 +86,20 @@ def versions() -> dict[str, str]:
 
 
 def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Cores that this process may use: those that it may run on, and as much of them as its cgroup allows."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, math.floor(min(count, cpu_quota(Path("/sys/fs/cgroup")))))
+
+
+def cpu_quota(cgroup: Path) -> float:
+    """Cores that a container's limit allows, from the files of cgroup v2 or v1; infinite where there is no limit."""
+    for names in (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")):
+        try:
+            quota, period = " ".join((cgroup / name).read_text() for name in names).split()
+            return int(quota) / int(period) if int(quota) > 0 else math.inf
+        except (OSError, ValueError, ZeroDivisionError):  # No such file; "max".
+            continue
+    return math.inf
 
 
 def processor_name() -> str:

@@ -147,7 +147,7 @@ def _begin(scene: Scene, folder: Path, renderer: Renderer, *, alone: bool) -> No
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
         for path in folder.rglob(".*.*") if alone else ():
             path.unlink()
-        require_space(scene, folder)
+        require_space([(scene, folder)], folder)
         _require_same_renderer(folder, renderer)
         replace(_manifest(scene), complete=False, made_with={"variant": renderer.variant}).write(folder)
     except OSError as error:

@@ -1,6 +1,7 @@
 """What a capture will cost before it is made: images, hours, bytes."""
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,12 +46,21 @@ def estimate(scene: Scene) -> Estimate:
     return Estimate(images=images, core_seconds=fixed + images * per_image, bytes=size, memory=memory)
 
 
-def require_space(scene: Scene, folder: Path) -> None:
-    """Refuse a capture that the disk cannot hold. What an earlier run wrote counts as there already."""
-    there = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-    needed = estimate(scene).bytes - there
-    free = shutil.disk_usage(folder).free
+def require_space(captures: Sequence[tuple[Scene, Path]], disk: Path) -> None:
+    """Refuse captures that the disk cannot hold. What an earlier run wrote into their folders counts as there already.
+
+    `disk`: a folder on it, or one that is still to be made.
+    """
+    needed = 0
+    for scene, folder in captures:
+        there = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+        needed += max(0, estimate(scene).bytes - there)
+    free = shutil.disk_usage(next(place for place in (disk, *disk.absolute().parents) if place.exists())).free
     if needed > free:
-        raise InputError(
-            f"{folder}: the capture needs {needed / 1e9:.1f} GB more and the disk has {free / 1e9:.1f} GB free"
-        )
+        what = "the capture needs" if len(captures) == 1 else f"{len(captures)} captures need"
+        raise InputError(f"{disk}: {what} {size_text(needed)} more and the disk has {size_text(free)} free")
+
+
+def size_text(count: int) -> str:
+    """Bytes for a reader: 1.2 GB, 34.5 MB."""
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"

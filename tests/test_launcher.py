@@ -302,3 +302,35 @@ def test_no_system_leaves_apt_alone(project: Path, environment: dict[str, str]) 
     assert log.read_text() == ""
     done = launch(project, "--no-system", "x", "0", env=environment)
     assert done.returncode == 0 and done.stdout == f"{project} x\n" and "will install into" in done.stderr
+
+
+def test_help_and_version_need_no_set_up(tmp_path: Path, environment: dict[str, str]) -> None:
+    shutil.copy(ROOT / "ash-bench", tmp_path)
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    (tmp_path / "benchmarks").mkdir()
+    shutil.copy(ROOT / "benchmarks" / "help.txt", tmp_path / "benchmarks")
+    for flag, expected in (
+        ("--help", "usage: ./ash-bench VERB"),
+        ("-h", "exit codes: 0 done"),
+        ("--version", "ash-bench 0."),
+    ):
+        done = launch(tmp_path, flag, env=environment)
+        assert (done.returncode, done.stderr) == (0, "") and expected in done.stdout
+    assert not (tmp_path / ".venv").exists()
+
+
+def test_an_environment_whose_interpreter_is_gone_is_made_again(project: Path, environment: dict[str, str]) -> None:
+    python = project / ".venv" / "bin" / "python"
+    for path in python.parent.glob("python*"):
+        path.unlink()
+    python.symlink_to("/nowhere/python3")
+    done = launch(project, "again", "0", env=environment)
+    assert (done.returncode, done.stdout) == (0, f"{project} again\n"), done.stderr
+
+
+def test_a_user_s_python_settings_change_nothing(project: Path, environment: dict[str, str], tmp_path: Path) -> None:
+    (tmp_path / "random.py").write_text("raise RuntimeError('the wrong module')\n")
+    settings = {"PYTHONPATH": str(tmp_path), "PYTHONHOME": "/nowhere", "PIP_USER": "1", "PYTHONIOENCODING": "ascii"}
+    change(project)
+    done = launch(project, "ünïcode", "0", env=environment | settings)
+    assert (done.returncode, done.stdout) == (0, f"{project} ünïcode\n"), done.stderr

@@ -1,9 +1,15 @@
 """How methods are called and coloured in tables and charts; a method of someone else keeps its own name."""
 
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache
 
+from ash.files import hash_of
+from benchmarks.cell.cells import CellConfig
 from benchmarks.cell.methods import DECIDING_PACKAGES, methods
+from benchmarks.suites.files import our_rows
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -97,16 +103,60 @@ SPLIT_NAMES = {
     "memory": SplitName(title="Cost", words="cost"),
 }
 SPARE_COLOURS = ("#b8860b", "#c2415c", "#5b8c2a", "#7a869a", "#008fb3", "#a0522d")
+# Rows of published results that no suite has any more: name, factory, changes.
+FORMER_ROWS = (
+    ("ash_studio", "ash", {"training.background": "studio"}),
+    ("wo_bound", "ash", {"model.bound": "inf"}),
+)
 EXACT = {"ash": "ash_truth", "ddc": "ddc_truth"}  # A method and the same method given the exact surface.
+
+
+_USER_ROWS: ContextVar[dict[str, str]] = ContextVar("_USER_ROWS")  # titles by name
+
+
+def user_rows(configs: Iterable[CellConfig]) -> frozenset[str]:
+    """Rows that have a name of ours but another factory or other changes than ours."""
+    ours = our_rows() | {(name, factory, hash_of(changes)) for name, factory, changes in FORMER_ROWS}
+    found = set()
+    for config in configs:
+        changes = {key: value for key, value in config.changes.items() if key != "device"}
+        plain = not config.factory and not changes  # the installed method itself
+        if not plain and (config.method, config.source, hash_of(changes)) not in ours:
+            found.add(config.method)
+    return frozenset(found)
+
+
+@contextmanager
+def titles_of(configs: Iterable[CellConfig], titles: Mapping[str, str] | None = None) -> Iterator[None]:
+    """In its block, `look_of` and `is_ours` give our titles to our own rows only, not to the user's.
+
+    `titles`: those that the suite gives. A title that another row has as well is followed by the row's name.
+    """
+    configs, titles = tuple(configs), titles or {}
+    names = dict.fromkeys(config.method for config in configs)
+    users = user_rows(configs)
+    given = {
+        name: titles.get(name) or (name if name in LOOKS else look_of(name).title)
+        for name in names
+        if name in titles or name in users
+    }
+    token = _USER_ROWS.set(given)
+    try:
+        shown = [look_of(name).title for name in names]
+        _USER_ROWS.set({n: title if shown.count(title) == 1 else f"{title} ({n})" for n, title in given.items()})
+        yield
+    finally:
+        _USER_ROWS.reset(token)
 
 
 def look_of(method: str) -> Look:
     """The look of a method; unknown ones get a colour by the sum of their letters, the same in every report."""
-    if method in LOOKS:
+    own = _USER_ROWS.get({})
+    if method in LOOKS and method not in own:
         return LOOKS[method]
     name = method.rpartition(":")[2]
     title = name.replace("_", " ") if name != method else method  # A factory's name, where it came by its path.
-    return Look(title=title, colour=SPARE_COLOURS[sum(method.encode()) % len(SPARE_COLOURS)])
+    return Look(title=own.get(method, title), colour=SPARE_COLOURS[sum(method.encode()) % len(SPARE_COLOURS)])
 
 
 def is_ours(method: str) -> bool:
@@ -114,6 +164,8 @@ def is_ours(method: str) -> bool:
 
     A user's own stand first in reports.
     """
+    if method in _USER_ROWS.get({}):
+        return False
     if ":" in method:
         return method.partition(".")[0] in DECIDING_PACKAGES
     return _installed().get(method, method in LOOKS)

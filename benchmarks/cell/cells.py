@@ -21,6 +21,7 @@ import numpy as np
 
 from ash.capture.dataset import Capture
 from ash.capture.typed import from_json
+from ash.fields import nearest
 from ash.files import InputError, hash_of, read_image, read_json, require_plain, write_json
 from ash.protocol import TrainingOutcome
 from benchmarks.cell.metrics import IMAGE_SPLITS, METRICS, PROTOCOL, VIEW_SCORES
@@ -29,6 +30,7 @@ from benchmarks.cell.views import View
 DrawnBy = Literal["method", "display", "trainer"]  # a timed frame; "trainer": the display did not open there
 Status = Literal["done", "crashed", "diverged", "timeout", "out of memory"]
 VARIED = ("factory", "changes", "subject")
+PRINTED = ("reason", "training", "provenance", "drawn_on", "evaluated_code")  # texts of a result, for people to read
 STATUSES = ("done", "crashed", "diverged", "timeout", "out of memory")
 
 
@@ -272,6 +274,7 @@ def result_of(cell: Cell) -> CellResult | None:
 
 
 def _result_from(content: Any) -> CellResult:
+    content = content | {name: _printable(content[name]) for name in PRINTED if name in content}
     views = [dict(view) for view in content["views"]]
     scores = [
         from_json(dict[str, float], view.pop("scores"), place=f"views[{k}].scores") for k, view in enumerate(views)
@@ -281,8 +284,27 @@ def _result_from(content: Any) -> CellResult:
     for view in result.views:
         require_plain(view.split, what="split")
         require_plain(view.camera, what="camera")
+    for row in result.summary:
+        require_plain(row.split, what="split")
+        require_plain(row.region, what="region", may_be_empty=True)
+        if row.metric not in METRICS:
+            raise ValueError(f"unknown metric {row.metric!r}, {nearest(row.metric, tuple(METRICS))}")
     whole = [replace(view, scores=_by_region(s)) for view, s in zip(result.views, scores, strict=True)]
     return replace(result, views=tuple(whole))
+
+
+def printable(text: str) -> str:
+    """A text from a file without line breaks, terminal codes and other control characters: blanks instead."""
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
+def _printable(content: Any) -> Any:
+    """JSON whose texts are printable."""
+    if isinstance(content, str):
+        return printable(content)
+    if isinstance(content, dict):
+        return {printable(name): _printable(value) for name, value in content.items()}
+    return [_printable(value) for value in content] if isinstance(content, list) else content
 
 
 def _by_region(scores: dict[str, float]) -> dict[tuple[str, str], float]:

@@ -10,6 +10,7 @@ from typing import IO
 
 import psutil
 
+METHOD_PATH = "ASH_BENCH_METHOD_PATH"  # folders of users' methods, as in PATH
 LOUDEST, LAST_WORDS = 1 << 20, 1 << 14  # bytes of printing that are kept: the first of them, and the last
 
 
@@ -28,16 +29,30 @@ def pass_on(output: IO[bytes]) -> None:
     output.close()
 
 
-def end_family(process: subprocess.Popen[bytes]) -> None:
-    """End a method's process and everything that it started."""
-    family = []
+def kill_process_tree(process: subprocess.Popen[bytes]) -> None:
+    """Kill a process and all its descendants, also those that left its process group.
+
+    The tree is stopped first, until no new member is found: a process that was stopped starts no other.
+    """
+    stopped: dict[psutil.Process, None] = {}
     with contextlib.suppress(psutil.Error):
-        whole = psutil.Process(process.pid)
-        family = [*whole.children(recursive=True), whole]
-    for member in reversed(family):
+        root = psutil.Process(process.pid)
+        while new := [member for member in (root, *root.children(recursive=True)) if member not in stopped]:
+            for member in new:
+                stopped[member] = None
+                with contextlib.suppress(psutil.Error):
+                    member.suspend()
+    for member in reversed(stopped):  # The root last: it adopts the children of those that end before it.
         with contextlib.suppress(psutil.Error):
             member.kill()
+    with contextlib.suppress(ProcessLookupError):
+        process.kill()
     process.wait()
+
+
+def end_family(process: subprocess.Popen[bytes]) -> None:
+    """End a method's process and everything that it started."""
+    kill_process_tree(process)
     # What lost its parents has become ours (see `adopt_orphans`).
     deadline = time.monotonic() + 5
     while (orphans := _children()) and time.monotonic() < deadline:
@@ -46,6 +61,18 @@ def end_family(process: subprocess.Popen[bytes]) -> None:
                 for member in (*orphan.children(recursive=True), orphan):
                     member.kill()
         _reap()
+
+
+def clean_environment() -> dict[str, str]:
+    """Our environment for a child process, without what makes Python import the user's modules in place of ours."""
+    return {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONHOME")}
+
+
+def add_method_paths() -> None:
+    """Append the folders of `--method-path` to `sys.path`: behind the libraries, so that they can replace none."""
+    for path in os.environ.get(METHOD_PATH, "").split(os.pathsep):
+        if path and path not in sys.path:
+            sys.path.append(path)
 
 
 def adopt_orphans() -> None:

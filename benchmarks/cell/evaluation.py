@@ -59,24 +59,33 @@ class Submission:
     peak_mb: float
     snapshots: tuple[Snapshot, ...]
     isolated: bool
+    prepared: Spent  # since the avatar was made, before the first picture
 
 
 def draw_all(cell: Cell, capture: Capture, host: Host) -> Submission:
-    """Let the method draw every view that is scored, and measure it; nothing is compared with truth yet."""
+    """Let the method draw every view that is scored, and measure it; nothing is compared with truth yet.
+
+    Frames are timed first, when none of them was ever drawn: a method that keeps its pictures gains nothing.
+    """
     views = evaluated_views(capture)
     host.meet(cell.folder.resolve() / EXAM, capture)
+    described, prepared = host.describe(), host.spent()
+    timing, shown = _timing(capture, host, playback(views))
     for view in views:
         write_image(prediction_path(cell.folder, view), metrics.quantise(host.draw(view, capture.cameras[view.camera])))
-    described, peak_mb = host.describe(), host.peak_memory_mb()
-    timing = _timing(cell, capture, host, playback(views))
+    agreement_db = min(_agreement(image, stored_prediction(cell, capture, view)) for view, image in shown)
+    if agreement_db < LEAST_AGREEMENT_DB:
+        told = f"{agreement_db:.1f} dB, expected {LEAST_AGREEMENT_DB:.0f} or more"
+        raise MethodFailed("crashed", f"a timed picture differs from the one that was scored by {told}")
     return Submission(
         views=views,
-        timing=timing,
+        timing=replace(timing, agreement_db=agreement_db),
         geometry=_pose_geometry(host, described, views),
         described=described,
-        peak_mb=peak_mb,
+        peak_mb=host.peak_memory_mb(),
         snapshots=_snapshots(cell, capture, host, views),
         isolated=host.isolated,
+        prepared=prepared,
     )
 
 
@@ -133,33 +142,32 @@ def _psnr(capture: Capture, view: View, prediction: np.ndarray) -> float:
     return metrics.psnr(prediction[..., :3], truth[..., :3], mask if mask.any() else None)
 
 
-def _timing(cell: Cell, capture: Capture, host: Host, views: list[View]) -> Timing:
-    """The method's own milliseconds, which ours outside must bear out, of pictures that show what was scored."""
+def _timing(capture: Capture, host: Host, views: list[View]) -> tuple[Timing, list[tuple[View, np.ndarray]]]:
+    """The method's own milliseconds, which ours outside must bear out, and the pictures that were timed.
+
+    `views` differ, so that no picture is timed twice; where a capture has fewer than are wanted, fewer are timed.
+    """
     drawn_by = host.open_display()
     frames: list[Timed] = []
-    references, agreements = [], []
-    for index in range(WARM_UP_FRAMES + TIMED_FRAMES):
-        view = views[index % len(views)]
+    references, pictures = [], []
+    for view in views[: WARM_UP_FRAMES + TIMED_FRAMES]:
         host.time(replace(view, frame=max(0, view.frame - 1)))  # As in playback: the history of a frame is known.
         frames.append(host.time(view))
-        shown = metrics.quantise(host.draw(view, capture.cameras[view.camera], "shown"))
-        agreements.append(_agreement(shown, stored_prediction(cell, capture, view)))
+        pictures.append((view, metrics.quantise(host.draw(view, capture.cameras[view.camera], "shown"))))
         references.append(reference_workload_ms())
-    if min(agreements) < LEAST_AGREEMENT_DB:
-        told = f"{min(agreements):.1f} dB, expected {LEAST_AGREEMENT_DB:.0f} or more"
-        raise MethodFailed("crashed", f"a timed picture differs from the one that was scored by {told}")
-    timed = frames[WARM_UP_FRAMES:]
+    warm_up = min(WARM_UP_FRAMES, len(frames) - 1)
+    timed = frames[warm_up:]
     stages: dict[str, tuple[float, ...]] = {
         name: tuple(frame.stage_ms[name] for frame in timed if name in frame.stage_ms)
         for name in sorted({name for frame in timed for name in frame.stage_ms})
     }
-    return Timing(
+    timing = Timing(
         frame_ms=frame_times_ms(timed),
         stage_ms=stages,
-        reference_ms=tuple(references[WARM_UP_FRAMES:]),
+        reference_ms=tuple(references[warm_up:]),
         drawn_by=drawn_by,
-        agreement_db=min(agreements),
     )
+    return timing, pictures
 
 
 def _agreement(shown: np.ndarray, scored: np.ndarray) -> float:

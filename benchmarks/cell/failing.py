@@ -19,5 +19,9 @@ class Spoilt(MethodFailed):
         super().__init__("crashed", f"while it ran without isolation the capture was changed: {damage}")
 
 
+class HarnessFailed(Exception):
+    """Something of ours failed before the method began, or for want of disk: the method has no result from it."""
+
+
 class Killed(Exception):
     """The method's process was killed by somebody else, such as the kernel for want of memory."""

@@ -52,6 +52,8 @@ def _answer(answers: "Answers", request: dict[str, Any]) -> tuple[dict[str, Any]
         import traceback
 
         traceback.print_exc()
+        if not answers.begun:
+            return {"error": "harness", "message": f"{type(error).__name__}: {error}"[:2000]}, b""
         kind = "memory" if isinstance(error, MemoryError) else "crashed"
         kind = "diverged" if isinstance(error, FloatingPointError) else kind
         from benchmarks.cell.methods import located
@@ -73,6 +75,7 @@ class Answers:
 
     def __init__(self, order: dict[str, Any]) -> None:
         self.order = order
+        self.begun = False  # Whether any code of the method was run.
         self.avatar: Any = None
         self.drawer: Any = None  # the avatar's display
         self.picture: Any = None  # the one that was timed last
@@ -93,10 +96,13 @@ class Answers:
         from dataclasses import replace
 
         from ash.capture.formats import load_capture
+        from benchmarks.cell.children import add_method_paths
         from benchmarks.cell.methods import Method, configured
 
+        add_method_paths()
         store = Path(self.order["store"]) if self.order["store"] else None
         self.capture = replace(load_capture(Path(self.order["input"])), store=store)
+        self.begun = True
         factory = Method(name="", target=self.order["target"], distribution="").load()
         wanted = {"seed": self.order["seed"], "preset": self.order["preset"]}
         if self.order["changes"]:

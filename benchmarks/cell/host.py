@@ -33,7 +33,7 @@ from ash.protocol import TrainingOutcome
 from benchmarks.cell import isolation
 from benchmarks.cell.cells import CHECKPOINT, Cell, DrawnBy, Status
 from benchmarks.cell.children import end_family, pass_on, peak_memory_mb
-from benchmarks.cell.failing import Killed, MethodFailed
+from benchmarks.cell.failing import HarnessFailed, Killed, MethodFailed
 from benchmarks.cell.guest import LARGEST_HEADER
 from benchmarks.cell.kernels import KERNELS, give_kernels, looking_in
 from benchmarks.cell.methods import OUR_PACKAGES, Method
@@ -75,20 +75,30 @@ class Host:
     def __init__(self, process: subprocess.Popen[bytes], requests: int, replies: int, *, isolated: bool) -> None:
         self.isolated = isolated
         self._process, self._requests, self._replies = process, requests, replies
+        self._start = Spent(wall_s=0.0, cpu_s=0.0)
 
-    def make(self) -> None:
-        """Import the factory and build the avatar."""
+    def make(self) -> Spent:
+        """Import the factory and build the avatar. Returns what that took; the time of training begins here."""
+        self._start = Spent(wall_s=time.perf_counter(), cpu_s=self._cpu_seconds())
         self._ask("make")
+        return self.spent()
 
-    def fit(self) -> Spent:
+    def fit(self) -> None:
         """Learn."""
-        start, used = time.perf_counter(), self._cpu_seconds()
+        start = time.perf_counter()
         header, _ = self._ask("fit")
         seconds = time.perf_counter() - start
         inside = _number(header.get("seconds"), "seconds of training")
         if abs(seconds - inside) > TRAINING_SLACK_S + CLOCK_SLACK * seconds:
             raise MethodFailed("crashed", f"its clock says {inside:.1f} s of training, ours {seconds:.1f} s")
-        return Spent(wall_s=seconds, cpu_s=self._cpu_seconds() - used)
+
+    def spent(self) -> Spent:
+        """Time since `make` began, of every request and of what the process does between them.
+
+        Read before the first picture, this is the training: no work that prepares pictures is left out.
+        """
+        assert self._start.cpu_s is not None
+        return Spent(wall_s=time.perf_counter() - self._start.wall_s, cpu_s=self._cpu_seconds() - self._start.cpu_s)
 
     def save(self) -> None:
         """Write the weights."""
@@ -198,6 +208,8 @@ class Host:
                 raise ValueError(size)
         except (ValueError, TypeError, KeyError, RecursionError):
             raise MethodFailed("crashed", "its process answered nonsense") from None
+        if header.get("error") == "harness":
+            raise HarnessFailed(f"before the method began: {header.get('message')}")
         if "error" in header:
             statuses: dict[str, Status] = {"diverged": "diverged", "memory": "out of memory"}
             raise MethodFailed(statuses.get(str(header["error"]), "crashed"), str(header.get("message")))
@@ -267,6 +279,8 @@ def hosted(
             end_family(host._process)
             host, pump = _start(order | {"room": None}, kernels, isolated=False)
             host._receive(0)
+        except MethodFailed as error:
+            raise HarnessFailed(f"before the method began: {error}") from error
         yield host
     finally:
         end_family(host._process)
@@ -350,7 +364,7 @@ def _package_folders(target: str) -> set[str]:
 def _start(order: dict[str, Any], kernels: Path, *, isolated: bool) -> tuple[Host, threading.Thread]:
     theirs, requests = os.pipe()
     replies, answers = os.pipe()
-    command = [sys.executable, "-m", "benchmarks.cell.guest", str(theirs), str(answers), json.dumps(order)]
+    command = [sys.executable, "-P", "-m", "benchmarks.cell.guest", str(theirs), str(answers), json.dumps(order)]
     process = subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,

@@ -145,6 +145,10 @@ def _furnish(room: Room) -> None:
         _mount("proc", room.base + "/proc", "proc", 0)
     except Refused:  # In a container whose /proc is masked in part.
         _mount("/proc", room.base + "/proc", None, MS_BIND | MS_REC)
+    for settings in ("/proc/sys", "/proc/sysrq-trigger"):  # Of the machine; root outside may write them.
+        if os.path.exists(room.base + settings):
+            _mount(room.base + settings, room.base + settings, None, MS_BIND | MS_REC)
+            _make_read_only(room.base + settings)
     for place in EMPTY:
         if os.path.isdir(place) or place == "/tmp":
             _empty(room.base + place)

@@ -99,6 +99,11 @@ def _load(path: Path) -> dict[str, Tensor]:
     for name, tensor in content.items():
         if not isinstance(tensor, Tensor):
             raise InputError(f"{path}: expected tensors, got {type(tensor).__name__} as {name!r:.60}")
+        if not isinstance(name, str):
+            raise InputError(f"{path}: expected names of tensors, got {name!r:.60}")
+        stored = tensor.layout == torch.strided and tensor.untyped_storage().nbytes()
+        if not stored or stored < tensor.numel() * tensor.element_size():  # Its file is small, its copies are not.
+            raise InputError(f"{path}: {name!r:.60}: expected a dense tensor with all its numbers in the file")
         if not torch.isfinite(tensor).all():
             raise InputError(f"{path}: {name!r:.60} holds NaN or infinity, expected finite numbers")
     return content

@@ -19,6 +19,7 @@ from ash.protocol import Configurable
 from benchmarks.cell.sources import plugin_hash
 
 METHOD_GROUP = "ash_bench.methods"
+LONGEST_NAME = 200  # characters of `package.module:factory`
 
 
 TEMPLATE_ERRORS_MM = (0, 2, 4, 8, 16)
@@ -83,11 +84,14 @@ def methods() -> dict[str, Method]:
 
 def find_method(name: str) -> Method:
     """An installed method by name, or any importable factory as `package.module:function`."""
+    if len(name) > LONGEST_NAME:
+        raise InputError(f"unknown method {name[:40]}...: expected a name of at most {LONGEST_NAME} characters")
     if ":" in name and find_spec_of(name) is not None:
         return Method(name=name, target=name, distribution="")
     known = methods()
     if name not in known:
-        raise InputError(f"unknown method {name!r}, {nearest(name, tuple(known))}")
+        hint = "; --method-path DIR adds a folder where it is looked for" if ":" in name else ""
+        raise InputError(f"unknown method {name!r}, {nearest(name, tuple(known))}{hint}")
     return known[name]
 
 

@@ -37,9 +37,17 @@ from benchmarks.cell.cells import (
     result_of,
     write_result,
 )
-from benchmarks.cell.children import adopt_orphans
-from benchmarks.cell.evaluation import _flicker_summary, _gap_summary, _image_summary, draw_all, judge, scored_views
-from benchmarks.cell.failing import Killed, MethodFailed, Spoilt
+from benchmarks.cell.children import add_method_paths, adopt_orphans
+from benchmarks.cell.evaluation import (
+    Submission,
+    _flicker_summary,
+    _gap_summary,
+    _image_summary,
+    draw_all,
+    judge,
+    scored_views,
+)
+from benchmarks.cell.failing import HarnessFailed, Killed, MethodFailed, Spoilt
 from benchmarks.cell.host import WORK, Host, give_files, hosted, take_files
 from benchmarks.cell.methods import ORACLES, code_version, configured, find_method, offered
 from benchmarks.cell.sealing import seen_by_method, watched
@@ -59,6 +67,7 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     os.environ["ASH_BENCH_CELL_PROCESS"] = str(os.getpid())
     adopt_orphans()
+    add_method_paths()
     if arguments.follow_parent:
         threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
@@ -74,6 +83,9 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt as interruption:
         print(f"interrupted {interruption}", file=sys.stderr)
         return 130
+    except HarnessFailed as error:
+        print(error, file=sys.stderr)
+        return 2
     except Killed:
         print("the method's process was killed from outside", file=sys.stderr)
         return KILLED
@@ -190,12 +202,26 @@ def rescore_cell(cell: Cell) -> CellResult:
 def _train_and_evaluate(cell: Cell, capture: Capture) -> CellResult:
     """The method learns and draws in a process of its own, then ends; what it drew is scored in this one."""
     with _hosted(cell, capture) as host:
-        host.make()
-        spent = host.fit()
+        made = host.make()
+        host.fit()
         host.save()
         drawn = draw_all(cell, capture, host)
     take_files(cell)
-    return judge(cell, capture, drawn, spent)
+    return judge(cell, capture, drawn, _training_time(cell, made, drawn))
+
+
+def _training_time(cell: Cell, made: Spent, drawn: Submission) -> Spent:
+    """What training took: everything before the first picture, but for a template that ours learned for all methods.
+
+    A method of others that learns a template has that in its training; what it says about it is not believed.
+    """
+    template_s = drawn.described.template_s if find_method(cell.config.source).is_ours else None
+    whole = drawn.prepared
+    assert whole.cpu_s is not None and made.cpu_s is not None
+    return Spent(
+        wall_s=whole.wall_s - min(template_s or 0.0, made.wall_s),
+        cpu_s=whole.cpu_s - min(template_s or 0.0, made.cpu_s),
+    )
 
 
 @contextmanager

@@ -51,15 +51,14 @@ def evaluated_views(capture: Capture) -> tuple[View, ...]:
 
 
 def playback(views: tuple[View, ...]) -> list[View]:
-    """One camera's views of motion that training did not show, as near to it as the capture has.
+    """Camera by camera, the views of motion that training did not show, as near to it as the capture has.
 
     A method that does less in poses far from training's, because it trusts what it learned less there, is timed where
     it does all.
     """
     splits = {view.split for view in views}
     split = next((name for name in ("near_pose", "novel_pose") if name in splits), views[-1].split)
-    first = next(view.camera for view in views if view.split == split)
-    return [view for view in views if view.split == split and view.camera == first]
+    return [view for view in views if view.split == split]
 
 
 def spread(count: int, at_most: int) -> list[int]:

@@ -3,7 +3,7 @@
 Everything comes from the results of the run's cells; the page needs no network and no other file.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -11,7 +11,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from ash.files import InputError, write_atomic
+from benchmarks.analysis.names import titles_of
 from benchmarks.analysis.scores import Scores, csv_of, scores_of
+from benchmarks.cell.cells import CellResult, printable
 from benchmarks.report import content, escaping, glossary, needs, sections, sentences, tables, vega
 from benchmarks.report.content import Report, Section
 from benchmarks.report.pictures import Album
@@ -35,10 +37,15 @@ def write_report(run: Run, chosen_on: Run | None = None) -> list[str]:
     Raises:
         InputError: no cell is finished, or a result is damaged; nothing is written then.
     """
+    with titles_of((cell.config for cell in run.cells), run.titles):
+        return _write_report(run, chosen_on)
+
+
+def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
     results = results_of(run)
-    scores = scores_of(results, {cell.config.key: cell.capture_folder.name for cell in run.cells})
+    scores = scores_of(results, {cell.config.key: printable(cell.capture_folder.name) for cell in run.cells})
     album = Album()
-    scenes = {scene: scene_report(_scene(run, scores, album, scene)) for scene in scores.scenes}
+    scenes = {scene: scene_report(_scene(run, results, scores, album, scene)) for scene in scores.scenes}
     findings, novelties = [*sections.spent(results), *sections.margins(scores)], sections.novelties(scores)
     report = Report(
         title=f"Report of suite {run.suite}",
@@ -122,8 +129,8 @@ def environment(form: Literal["html", "md"]) -> Environment:
     return found
 
 
-def _scene(run: Run, scores: Scores, album: Album, scene: str) -> SceneData:
-    results = tuple(r for r in results_of(run) if r.config.scene == scene and not r.config.axis)
+def _scene(run: Run, found: Sequence[CellResult], scores: Scores, album: Album, scene: str) -> SceneData:
+    results = tuple(r for r in found if r.config.scene == scene and not r.config.axis)
     many = sum(len(scores.methods(each)) for each in scores.scenes) > MANY
     room = PICTURE_BYTES // len(scores.scenes)
     worst = FEW_WORST if many else WORST

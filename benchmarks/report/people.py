@@ -165,11 +165,15 @@ def _told(gains: pd.DataFrame, others: Sequence[str]) -> Iterator[str]:
     """On how many people ASH is ahead, in one sentence per split and method."""
     for split in gains["split"].unique():
         for method in others:
-            here = gains[(gains["split"] == split) & (gains["method"] == method)]["gain"]
-            yield (
-                f"On {SPLIT_NAMES[split].words} ASH is ahead of {look_of(method).title} on {(here > 0).sum()} of "
-                f"{len(here)} people, by {here.min():+.2f} to {here.max():+.2f} dB."
-            )
+            here = gains[(gains["split"] == split) & (gains["method"] == method)]["gain"].round(2)
+            words, title = SPLIT_NAMES[split].words, look_of(method).title
+            span = f"{here.min():+.2f} to {here.max():+.2f} dB"
+            if (here == 0).all():
+                yield f"On {words} ASH and {title} are equal on all {len(here)} people, within 0.01 dB."
+            elif (here > 0).any():
+                yield f"On {words} ASH is ahead of {title} on {(here > 0).sum()} of {len(here)} people, by {span}."
+            else:
+                yield f"On {words} ASH is ahead of {title} on none of {len(here)} people; the differences are {span}."
 
 
 def _table(scores: Scores, scene: str, gains: pd.DataFrame, others: Sequence[str], split: str) -> Table:

@@ -44,7 +44,9 @@ def _finding(scores: Scores, scene: str) -> str:
         return f"On {scene}, no method was ranked on held-out views."
     (best, most), *others = ranked
     text = f"On {scene}, {look_of(best).title} is best on held-out views with {most:.1f} dB"
-    if others:
+    if others and most - others[0][1] < TOO_CLOSE_DB:
+        text += f", level with {look_of(others[0][0]).title} (within {TOO_CLOSE_DB:g} dB)"
+    elif others:
         text += f", {most - others[0][1]:.1f} dB ahead of {look_of(others[0][0]).title}"
     return _sentence(text)
 

@@ -141,7 +141,7 @@ class _Bench:
         """How a trial ended, and whether that was for want of a room."""
         work, log = place / WORK, place / "output.log"
         write_json(work / "room.json", room)
-        ending = watched_process([sys.executable, "-m", "benchmarks.studies.locked", str(work)], log, self.limits)
+        ending = watched_process([sys.executable, "-P", "-m", "benchmarks.studies.locked", str(work)], log, self.limits)
         isolated = room is not None
         if isolated and ending.exit_code == REFUSED:
             return TrialRun(outcome=None), True

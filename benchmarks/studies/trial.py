@@ -23,6 +23,7 @@ from ash.capture.manifest import verify_capture
 from ash.capture.typed import from_json
 from ash.files import InputError, read_json, write_json
 from ash.protocol import Avatar, StageClock
+from benchmarks.cell.children import add_method_paths
 from benchmarks.cell.methods import find_method
 from benchmarks.cell.sealing import Tampering, Trespass, watched_folders
 from benchmarks.cell.timing import peak_memory_mb
@@ -65,6 +66,7 @@ class Outcome:
 
 def main(folder: Path) -> int:
     """Do the trial whose folder is given."""
+    add_method_paths()
     try:
         trial: Trial = from_json(Trial, read_json(folder / "trial.json"))
         outcome = perform(trial, folder)

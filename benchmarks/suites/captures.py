@@ -1,15 +1,17 @@
 """The captures that a suite needs, made or taken up where they lie."""
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from ash.capture.formats import load_capture
 from ash.capture.manifest import Manifest, is_capture, read_manifest, verify_capture
 from ash.files import InputError, hash_of
-from benchmarks.suites.scenes import draw_scene, identity_of, scene_of
+from benchmarks.suites.scenes import SPLATS, draw_scene, identity_of, scene_of
 from benchmarks.suites.stress import Stress
 from benchmarks.suites.suites import CaptureSpec, Suite
+from synth.cost import require_space
 from synth.person.cast import VALIDATION
 from synth.readers.perturb import perturb
 from synth.scene import Scene
@@ -30,6 +32,17 @@ def make_capture(spec: CaptureSpec, data: Path, *, workers: int) -> Path:
         folder = data / f"{spec.name}-{wanted[:8]}"
     make_capture_in(spec, folder, workers=workers)
     return folder
+
+
+def missing_captures(suite: Suite, data: Path) -> list[CaptureSpec]:
+    """The captures that a run has to render first, by their names."""
+    clean = (spec for spec in suite.captures if spec.folder is None and spec.stress is None)
+    return [spec for spec in clean if not is_capture(data / spec.name)]
+
+
+def require_space_for(missing: Sequence[CaptureSpec], data: Path) -> None:
+    """Refuse captures that the disk cannot hold together."""
+    require_space([(described(spec), data / spec.name) for spec in missing if (spec.of or spec.scene) != SPLATS], data)
 
 
 def described(spec: CaptureSpec) -> Scene:

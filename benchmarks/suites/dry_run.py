@@ -3,10 +3,9 @@
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 
-from benchmarks.cell.methods import find_method
 from benchmarks.suites.captures import described
 from benchmarks.suites.engine import shard_of
-from benchmarks.suites.runs import RunOptions
+from benchmarks.suites.runs import RunOptions, require_runnable
 from benchmarks.suites.scenes import SPLATS
 from benchmarks.suites.suites import CellSpec, Suite
 
@@ -15,12 +14,11 @@ def estimate(suite: Suite, options: RunOptions) -> str:
     """Cells, hours and gigabytes of a suite, as lines."""
     from synth.cost import estimate as estimate_capture
 
-    for method in suite.methods:
-        find_method(method.of or method.name)
+    notes = require_runnable(suite, options)
     cells: list[CellSpec] = list(suite.cells)
     if options.shard:
         cells = list(shard_of(cells, options.shard))
-    lines = [f"{suite.name}: {suite.about}", ""]
+    lines = [f"{suite.name}: {suite.about}", *notes, ""]
     for spec in suite.captures:
         if spec.stress is not None:
             lines.append(f"capture {spec.name}: made from the clean one, what does not change is linked")

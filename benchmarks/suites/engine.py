@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import psutil
 
 from ash.capture.manifest import read_manifest
-from ash.files import InputError, one_line, read_json
+from ash.files import InputError, one_line, read_json, sha256_of
 from benchmarks.cell.cells import (
     Cell,
     CellResult,
@@ -29,6 +29,7 @@ from benchmarks.cell.cells import (
     write_config,
     write_result,
 )
+from benchmarks.cell.children import clean_environment, kill_process_tree
 from benchmarks.cell.process import DISK_FULL, KILLED
 from benchmarks.suites.gpus import lent_gpu
 from benchmarks.suites.progress import Progress
@@ -54,6 +55,7 @@ class Limits:
 
     seconds: float
     memory_mb: int
+    disk_mb: int = 4096  # of the cell's folder
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -85,14 +87,18 @@ class CellPlan:
 def plan_cells(cells: Sequence[Cell], *, retry_failed: bool = False) -> CellPlan:
     """Split cells into those with a result and those without.
 
-    Raises:
-        InputError: a result.json is damaged; nothing is overwritten.
+    A cell whose result is damaged is run again; what lay in its folder is kept beside it, as KEY.damaged.
     """
     todo: list[Cell] = []
     done: list[Cell] = []
     reasons = []
     for cell in cells:
-        result = result_of(cell)
+        try:
+            result = result_of(cell)
+        except InputError as error:
+            reasons.append(f"{cell.config.title}: run again, its result is damaged ({error})")
+            set_aside(cell)
+            result = None
         if result is not None and retry_failed and result.status != "done":
             shutil.rmtree(cell.folder)
             reasons.append(f"{cell.config.title}: {result.status} before, tried again")
@@ -101,6 +107,13 @@ def plan_cells(cells: Sequence[Cell], *, retry_failed: bool = False) -> CellPlan
             reasons.append(f"{cell.config.title}: {reason}")
         (todo if result is None else done).append(cell)
     return CellPlan(todo=tuple(todo), done=tuple(done), reasons=tuple(reasons))
+
+
+def set_aside(cell: Cell) -> None:
+    """Move a cell's folder out of the way, so that the cell is run from nothing."""
+    aside = cell.folder.with_name(f"{cell.folder.name}.damaged")
+    shutil.rmtree(aside, ignore_errors=True)
+    cell.folder.rename(aside)
 
 
 def shard_of(cells: Sequence[AnyCell], shard: str) -> tuple[AnyCell, ...]:
@@ -126,18 +139,32 @@ def run_cells(
         InputError: a cell found its input wrong; cells that wait are given up, results that are there stay.
         KeyboardInterrupt: the user's; all child processes have ended when it is seen.
     """
-    for cell in plan.todo:
-        write_config(cell)
     _stopping.clear()  # Not when a run is over: a thread that the interruption kept from its executor may still look.
     futures: dict[Future[str], Cell] = {}
+    known = {cell.folder: (cell, _digest(cell)) for cell in plan.done}
+
+    def submit(cell: Cell) -> Future[str]:
+        write_config(cell)
+        future = executor.submit(run_in_process, str(cell.folder), limits, gpus)
+        futures[future] = cell
+        return future
+
     try:
-        for cell in plan.todo:
-            futures[executor.submit(run_in_process, str(cell.folder), limits, gpus)] = cell
-        pending = set(futures)
+        pending = {submit(cell) for cell in plan.todo}
         while pending:
             finished, pending = wait(pending, timeout=POLL_S, return_when=FIRST_COMPLETED)
             for future in finished:
-                progress.finish(futures[future].config.title, status=future.result())
+                cell = futures[future]
+                progress.finish(cell.config.title, status=future.result())
+                known[cell.folder] = (cell, _digest(cell))
+            if finished:
+                # A method that nothing isolates can write to the folders of other cells.
+                for cell in [cell for cell, digest in known.values() if _digest(cell) != digest]:
+                    progress.say(f"{cell.config.title}: run again, its result was changed while another cell ran")
+                    progress.total += 1
+                    del known[cell.folder]
+                    set_aside(cell)
+                    pending.add(submit(cell))
             progress.tick(running=[futures[f].config.title for f in pending if f.running()])
     except BaseException:
         for future in futures:
@@ -155,10 +182,10 @@ def run_in_process(folder: str, limits: Limits, gpus: tuple[str, ...] = ()) -> s
     cell = read_cell(Path(folder))
     for path in cell.folder.rglob(".*.*"):  # What a killed process left half-written.
         path.unlink(missing_ok=True)
-    command = [sys.executable, "-m", "benchmarks.cell.process", str(cell.folder), "--follow-parent"]
+    command = [sys.executable, "-P", "-m", "benchmarks.cell.process", str(cell.folder), "--follow-parent"]
     for _ in range(ATTEMPTS):
         with lent_gpu(gpus, cell.config) as environment:
-            ending = watched_process(command, cell.folder / "output.log", limits, environment)
+            ending = watched_process(command, cell.folder / "output.log", limits, environment, disk=cell.folder)
         for left in ("input", "exam", "room"):  # By a method that was ended.
             shutil.rmtree(cell.folder / left, ignore_errors=True)
         if ending.interrupted:
@@ -169,11 +196,16 @@ def run_in_process(folder: str, limits: Limits, gpus: tuple[str, ...] = ()) -> s
 
 
 def watched_process(
-    command: Sequence[str], log: Path, limits: Limits, environment: Mapping[str, str] = NOTHING
+    command: Sequence[str],
+    log: Path,
+    limits: Limits,
+    environment: Mapping[str, str] = NOTHING,
+    *,
+    disk: Path | None = None,
 ) -> Ending:
-    """Run a command, its output appended to `log`, until it ends or exceeds its time or memory.
+    """Run a command, its output appended to `log`, until it ends or exceeds its time, memory or disk.
 
-    `environment`: variables besides ours.
+    `environment`: variables besides ours. `disk`: the folder that `limits.disk_mb` is about.
     """
     start = time.monotonic()
     with log.open("ab") as output, _starting:
@@ -189,7 +221,7 @@ def watched_process(
         )
         _children.add(child)
     try:
-        failure = _watch(child, limits, start)
+        failure = _watch(child, limits, start, disk)
     finally:
         _kill(child)
         _children.discard(child)
@@ -212,6 +244,7 @@ def make_executor(spec: str, *, workers: int, gpu: bool = False) -> Iterator[Exe
     Locally, threads suffice, for each only waits for the process of its cell. `gpu`: on Dask each job takes one of the
     resource GPU, which workers offer that were started with `--resources GPU=1`.
     """
+    require_executor(spec)
     if spec == "local":
         executor = ThreadPoolExecutor(workers)
         try:
@@ -219,8 +252,6 @@ def make_executor(spec: str, *, workers: int, gpu: bool = False) -> Iterator[Exe
         finally:
             executor.shutdown(wait=True, cancel_futures=True)
         return
-    if not spec.startswith("dask://"):
-        raise InputError(f"unknown executor {spec!r}, expected local or dask://HOST:PORT")
     try:
         from distributed import Client
     except ImportError:
@@ -236,6 +267,16 @@ def make_executor(spec: str, *, workers: int, gpu: bool = False) -> Iterator[Exe
         yield client.get_executor(retries=2, pure=False, **_gpu_on(client, spec) if gpu else {})
 
 
+def require_executor(spec: str) -> None:
+    """Refuse the name of an executor that there is not.
+
+    Raises:
+        InputError: it is neither `local` nor a Dask scheduler's address.
+    """
+    if spec != "local" and not spec.startswith("dask://"):
+        raise InputError(f"unknown executor {spec!r}, expected local or dask://HOST:PORT")
+
+
 def _gpu_on(client: Any, spec: str) -> dict[str, Any]:
     """What a job asks of a Dask cluster to have a GPU.
 
@@ -248,7 +289,7 @@ def _gpu_on(client: Any, spec: str) -> dict[str, Any]:
     return {"resources": {GPU: 1}}
 
 
-def _watch(child: subprocess.Popen[bytes], limits: Limits, start: float) -> Failure | None:
+def _watch(child: subprocess.Popen[bytes], limits: Limits, start: float, disk: Path | None) -> Failure | None:
     process = psutil.Process(child.pid)
     while True:
         try:
@@ -262,6 +303,17 @@ def _watch(child: subprocess.Popen[bytes], limits: Limits, start: float) -> Fail
             family = [process, *process.children(recursive=True)]
             if (used := sum(member.memory_info().rss for member in family) / 2**20) > limits.memory_mb:
                 return _too_large(used, limits)
+        if disk is not None and (used := folder_mb(disk)) > limits.disk_mb:
+            return Failure(status="crashed", reason=f"its folder takes {used:.0f} MB, the limit is {limits.disk_mb} MB")
+
+
+def folder_mb(folder: Path) -> float:
+    """MiB of disk that the files below a folder take; links are not followed."""
+    used = 0
+    for path in folder.rglob("*"):
+        with contextlib.suppress(OSError):  # Files come and go.
+            used += path.lstat().st_blocks * 512
+    return used / 2**20
 
 
 def _too_large(used_mb: float, limits: Limits) -> Failure:
@@ -285,10 +337,10 @@ def _outcome(cell: Cell, ending: Ending, limits: Limits) -> CellResult:
     if failure is None and _was_killed(ending):
         reason = f"killed from outside in each of {ATTEMPTS} attempts; the kernel does that when memory runs out"
         failure = Failure(status="crashed", reason=f"{reason}; --retry-failed tries again")
-    if failure is None:
-        log = last_line(cell.folder / "output.log")
-        reason = f"the process ended with {_exit_name(ending.exit_code)}: {log}"
-        failure = Failure(status="crashed", reason=reason)
+    if failure is None:  # No code of the method runs in that process: this is no failure of the method.
+        log = cell.folder / "output.log"
+        ended = f"the process of {cell.config.title} ended with {_exit_name(ending.exit_code)}"
+        raise InputError(f"{ended} before the method had a result: {last_line(log)} (more in {log})")
     splits = read_manifest(cell.capture_folder).splits
     result = failed_result(cell.config, failure.status, failure.reason, splits=splits)
     write_result(cell.folder, result)
@@ -302,15 +354,10 @@ def _was_killed(ending: Ending) -> bool:
 
 def _kill(child: subprocess.Popen[bytes]) -> None:
     """End a child with all processes that it started, also those that left its group, and those that outlived it."""
-    family: list[psutil.Process] = []
     if child.poll() is None:
-        with contextlib.suppress(psutil.Error):
-            family = psutil.Process(child.pid).children(recursive=True)
+        kill_process_tree(child)
     with contextlib.suppress(ProcessLookupError):
         os.killpg(child.pid, signal.SIGKILL)
-    for member in family:
-        with contextlib.suppress(psutil.Error):
-            member.kill()
     child.wait()
     if child.stdin is not None:
         child.stdin.close()
@@ -319,7 +366,15 @@ def _kill(child: subprocess.Popen[bytes]) -> None:
 def _environment() -> dict[str, str]:
     """One thread per cell: two buy 1.35x alone and cost 6x when cells run side by side."""
     threads = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
-    return {**os.environ, **threads, "PYTHONUNBUFFERED": "1"}
+    return {**clean_environment(), **threads, "PYTHONUNBUFFERED": "1"}
+
+
+def _digest(cell: Cell) -> str:
+    """SHA-256 of a cell's result as it lies on disk; empty where there is none."""
+    try:
+        return sha256_of(cell.folder / "result.json")
+    except OSError:
+        return ""
 
 
 def _why_stale(cell: Cell) -> str | None:

@@ -11,6 +11,7 @@
     limit_minutes = 60           # of one cell, and limit_mb
     cell_minutes = 2.5           # what one cell takes, for estimates
 
+A method's table may have a `title` for reports: `{ of = "ash", name = "narrow", title = "Half the width", ... }`.
 `[[methods]]` and `[[scenes]]` as tables of their own mean the same; all further keys of such a table are replacements
 in the scene or in the method's configuration. Of a scene that names some of the methods, only those run on it.
 """
@@ -25,14 +26,15 @@ from tomlkit.exceptions import NonExistentKey, TOMLKitError
 from tomlkit.items import AbstractTable, Table
 
 from ash.capture.manifest import read_manifest
-from ash.fields import WRITTEN, Changes, nearest
-from ash.files import InputError, open_regular
+from ash.fields import WRITTEN, Changes, for_json, nearest
+from ash.files import InputError, hash_of, open_regular
 from benchmarks.cell.methods import configured, find_method
 from benchmarks.suites.stress import Stress
 from benchmarks.suites.suites import MethodSpec, SceneSpec, Suite, varied_name
 
 FOLDER = Path(__file__).parent
 LARGEST = 1 << 20  # bytes of a suite's file
+LONGEST_TITLE = 60  # characters of a method's title
 MARK = "ba5e11ne"  # Found again where it was put; no file has it.
 Place = tuple[str | int, ...]  # A key of the file, from the top.
 PLAIN: dict[str, type] = {
@@ -50,6 +52,18 @@ PLAIN: dict[str, type] = {
 def suite_files() -> dict[str, Path]:
     """Our own suites by name."""
     return {path.stem: path for path in sorted(FOLDER.glob("*.toml"))}
+
+
+def our_rows() -> frozenset[tuple[str, str, str]]:
+    """Name, factory and hash of the changes of every varied method in our own suites."""
+    found = set()
+    for path in suite_files().values():
+        for row in tomlkit.parse(path.read_text()).unwrap()["methods"]:
+            if isinstance(row, dict):
+                changes = _dotted({key: value for key, value in row.items() if key not in METHOD_KEYS})
+                name = row.get("name") or varied_name(row["of"], changes)
+                found.add((name, row["of"], hash_of(for_json(changes))))
+    return frozenset(found)
 
 
 def find_suite(name: str | Path) -> Suite:
@@ -80,7 +94,7 @@ def read_suite(path: Path) -> Suite:
 
 SUITE_KEYS = tuple(field.name for field in fields(Suite) if field.name not in ("name", "validation"))
 REQUIRED = ("scenes", "methods", "preset")
-SCENE_KEYS, METHOD_KEYS = ("name", "of", "size", "capture"), ("name", "of", "preset")
+SCENE_KEYS, METHOD_KEYS = ("name", "of", "size", "capture"), ("name", "of", "preset", "title")
 
 
 class _Reader:
@@ -146,8 +160,12 @@ class _Reader:
         own = known.get("preset", "")
         self.each(place, changes, lambda some: configured(of, own or preset, some))
         varied = changes + ((("preset", own),) if own else ())
-        name = known.get("name") or varied_name(of, varied)
-        return self.told(place, lambda: MethodSpec(name=name, of=of, preset=own, changes=changes))  # type: ignore[no-any-return]
+        name, title = known.get("name") or varied_name(of, varied), known.get("title", "")
+        if not title.isprintable() or len(title) > LONGEST_TITLE:
+            raise self.error((*place, "title"), f"title: expected at most {LONGEST_TITLE} printable characters")
+        if title and name == of and find_method(of).is_ours:
+            raise self.error((*place, "title"), f"title: {of} has one; expected it beside a name of the row's own")
+        return self.told(place, lambda: MethodSpec(name=name, of=of, preset=own, changes=changes, title=title))  # type: ignore[no-any-return]
 
     def stresses(self, table: Any) -> Iterator[Stress]:
         """Every step of every axis."""

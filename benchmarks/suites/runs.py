@@ -2,8 +2,10 @@
 
 import contextlib
 import os
+import subprocess
+import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +14,24 @@ from ash.capture.typed import from_json
 from ash.fields import for_json
 from ash.files import InputError, only_run_in, read_json, require_plain, write_json
 from benchmarks.cell import isolation
-from benchmarks.cell.cells import Cell, CellConfig, CellResult, read_cell, result_of
-from benchmarks.cell.methods import code_version, find_method
+from benchmarks.cell.cells import Cell, CellConfig, CellResult, printable, read_cell, result_of
+from benchmarks.cell.methods import code_version, configured, find_method, offered
 from benchmarks.cell.metrics import PROTOCOL
-from benchmarks.suites.captures import make_capture, require_intact, subject_of, truth_of
-from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells, shard_of
+from benchmarks.suites.captures import (
+    make_capture,
+    missing_captures,
+    require_intact,
+    require_space_for,
+    subject_of,
+    truth_of,
+)
+from benchmarks.suites.engine import Limits, make_executor, plan_cells, require_executor, run_cells, shard_of
 from benchmarks.suites.progress import Progress
 from benchmarks.suites.suites import CellSpec, Suite
 from synth.person.cast import VALIDATION
 
 RUN_FILE = "run.json"
+IMPORT_S = 120.0  # of a method, before a run
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -34,6 +44,7 @@ class Run:
     command: str
     cells: tuple[Cell, ...]
     absent: tuple[str, ...] = ()  # keys of cells that have no folder: other shards have them
+    titles: dict[str, str] = field(default_factory=dict)  # of methods, where the suite gives them
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -45,6 +56,7 @@ class RunFile:
     about: str
     command: str
     cells: tuple[str, ...]
+    titles: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -69,10 +81,10 @@ class RunOptions:
 
 def run_suite(suite: Suite, options: RunOptions) -> Run:
     """Make the captures, run the missing cells, and return the run; finished work is never repeated."""
-    for method in suite.methods:
-        find_method(method.of or method.name)
     for folder in (options.out, options.data):
         require_utf8(folder)
+    for note in require_runnable(suite, options):
+        print(note, file=sys.stderr)
     options.out.mkdir(parents=True, exist_ok=True)
     with contextlib.nullcontext() if options.shard else only_run_in(options.out):
         return _run_suite(suite, options)
@@ -91,12 +103,60 @@ def require_utf8(folder: Path) -> None:
         raise InputError(f"expected a folder whose path is UTF-8, got {path!r}") from None
 
 
+def require_runnable(suite: Suite, options: RunOptions) -> list[str]:
+    """Refuse what is known to be wrong before anything is rendered; returns what is odd about rows, a line each.
+
+    Raises:
+        InputError: a shard, an executor, a method, a preset or a changed field is wrong, or the disk is too small.
+    """
+    if options.shard:
+        shard_of((), options.shard)
+    require_executor(options.executor)
+    missing = missing_captures(suite, options.data)
+    notes = []
+    for row in suite.methods:
+        of, preset = row.of or row.name, row.preset or suite.preset
+        method = find_method(of)
+        if row.changes:
+            if configured(of, preset, row.changes) == offered(of, preset):
+                fields = ", ".join(f"{key} = {value}" for key, value in row.changes)
+                notes.append(f"row {row.name!r} equals {of!r}: preset {preset} has {fields} already")
+        elif method.is_ours:
+            offered(of, preset)
+        elif missing:  # Code of others is not imported here; where cells start at once, the first one says as much.
+            _require_importable(of, preset)
+    require_space_for(missing, options.data)
+    return notes
+
+
+def _require_importable(method: str, preset: str) -> None:
+    """Import a method in a process of its own; only what that process refuses counts, not how it ends otherwise."""
+    code = (
+        "import sys; from ash.files import InputError; from benchmarks.cell.children import add_method_paths\n"
+        "from benchmarks.cell.methods import offered; add_method_paths()\n"
+        "try: offered(*sys.argv[1:])\nexcept InputError as error: sys.exit(f'refused: {error}')"
+    )
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        command = [sys.executable, "-P", "-c", code, method, preset]
+        ended = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=IMPORT_S, check=False)
+        last = ended.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+        if last.startswith("refused: "):
+            raise InputError(last.removeprefix("refused: "))
+
+
 def _run_suite(suite: Suite, options: RunOptions) -> Run:
     folders = {spec: make_capture(spec, options.data, workers=options.workers) for spec in suite.captures}
     for folder in folders.values():
         require_intact(folder)
     cells = [cell_for(spec, folders[spec.capture], options.out) for spec in suite.cells]
-    run = Run(folder=options.out, suite=suite.name, about=suite.about, command=options.command, cells=tuple(cells))
+    run = Run(
+        folder=options.out,
+        suite=suite.name,
+        about=suite.about,
+        command=options.command,
+        cells=tuple(cells),
+        titles={method.name: method.title for method in suite.methods if method.title},
+    )
     write_run(run)
     run_missing(shard_of(cells, options.shard) if options.shard else cells, suite, options)
     return run
@@ -154,6 +214,7 @@ def description_of(run: Run) -> dict[str, Any]:
         "about": run.about,
         "command": run.command,
         "cells": [cell.config.key for cell in run.cells],
+        **({"titles": run.titles} if run.titles else {}),
     }
 
 
@@ -176,10 +237,12 @@ def read_run(folder: Path) -> Run:
         raise InputError(f"{path}: expected the description of a run ({error})") from error
     if told.protocol != PROTOCOL:
         raise InputError(f"{path}: expected protocol {PROTOCOL}, got {told.protocol}; results do not mix")
-    names = {"suite": told.suite, "about": told.about, "command": told.command}
+    names = {"suite": told.suite, "about": printable(told.about), "command": printable(told.command)}
+    titles = {name: printable(title) for name, title in told.titles.items()}
     found = [key for key in keys if (folder / "cells" / key / "config.json").exists()]
     cells = tuple(read_cell(folder / "cells" / key) for key in found)
-    return Run(folder=folder, cells=cells, absent=tuple(key for key in keys if key not in found), **names)
+    absent = tuple(key for key in keys if key not in found)
+    return Run(folder=folder, cells=cells, absent=absent, titles=titles, **names)
 
 
 def require_complete(run: Run) -> Run:
@@ -215,7 +278,8 @@ def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
         )
     named = [_told_apart(cell) if cell.config.place in mixed else cell for cell in cells]
     about = f"cells of {', '.join(map(str, folders))}"
-    return Run(folder=out, suite=out.name, about=about, command=command, cells=tuple(named))
+    titles = {name: title for run in reversed(runs) for name, title in run.titles.items()}  # The first run's first.
+    return Run(folder=out, suite=out.name, about=about, command=command, cells=tuple(named), titles=titles)
 
 
 def require_for_choosing(run: Run) -> Run:

@@ -11,6 +11,7 @@ from benchmarks.cell.methods import ORACLES, find_method, is_oracle, named_metho
 from benchmarks.suites.stress import Stress
 from synth.person.cast import VALIDATION
 
+MOST_SEEDS = 1000
 LONGEST_VALUE = 24  # Characters of a changed value in a name; its hash stands for a longer one.
 
 
@@ -34,6 +35,7 @@ class MethodSpec:
     of: str = ""  # the entry point or factory, where it has another name
     preset: str = ""  # none: the suite's
     changes: Changes = ()  # in the configuration that the preset means
+    title: str = ""  # in reports; none: the name
 
     def __post_init__(self) -> None:
         """Refuse an oracle under a competitor's name, and a competitor under an oracle's."""
@@ -107,8 +109,8 @@ class Suite:
             for name in scene.methods:
                 if name not in known:
                     raise InputError(f"scenes: {scene.name} asks for the method {name!r}, {nearest(name, known)}")
-        if self.seeds < 1:
-            raise InputError(f"seeds: expected at least 1, got {self.seeds}")
+        if not 1 <= self.seeds <= MOST_SEEDS:
+            raise InputError(f"seeds: expected 1 to {MOST_SEEDS}, got {self.seeds}")
         if not 1 <= self.subjects <= VALIDATION:
             raise InputError(
                 f"subjects: expected 1 to {VALIDATION}, got {self.subjects}:"

@@ -1,5 +1,4 @@
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -15,6 +14,7 @@ from helpers.waiting import wait_for
 from ash.capture.manifest import read_manifest
 from benchmarks import cli
 from benchmarks.cell import methods
+from benchmarks.cell.children import METHOD_PATH
 from benchmarks.suites import captures
 from benchmarks.suites.files import find_suite
 from benchmarks.suites.suites import CaptureSpec
@@ -115,9 +115,10 @@ def test_a_scenes_fields_are_flags_and_part_of_what_it_is(capsys) -> None:
 def test_a_methods_mistake_comes_with_file_and_line(capture: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     (tmp_path / "own_method.py").write_text("def mine(capture, *, seed, preset):\n    return 1 / 0\n")
     (tmp_path / "own_typo.py").write_text("import nowhere_to_be_found\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]))
-    train = ["train", "own_method:mine", str(capture), "--out", str(tmp_path / "out")]
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setenv(METHOD_PATH, "")
+    assert "--method-path DIR" in refused(capsys, "train", "own_method:mine", str(capture))
+    train = ["train", "own_method:mine", str(capture), "--out", str(tmp_path / "out"), "--method-path", str(tmp_path)]
     assert cli.main(train) == arguments.FAILED
     assert "crashed: ZeroDivisionError: division by zero (" in (told := capsys.readouterr().err)
     assert "own_method.py:2)" in told

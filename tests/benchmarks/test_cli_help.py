@@ -23,8 +23,8 @@ def test_help_tells_a_methods_configuration(capsys) -> None:
 def test_help_lists_every_verb_and_how_to_go_on(capsys) -> None:
     assert cli.main(["--help"]) == arguments.DONE
     told = capsys.readouterr().out
-    for verb in cli.VERBS:
-        assert re.search(rf"^  {verb} +[A-Z]", told, re.MULTILINE), verb
+    listed = dict(re.findall(r"^  ([a-z][a-z-]*)  +([A-Z].*)$", told, re.MULTILINE))
+    assert listed == {verb: (cli._verb(verb).__doc__ or "").splitlines()[0].rstrip(".") for verb in cli.VERBS}
     assert f"{arguments.own_name()} run my.toml" in told
 
 

@@ -11,6 +11,7 @@ from PIL import Image
 
 from ash.capture.dataset import Camera, Capture, Pose
 from ash.protocol import StageClock
+from benchmarks.cell.children import METHOD_PATH
 
 
 class Honest(FakeAvatar):
@@ -161,6 +162,6 @@ def use(folder: Path, monkeypatch) -> None:
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: ash-bench-cheats\nVersion: 1.0\n")
     lines = ["[ash_bench.methods]", *(f"{name} = helpers.cheats:{name}" for name in NAMES)]
     (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
-    paths = [str(folder), str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
+    paths = [str(folder), str(Path(__file__).parents[1]), *filter(None, [os.environ.get(METHOD_PATH)])]
+    monkeypatch.setenv(METHOD_PATH, os.pathsep.join(paths))
     monkeypatch.syspath_prepend(str(folder))

@@ -26,6 +26,7 @@ from ash.capture.formats import write_cameras, write_motion, write_skeleton, wri
 from ash.capture.manifest import SCHEMA
 from ash.files import sha256_of, write_arrays, write_image, write_json
 from ash.protocol import StageClock
+from benchmarks.cell.children import METHOD_PATH
 
 SIZE = 64
 TRAIN_FRAMES, TEST_FRAMES = 4, 3
@@ -330,8 +331,8 @@ def use(folder: Path, monkeypatch) -> None:
     """Install the fake methods for this process and for the processes of cells."""
     install(folder)
     here = str(Path(__file__).parents[1])
-    paths = [str(folder), here, *filter(None, [os.environ.get("PYTHONPATH")])]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
+    paths = [str(folder), here, *filter(None, [os.environ.get(METHOD_PATH)])]
+    monkeypatch.setenv(METHOD_PATH, os.pathsep.join(paths))
     monkeypatch.syspath_prepend(str(folder))
 
 

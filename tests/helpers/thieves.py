@@ -54,6 +54,7 @@ def _reads() -> dict[str, object]:
         "parent's files": lambda: Path("/proc", str(os.getppid()), "root", *OTHER.parts[1:]).read_bytes()[:8],
         "other result": lambda: OTHER.read_bytes()[:8],
         "overwrite": lambda: b"x" if OTHER.exists() and OTHER.write_bytes(b"{}") else b"",
+        "kernel settings": lambda: Path("/proc/sys/kernel/core_pattern").open("r+b").name,
         "generator": lambda: bytes(str(__import__("synth.presets")), "utf8"),
     }
 
@@ -94,6 +95,39 @@ class Slow(FakeAvatar):
         return super().render(pose, camera, clock=clock)
 
 
+class Memoises(FakeAvatar):
+    """Draws in 30 ms, and a picture that it drew before in no time."""
+
+    def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
+        drawn = self.__dict__.setdefault("drawn", {})
+        if (camera.name, pose.frame) not in drawn:
+            time.sleep(0.03)
+            drawn[camera.name, pose.frame] = super().render(pose, camera, clock=clock)
+        return drawn[camera.name, pose.frame]
+
+
+class PreparesElsewhere(FakeAvatar):
+    """Works half a second in the factory, in `save` and when it is asked what it is, and nothing in `fit`."""
+
+    def __init__(self, capture: Capture, **settings: float) -> None:
+        super().__init__(capture, **settings)
+        _work(0.5)
+
+    def save(self, path: Path) -> None:
+        _work(0.5)
+        super().save(path)
+
+    def parameter_count(self) -> int:
+        _work(0.5)
+        return super().parameter_count()
+
+
+def _work(seconds: float) -> None:
+    start = time.process_time()
+    while time.process_time() - start < seconds:
+        pass
+
+
 class Warps(FakeAvatar):
     """Runs a kernel of Warp's on the CPU, writes down what was compiled before and after, and spoils it."""
 
@@ -120,6 +154,14 @@ def _files(folder: Path) -> dict[str, int]:
 
 def warps(capture: Capture, *, seed: int, preset: str) -> Warps:
     return Warps(capture, detail=0.9, seed=seed)
+
+
+def memoises(capture: Capture, *, seed: int, preset: str) -> Memoises:
+    return Memoises(capture, detail=0.9, seed=seed)
+
+
+def prepares_elsewhere(capture: Capture, *, seed: int, preset: str) -> PreparesElsewhere:
+    return PreparesElsewhere(capture, detail=0.9, seed=seed)
 
 
 def thief(capture: Capture, *, seed: int, preset: str) -> Thief:
@@ -194,6 +236,18 @@ class Ends(FakeAvatar):
             case "spoils":
                 libc = ctypes.CDLL(None)
                 libc.write(libc.open(str(TRUTH).encode(), os.O_WRONLY), b"spoilt", 6)
+            case "overwrites":
+                for path in folder.parents[1].glob("*/result.json"):
+                    ctypes.CDLL(None).truncate(str(path).encode(), 10)
+            case "fills":
+                for number in range(40):
+                    (folder / f"{number}.bin").write_bytes(b"\0" * (1 << 22))
+                time.sleep(60)
+            case "forks":
+                program = "import os, time\nwhile True: os.fork() or os.setsid(); time.sleep(600)"
+                subprocess.Popen([sys.executable, "-c", program, "left-behind-by-a-method"], start_new_session=True)
+                hoard = bytearray(1 << 30)
+                time.sleep(60 + len(hoard) % 2)
             case "sleeps":
                 time.sleep(1.2)
             case "works":
@@ -212,7 +266,7 @@ class Ends(FakeAvatar):
 
 HOW = (
     "exit_2", "exit_0", "exit_130", "os_error", "input_error", "keyboard", "leaves", "loud", "killed", "bytes",
-    "units", "negative", "resumes", "sleeps", "spoils", "works",
+    "units", "negative", "resumes", "sleeps", "spoils", "works", "overwrites", "fills", "forks",
 )  # fmt: skip
 
 

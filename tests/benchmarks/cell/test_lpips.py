@@ -109,3 +109,17 @@ def test_files_that_are_no_alexnet(tmp_path: Path) -> None:
     torch.save([1, 2], path)
     with pytest.raises(InputError, match="expected a dictionary"):
         lpips.Lpips(path)
+
+
+def test_weights_that_would_grow_in_memory_are_refused(backbone: Path, tmp_path: Path) -> None:
+    whole = torch.load(backbone)
+    bad = {
+        "expanded": {"features.0.weight": torch.zeros(1).expand(64, 3, 11, 11)},
+        "sparse": {"features.0.weight": torch.zeros(64, 3, 11, 11).to_sparse()},
+        "names": {7: torch.zeros(3)},
+    }
+    for name, content in bad.items():
+        path = tmp_path / f"{name}.pth"
+        torch.save(whole | content, path)
+        with pytest.raises(InputError, match=r"expected a dense tensor|expected names of tensors"):
+            lpips.Lpips(path)

@@ -9,6 +9,7 @@ import pytest
 from helpers import fakes
 
 from benchmarks.cell.cells import read_result
+from benchmarks.cell.children import METHOD_PATH
 
 PACKAGE = Path(__file__).parents[2] / "helpers" / "plugin"
 
@@ -38,8 +39,7 @@ def environment(tmp_path_factory) -> dict[str, str]:
     command = [sys.executable, "-m", "pip", "install", *options, str(source)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    paths = [str(target), *filter(None, [os.environ.get("PYTHONPATH")])]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
+    return {**os.environ, METHOD_PATH: str(target), "OMP_NUM_THREADS": "1"}
 
 
 def ash_bench(*arguments: str, environment: dict[str, str], folder: Path) -> subprocess.CompletedProcess[str]:

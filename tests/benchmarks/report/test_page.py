@@ -18,7 +18,7 @@ from ash.files import InputError
 from ash.protocol import TrainingOutcome
 from benchmarks import cli
 from benchmarks.analysis.scores import Quantity, scores_of
-from benchmarks.cell.cells import CellResult, Summary, failed_result
+from benchmarks.cell.cells import CellResult, Summary, failed_result, result_of
 from benchmarks.cell.metrics import PROTOCOL
 from benchmarks.report import charts, sentences, tables, vega
 from benchmarks.report.content import Text
@@ -26,6 +26,7 @@ from benchmarks.report.figures import speed_figure
 from benchmarks.report.page import publish, write_report
 from benchmarks.report.pictures import Album
 from benchmarks.report.scene import SceneData, scene_report
+from benchmarks.suites import runs
 from benchmarks.suites.runs import Run, read_run, results_of
 from benchmarks.verbs import arguments
 
@@ -112,6 +113,27 @@ def test_one_failure_does_not_press_the_points_of_a_chart_together() -> None:
     )
     low, high = panel.to_dict()["layer"][0]["encoding"]["y"]["scale"]["domain"]
     assert 27 < low < 28.1 and 32.9 < high < 34
+
+
+def test_every_result_is_read_once(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = []
+    monkeypatch.setattr(runs, "result_of", lambda cell: read.append(cell.folder) or result_of(cell))
+    write_report(run)
+    assert read == [cell.folder for cell in run.cells]
+
+
+def test_a_title_of_the_suite_is_shown_in_every_form_of_the_report(run: Run, tmp_path: Path) -> None:
+    shown = write_report(replace(run, folder=tmp_path, titles={"fake_good": "Good row"}))
+    texts = [(tmp_path / name).read_text() for name in ("report.html", "report.md", "tables.tex")]
+    assert all("Good row" in text for text in ("\n".join(shown), *texts))
+    assert "Good row" not in (tmp_path / "results.csv").read_text(), "a table for programs keeps names"
+
+
+def test_rows_that_are_equal_are_not_told_as_a_win() -> None:
+    rows = [scored("wide", view=23.04, pose=20.0), scored("narrow", view=23.01, pose=20.0)]
+    assert sentences.headline(scores_of(rows), rows[0].config.scene) == (
+        f"On {rows[0].config.scene}, wide is best on held-out views with 23.0 dB, level with narrow (within 0.1 dB)."
+    )
 
 
 def test_markdown_and_latex_say_the_same_as_the_page(run: Run) -> None:

@@ -60,6 +60,17 @@ def test_every_person_has_the_lead_of_ash_and_the_cast_its_spread() -> None:
     assert chart.figure.svg().count("subject 0") >= 2, "a row in each of the two panels"
 
 
+def test_an_ablation_that_changes_nothing_is_no_win() -> None:
+    def first(psnr: tuple[tuple[float, ...], ...]) -> str:
+        (section,) = people.sections(cast(PSNR | {"ddc": psnr}), "loose")
+        return blocks(section, Bullets)[0].items[0]
+
+    assert first(PSNR["ash"]) == "On held-out views ASH and DDC are equal on all 2 people, within 0.01 dB."
+    assert first(((26.0, 26.0), (29.0, 29.0))) == (
+        "On held-out views ASH is ahead of DDC on none of 2 people; the differences are -1.00 to -1.00 dB."
+    )
+
+
 def test_a_single_person_and_a_rival_that_failed_have_no_such_section() -> None:
     alone = cast({method: persons[:1] for method, persons in PSNR.items()})
     assert people.sections(alone, "loose") == []

@@ -159,3 +159,23 @@ def test_what_was_not_enforced_and_clocks_that_contradict_are_told() -> None:
         build(scores_of([result()]), "boxes", columns, title="", exposed=exposed) for exposed in ((), ("ash",))
     )
     assert (plain.rows[0].note, marked.rows[0].note) == ("", "not isolated")
+
+
+def test_texts_of_a_result_cannot_steer_the_terminal(tmp_path: Path) -> None:
+    ends = replace(
+        result(),
+        reason="no\n\x1b[2Jimage",
+        provenance=Provenance(commit="a\x07", machine={"c\r": "\x9b"}, versions={}, wall_s=1.0),
+    )
+    write_result(tmp_path, ends)
+    read = read_result(tmp_path)
+    assert read.reason == "no  [2Jimage"
+    assert (read.provenance.commit, read.provenance.machine) == ("a ", {"c ": " "})
+
+
+def test_an_unknown_metric_is_one_line(tmp_path: Path) -> None:
+    write_result(tmp_path, result())
+    path = tmp_path / "result.json"
+    path.write_text(path.read_text().replace('"metric": "psnr"', '"metric": "psrn"'))
+    with pytest.raises(InputError, match=r"result\.json: .*unknown metric 'psrn', did you mean psnr\?"):
+        read_result(tmp_path)

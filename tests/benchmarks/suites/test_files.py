@@ -8,11 +8,12 @@ import pytest
 from helpers import fakes
 
 from ash.files import InputError
-from benchmarks.analysis.names import is_ours
+from benchmarks.analysis.names import is_ours, look_of, titles_of, user_rows
+from benchmarks.cell.cells import write_config
 from benchmarks.cell.methods import WRONG_BY_MM, is_oracle
 from benchmarks.suites.captures import described
 from benchmarks.suites.files import find_suite, given_captures, line_of, read_suite, suite_files
-from benchmarks.suites.runs import cell_for
+from benchmarks.suites.runs import Run, cell_for, read_run, write_run
 from benchmarks.suites.suites import SceneSpec, varied_name
 
 GOOD = """\
@@ -96,7 +97,7 @@ def test_a_capture_that_is_there_is_a_scene(tmp_path: Path) -> None:
     ("before", "after", "line", "message"),
     [
         ("seeds", "sedes", 10, "unknown key 'sedes', did you mean seeds"),
-        ("seeds = 2", "seeds = 0", 10, "seeds: expected at least 1"),
+        ("seeds = 2", "seeds = 0", 10, "seeds: expected 1 to 1000"),
         ("seeds = 2", "subjects = 0", 10, "subjects: expected 1 to 100, got 0"),
         ("seeds = 2", "subjects = 101", 10, "those from 100 on are for validation"),
         ("seeds = 2", 'seeds = "two"', 10, "seeds: expected a whole number, got 'two'"),
@@ -192,11 +193,54 @@ def test_no_row_of_our_suites_is_taken_for_a_users_own() -> None:
     assert not is_ours("mine")
 
 
+def test_a_users_row_does_not_take_our_title(tmp_path: Path) -> None:
+    capture = fakes.write_capture(tmp_path / "mine")
+    rows = '"ash", { of = "ash", name = "refined", model.width = 12 }, { of = "ash", name = "wo_mot", model.width = 4 }'
+    text = f'scenes = ["tight"]\npreset = "ci"\nmethods = [{rows}]\n'
+    suite = read_suite(written(tmp_path, text))
+    configs = [cell_for(cell, capture, tmp_path).config for cell in suite.cells]
+    with titles_of(configs):
+        assert [look_of(config.method).title for config in configs] == ["ASH", "refined", "wo_mot"]
+        assert [is_ours(config.method) for config in configs] == [True, False, False]
+    assert look_of("refined").title != "refined", "outside of the report the title is ours again"
+
+
+def test_a_row_has_the_title_that_its_suite_gives(tmp_path: Path) -> None:
+    capture = fakes.write_capture(tmp_path / "mine")
+    rows = """[
+        "ash",
+        { of = "ash", name = "refined", title = "Half the width", model.width = 12 },
+        { of = "ash", name = "narrow", title = "ASH", model.width = 4 },
+    ]"""
+    suite = read_suite(written(tmp_path, f'preset = "ci"\nscenes = ["tight"]\nmethods = {rows}'.replace("\n ", " ")))
+    cells = tuple(cell_for(cell, capture, tmp_path) for cell in suite.cells)
+    titles = {method.name: method.title for method in suite.methods if method.title}
+    for cell in cells:
+        write_config(cell)
+    write_run(Run(folder=tmp_path, suite="mine", about="a", command="", cells=cells, titles=titles))
+    run = read_run(tmp_path)
+    with titles_of([cell.config for cell in run.cells], run.titles):
+        assert [look_of(c.config.method).title for c in run.cells] == ["ASH", "Half the width", "ASH (narrow)"]
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ('{ of = "ash", title = "Mine" }', "title: ash has one"),
+        ('{ of = "ash", name = "mine", title = "a\\u001b[2J" }', "title: expected at most 60 printable characters"),
+    ],
+)
+def test_a_title_is_printable_and_ours_keep_theirs(tmp_path: Path, row: str, message: str) -> None:
+    with pytest.raises(InputError, match=rf"mine\.toml:3: {message}"):
+        read_suite(written(tmp_path, f'preset = "ci"\nscenes = ["tight"]\nmethods = [{row}]\n'))
+
+
 def test_every_row_of_our_suites_has_an_identity(tmp_path: Path) -> None:
     capture = fakes.write_capture(tmp_path / "mine")
     for suite in map(find_suite, suite_files()):
         rows = [cell_for(cell, capture, tmp_path).config for cell in islice(suite.cells, len(suite.methods))]
         assert len({row.key for row in rows}) == len(suite.methods)
+        assert not user_rows(rows)
 
 
 def test_every_subject_has_its_captures_and_subject_0_keeps_its_names(tmp_path: Path) -> None:
