@@ -65,10 +65,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--follow-parent", action="store_true", help="end when standard input ends")
     arguments = parser.parse_args(argv)
-    os.environ["ASH_BENCH_CELL_PROCESS"] = str(os.getpid())
-    adopt_orphans()
     add_method_paths()
-    if arguments.follow_parent:
+    if arguments.follow_parent:  # Its own process, whose children are all the method's.
+        os.environ["ASH_BENCH_CELL_PROCESS"] = str(os.getpid())
+        adopt_orphans()
         threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         run_cell(read_cell(arguments.folder))

@@ -51,14 +51,13 @@ def evaluated_views(capture: Capture) -> tuple[View, ...]:
 
 
 def playback(views: tuple[View, ...]) -> list[View]:
-    """Camera by camera, the views of motion that training did not show, as near to it as the capture has.
+    """The views in the order in which they are timed: first motion that is not training's, as near to it as there is.
 
     A method that does less in poses far from training's, because it trusts what it learned less there, is timed where
-    it does all.
+    it does all. Camera by camera, frames follow each other.
     """
-    splits = {view.split for view in views}
-    split = next((name for name in ("near_pose", "novel_pose") if name in splits), views[-1].split)
-    return [view for view in views if view.split == split]
+    order = ("near_pose", "novel_pose", "far_pose", "novel_view", "train_view")
+    return sorted(views, key=lambda view: order.index(view.split))
 
 
 def spread(count: int, at_most: int) -> list[int]:

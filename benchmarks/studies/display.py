@@ -11,7 +11,7 @@ from ash.protocol import Displayed, Drawn, StageClock
 from benchmarks.cell import metrics
 from benchmarks.cell.cells import Cell
 from benchmarks.cell.process import load_avatar
-from benchmarks.cell.timing import time_frames
+from benchmarks.cell.timing import TIMED_FRAMES, WARM_UP_FRAMES, time_frames
 from benchmarks.cell.views import View, evaluated_views, playback
 
 
@@ -39,7 +39,7 @@ def show(cell: Cell, *, trust: bool = False) -> DisplayTiming:
             raise InputError(f"{cell.folder}: {cell.config.method} has no display of its own")
         display = avatar.open_display()
         try:
-            views = playback(evaluated_views(capture))
+            views = playback(evaluated_views(capture))[: WARM_UP_FRAMES + TIMED_FRAMES]
             trained, shown = (time_frames(way, capture, views) for way in (avatar, display))
             agreement = min(_agreement(capture, view, avatar, display) for view in views)
         finally:

@@ -27,7 +27,7 @@ from benchmarks.suites.runs import RunOptions
 from benchmarks.suites.stress import AXES, FOOTAGE_FRAMES, Stress
 from benchmarks.suites.suites import CaptureSpec
 
-MASKS = Path(__file__).parents[3] / "reports" / "masks" / "masks.toml"
+MASKS = Path(__file__).parents[2] / "data" / "masks.toml"
 
 
 def severities_of(axis: str) -> list[float]:
