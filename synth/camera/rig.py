@@ -125,12 +125,14 @@ def rig_from_file(path: Path, *, held_out: int | None = None) -> Rig:
 def _camera_rows(path: Path, content: Any) -> list[dict[str, Any]]:
     """The cameras of a file as rows of our `cameras.json`."""
     try:
+        foreign = True
         if isinstance(content, dict) and "frames" in content:
             rows = [_from_nerfstudio(content | frame, k) for k, frame in enumerate(content["frames"])]
         else:
             rows = content["cameras"] if isinstance(content, dict) else content
+            foreign = any("rotation" in row for row in rows)
             rows = [_from_splatting(row, k) if "rotation" in row else dict(row) for k, row in enumerate(rows)]
-        if len({row["name"] for row in rows}) < len(rows):  # Names of images may repeat in other folders.
+        if foreign and len({row["name"] for row in rows}) < len(rows):  # Names of images may repeat in other folders.
             rows = [row | {"name": f"cam{k:03d}"} for k, row in enumerate(rows)]
         for row in rows:
             row["distortion"] = _four_coefficients(row)
@@ -139,7 +141,7 @@ def _camera_rows(path: Path, content: Any) -> list[dict[str, Any]]:
         raise InputError(f"{path}: {error}") from error
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(
-            f"{path}: expected the cameras of a capture, of 3D Gaussian Splatting (cameras.json) or of nerfstudio"
+            f"{path}: expected a list of cameras, of a capture, of 3D Gaussian Splatting (cameras.json) or of nerfstudio"
             f" (transforms.json) ({type(error).__name__}: {error})"
         ) from error
     return rows
@@ -182,9 +184,11 @@ def _four_coefficients(row: dict[str, Any]) -> list[float]:
     for name, value in list(zip(COEFFICIENTS, values, strict=False))[4:]:
         if value != 0:
             raise InputError(f"camera {row['name']}: {name} is {value:g}, expected 0: the lens model is k1 k2 p1 p2")
+    if not values:
+        return [0.0] * 4
     if len(values) > len(COEFFICIENTS):
         raise InputError(f"camera {row['name']}: distortion has {len(values)} numbers, expected at most 14")
-    return [*values, 0.0, 0.0, 0.0, 0.0][:4] if len(values) < 4 else values[:4]
+    return values[:4]
 
 
 def _orthonormal(row: dict[str, Any]) -> list[list[float]]:
@@ -196,7 +200,7 @@ def _orthonormal(row: dict[str, Any]) -> list[list[float]]:
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if error > ROUNDED:
         raise InputError(
-            f"camera {row['name']}: its rotation is off by {error:.2g}, expected an orthonormal one within {ROUNDED:g}"
+            f"camera {row['name']}: its rotation is not orthonormal: off by {error:.2g}, expected at most {ROUNDED:g}"
         )
     if error > 1e-9:
         viewmat[:3, :3] = nearest_rotation(rotation)

@@ -84,7 +84,7 @@ def test_rounded_rotations_are_made_orthonormal_and_wrong_ones_refused(tmp_path:
     np.testing.assert_allclose(found, np.stack(matrices())[:, :3, :3], atol=1e-4)
     rows[2]["viewmat"][0][0] += 0.01
     path.write_text(json.dumps(rows))
-    with pytest.raises(InputError, match=r"camera cam2: its rotation is off by 0\.0"):
+    with pytest.raises(InputError, match=r"camera cam2: its rotation is not orthonormal: off by 0\.0"):
         rig_from_file(path)
 
 
@@ -108,5 +108,7 @@ def test_other_coefficients_are_refused_by_camera_and_field(tmp_path: Path) -> N
 
 def test_another_file_is_refused_by_what_is_read(tmp_path: Path) -> None:
     (tmp_path / "other.json").write_text('{"intrinsics": []}')
-    with pytest.raises(InputError, match=r"expected the cameras of a capture, of 3D Gaussian Splatting .* nerfstudio"):
+    with pytest.raises(
+        InputError, match=r"expected a list of cameras, of a capture, of 3D Gaussian Splatting .* nerfstudio"
+    ):
         rig_from_file(tmp_path / "other.json")
