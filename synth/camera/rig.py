@@ -194,7 +194,7 @@ def _four_coefficients(row: dict[str, Any]) -> list[float]:
 def _orthonormal(row: dict[str, Any]) -> list[list[float]]:
     """The camera's matrix, with the nearest rotation where its own is rounded."""
     viewmat = np.array(row["viewmat"], dtype=np.float64)
-    if viewmat.shape != (4, 4) or not np.isfinite(viewmat).all():
+    if viewmat.shape != (4, 4) or not (np.abs(viewmat) < 1e9).all():
         return row["viewmat"]  # Refused where it is read.
     rotation = viewmat[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())

@@ -202,7 +202,9 @@ def test_own_cameras_are_taken_as_they_are(capture: Capture, tmp_path: Path):
     path = tmp_path / "cameras.json"
     write_cameras(path, list(capture.cameras.values()))
     rig = rig_from_file(path, held_out=1)
-    for camera, own in zip(make_cameras(rig, np.array([[0, 1.0, 0]])), read_cameras(path).values(), strict=True):
+    for camera, own in zip(
+        make_cameras(rig, np.array([[0, 0.6, 0], [0, 1.4, 0]])), read_cameras(path).values(), strict=True
+    ):
         assert camera.name == own.name
         np.testing.assert_array_equal(camera.viewmat, own.viewmat)
     write_cameras(path, [replace(camera, width=32 + k) for k, camera in enumerate(capture.cameras.values())])
