@@ -136,7 +136,8 @@ def _camera_rows(path: Path, content: Any) -> list[dict[str, Any]]:
             rows = [row | {"name": f"cam{k:03d}"} for k, row in enumerate(rows)]
         for row in rows:
             row["distortion"] = _four_coefficients(row)
-            row["viewmat"] = _orthonormal(row)
+            if "viewmat" in row:
+                row["viewmat"] = _orthonormal(row)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except (KeyError, TypeError, ValueError, IndexError) as error:
