@@ -29,10 +29,8 @@ def commit() -> str:
     root = Path(__file__).parent.parent
     if not (root / ".git").exists() or shutil.which("git") is None:
         return "unknown"
-    revision = _output("git", "-c", f"safe.directory={root}", "-C", str(root), "rev-parse", "--short=12", "HEAD")
-    changed = _output(
-        "git", "-c", f"safe.directory={root}", "-C", str(root), "status", "--porcelain", "--untracked-files=no"
-    )
+    revision = _git(root, "rev-parse", "--short=12", "HEAD")
+    changed = _git(root, "status", "--porcelain", "--untracked-files=no")
     return revision + ("+" if changed else "") if revision else "unknown"
 
 
@@ -42,22 +40,10 @@ def changed_since(revision: str) -> tuple[str, ...] | None:
     known = revision.rstrip("+")
     if not (root / ".git").exists() or shutil.which("git") is None or not known.isalnum():
         return None
-    if not _output(
-        "git",
-        "-c",
-        f"safe.directory={root}",
-        "-C",
-        str(root),
-        "rev-parse",
-        "--verify",
-        "--quiet",
-        f"{known}^{{commit}}",
-    ):
+    if not _git(root, "rev-parse", "--verify", "--quiet", f"{known}^{{commit}}"):
         return None
-    changed = _output("git", "-c", f"safe.directory={root}", "-C", str(root), "diff", "--name-only", known, "--")
-    added = _output(
-        "git", "-c", f"safe.directory={root}", "-C", str(root), "ls-files", "--others", "--exclude-standard"
-    )
+    changed = _git(root, "diff", "--name-only", known, "--")
+    added = _git(root, "ls-files", "--others", "--exclude-standard")
     return tuple(sorted({*changed.splitlines(), *added.splitlines()}))
 
 
@@ -118,6 +104,11 @@ def gpu_name() -> str | None:
     if shutil.which("nvidia-smi") is None:
         return None
     return _output("nvidia-smi", "--query-gpu=name", "--format=csv,noheader").split("\n")[0] or None
+
+
+def _git(root: Path, *arguments: str) -> str:
+    """What git says of a checkout, also of one that somebody else owns."""
+    return _output("git", "-c", f"safe.directory={root}", "-C", str(root), *arguments)
 
 
 def _output(*command: str) -> str:

@@ -30,9 +30,10 @@ def pass_on(output: IO[bytes]) -> None:
 
 
 def kill_process_tree(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process and all its descendants, also those that left its process group.
+    """Kill a process and all its descendants, also those that left its process group or lost their parents.
 
-    The tree is stopped first, until no new member is found: a process that was stopped starts no other.
+    The tree is stopped first, until no new member is found: a process that was stopped starts no other. In a cell's
+    process, which adopts what a method leaves behind (`adopt_orphans`), the orphans are killed as well.
     """
     stopped: dict[psutil.Process, None] = {}
     with contextlib.suppress(psutil.Error):
@@ -48,14 +49,8 @@ def kill_process_tree(process: subprocess.Popen[bytes]) -> None:
     with contextlib.suppress(ProcessLookupError):
         process.kill()
     process.wait()
-
-
-def end_family(process: subprocess.Popen[bytes]) -> None:
-    """End a method's process and everything that it started."""
-    kill_process_tree(process)
-    # What lost its parents has become ours (see `adopt_orphans`).
     deadline = time.monotonic() + 5
-    while (orphans := _children()) and time.monotonic() < deadline:
+    while (orphans := _orphans()) and time.monotonic() < deadline:
         for orphan in orphans:
             with contextlib.suppress(psutil.Error):
                 for member in (*orphan.children(recursive=True), orphan):
@@ -83,7 +78,7 @@ def adopt_orphans() -> None:
         ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER
 
 
-def _children() -> list[psutil.Process]:
+def _orphans() -> list[psutil.Process]:
     if not _adopting():
         return []
     return psutil.Process().children()

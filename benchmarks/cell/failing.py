@@ -12,7 +12,7 @@ class MethodFailed(Exception):
         self.status: Status = status
 
 
-class Spoilt(MethodFailed):
+class CaptureModifiedError(MethodFailed):
     """The capture is no longer what it was when a method that could reach it began."""
 
     def __init__(self, damage: str) -> None:
@@ -20,7 +20,7 @@ class Spoilt(MethodFailed):
 
 
 class HarnessFailed(Exception):
-    """Something of ours failed before the method began, or for want of disk: the method has no result from it."""
+    """Something of ours failed before the method began, so that the method has no result from it."""
 
 
 class Killed(Exception):

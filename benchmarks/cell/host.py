@@ -32,7 +32,7 @@ from ash.files import require_plain
 from ash.protocol import TrainingOutcome
 from benchmarks.cell import isolation
 from benchmarks.cell.cells import CHECKPOINT, Cell, DrawnBy, Status
-from benchmarks.cell.children import end_family, pass_on, peak_memory_mb
+from benchmarks.cell.children import kill_process_tree, pass_on, peak_memory_mb
 from benchmarks.cell.failing import HarnessFailed, Killed, MethodFailed
 from benchmarks.cell.guest import LARGEST_HEADER
 from benchmarks.cell.kernels import KERNELS, give_kernels, looking_in
@@ -276,14 +276,14 @@ def hosted(
         try:
             host._receive(0)
         except isolation.Refused:
-            end_family(host._process)
+            kill_process_tree(host._process)
             host, pump = _start(order | {"room": None}, kernels, isolated=False)
             host._receive(0)
         except MethodFailed as error:
             raise HarnessFailed(f"before the method began: {error}") from error
         yield host
     finally:
-        end_family(host._process)
+        kill_process_tree(host._process)
         for descriptor in (host._requests, host._replies):
             os.close(descriptor)
         pump.join(5)

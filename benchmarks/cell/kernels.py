@@ -1,10 +1,11 @@
 """What a GPU runs, compiled once for all cells: a method gets a copy of it that it can spoil for nobody else."""
 
-import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+
+from benchmarks.cell.children import clean_environment
 
 KERNELS = "kernels"  # In a cell's folder, while its method runs.
 
@@ -24,10 +25,14 @@ def give_kernels(device: str, place: Path) -> Path:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     if runs_kernels(device):
-        subprocess.run([sys.executable, "-m", "ash.warp.compiling", device, str(folder)], check=False)
+        subprocess.run(
+            [sys.executable, "-P", "-m", "ash.warp.compiling", device, str(folder)],
+            env=clean_environment(),
+            check=False,
+        )
     return folder
 
 
 def looking_in(folder: Path) -> dict[str, str]:
     """The environment of a process whose Warp has its cache there."""
-    return os.environ | {"WARP_CACHE_PATH": str(folder)}
+    return clean_environment() | {"WARP_CACHE_PATH": str(folder)}

@@ -47,7 +47,7 @@ from benchmarks.cell.evaluation import (
     judge,
     scored_views,
 )
-from benchmarks.cell.failing import HarnessFailed, Killed, MethodFailed, Spoilt
+from benchmarks.cell.failing import CaptureModifiedError, HarnessFailed, Killed, MethodFailed
 from benchmarks.cell.host import WORK, Host, give_files, hosted, take_files
 from benchmarks.cell.methods import ORACLES, code_version, configured, find_method, offered
 from benchmarks.cell.sealing import seen_by_method, watched
@@ -111,7 +111,7 @@ def run_cell(cell: Cell) -> CellResult:
         result = _train_and_evaluate(cell, capture)
     except MethodFailed as error:
         if resumed and not isinstance(
-            error, Spoilt
+            error, CaptureModifiedError
         ):  # What an earlier attempt left may be damaged, and a whole training ends the same.
             print(f"{cell.config.title}: {error.status}: {error}; once more, from nothing", file=sys.stderr)
             shutil.rmtree(cell.folder / WORK)
@@ -254,10 +254,10 @@ def _hosted(cell: Cell, capture: Capture, *, secret: tuple[Path, ...] = ()) -> I
                 raise
     except (MethodFailed, Killed) as error:
         if exposed and (damage := _damage(cell, capture)):
-            raise Spoilt(damage) from error
+            raise CaptureModifiedError(damage) from error
         raise
     if exposed and (damage := _damage(cell, capture)):
-        raise Spoilt(damage)
+        raise CaptureModifiedError(damage)
 
 
 def require_disk(folder: Path, failure: MethodFailed) -> None:

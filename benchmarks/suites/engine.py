@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass
@@ -37,7 +38,8 @@ from benchmarks.suites.progress import Progress
 AnyCell = TypeVar("AnyCell")
 
 POLL_S = 0.2
-ATTEMPTS = 2  # at a cell that is killed from outside
+DISK_POLL_S = 2.0  # between two looks at the size of a cell's folder
+ATTEMPTS = 2  # at a cell that is killed from outside, or whose result others change
 TAIL = 1 << 16  # bytes of a log that are looked at
 WRONG_INPUT = 2
 GPU = "GPU"  # a resource of Dask's workers
@@ -136,11 +138,13 @@ def run_cells(
     environment shows them.
 
     Raises:
-        InputError: a cell found its input wrong; cells that wait are given up, results that are there stay.
+        InputError: a cell found its input wrong, or others changed its result again after it was made again; cells that
+            wait are given up, results that are there stay.
         KeyboardInterrupt: the user's; all child processes have ended when it is seen.
     """
     _stopping.clear()  # Not when a run is over: a thread that the interruption kept from its executor may still look.
     futures: dict[Future[str], Cell] = {}
+    repeats: Counter[Path] = Counter()
     known = {cell.folder: (cell, _digest(cell)) for cell in plan.done}
 
     def submit(cell: Cell) -> Future[str]:
@@ -160,6 +164,10 @@ def run_cells(
             if finished:
                 # A method that nothing isolates can write to the folders of other cells.
                 for cell in [cell for cell, digest in known.values() if _digest(cell) != digest]:
+                    repeats[cell.folder] += 1
+                    if repeats[cell.folder] == ATTEMPTS:
+                        times = f"changed by other cells {ATTEMPTS} times, since nothing isolates methods here"
+                        raise InputError(f"{cell.config.title}: its result was {times}; run its row alone")
                     progress.say(f"{cell.config.title}: run again, its result was changed while another cell ran")
                     progress.total += 1
                     del known[cell.folder]
@@ -290,7 +298,7 @@ def _gpu_on(client: Any, spec: str) -> dict[str, Any]:
 
 
 def _watch(child: subprocess.Popen[bytes], limits: Limits, start: float, disk: Path | None) -> Failure | None:
-    process = psutil.Process(child.pid)
+    process, looked = psutil.Process(child.pid), start
     while True:
         try:
             child.wait(POLL_S)
@@ -303,7 +311,10 @@ def _watch(child: subprocess.Popen[bytes], limits: Limits, start: float, disk: P
             family = [process, *process.children(recursive=True)]
             if (used := sum(member.memory_info().rss for member in family) / 2**20) > limits.memory_mb:
                 return _too_large(used, limits)
-        if disk is not None and (used := folder_mb(disk)) > limits.disk_mb:
+        if disk is None or time.monotonic() - looked < DISK_POLL_S:
+            continue
+        looked = time.monotonic()
+        if (used := folder_mb(disk)) > limits.disk_mb:
             return Failure(status="crashed", reason=f"its folder takes {used:.0f} MB, the limit is {limits.disk_mb} MB")
 
 

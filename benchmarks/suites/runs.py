@@ -15,6 +15,7 @@ from ash.fields import for_json
 from ash.files import InputError, only_run_in, read_json, require_plain, write_json
 from benchmarks.cell import isolation
 from benchmarks.cell.cells import Cell, CellConfig, CellResult, printable, read_cell, result_of
+from benchmarks.cell.children import clean_environment
 from benchmarks.cell.methods import code_version, configured, find_method, offered
 from benchmarks.cell.metrics import PROTOCOL
 from benchmarks.suites.captures import (
@@ -138,7 +139,8 @@ def _require_importable(method: str, preset: str) -> None:
     )
     with contextlib.suppress(subprocess.TimeoutExpired):
         command = [sys.executable, "-P", "-c", code, method, preset]
-        ended = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=IMPORT_S, check=False)
+        settings: dict[str, Any] = {"env": clean_environment(), "stdin": subprocess.DEVNULL, "capture_output": True}
+        ended = subprocess.run(command, timeout=IMPORT_S, check=False, **settings)
         last = ended.stderr.decode(errors="replace").strip().rpartition("\n")[2]
         if last.startswith("refused: "):
             raise InputError(last.removeprefix("refused: "))

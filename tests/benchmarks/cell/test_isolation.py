@@ -50,16 +50,16 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
 
 
-def cell(method: str, capture: Path, out: Path) -> Cell:
+def cell(method: str, capture: Path, out: Path, *, seed: int = 0) -> Cell:
     spec = CaptureSpec(scene="boxes", size="ci")
-    return cell_for(CellSpec(capture=spec, method=method, preset="ci", seed=0), capture, out)
+    return cell_for(CellSpec(capture=spec, method=method, preset="ci", seed=seed), capture, out)
 
 
-def run(cells: list[Cell], limits: Limits = LIMITS) -> str:
+def run(cells: list[Cell], limits: Limits = LIMITS, *, workers: int = 2) -> str:
     """Run the cells, and return what the progress said."""
     plan, lines = plan_cells(cells), io.StringIO()
-    with make_executor("local", workers=2) as executor:
-        run_cells(plan, executor, limits, Progress("", len(cells), expected_s=1.0, workers=2, stream=lines))
+    with make_executor("local", workers=workers) as executor:
+        run_cells(plan, executor, limits, Progress("", len(cells), expected_s=1.0, workers=workers, stream=lines))
     return "\n".join([*plan.reasons, lines.getvalue()])
 
 
@@ -165,6 +165,15 @@ def test_a_result_that_another_cell_changed_is_made_again(
         v.prediction for v in before.views
     ]
     assert ("its result was changed while another cell ran" in lines) == (isolation.problem() is not None)
+
+
+def test_methods_that_change_each_other_s_results_end_the_run(
+    own_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(isolation.ISOLATION, "off")
+    one, other = cell("overwrites", own_capture, tmp_path), cell("overwrites", own_capture, tmp_path, seed=1)
+    with pytest.raises(InputError, match="its result was changed by other cells 2 times"):
+        run([one, other], workers=1)
 
 
 def test_a_damaged_result_is_made_again_and_kept_beside(capture: Path, tmp_path: Path) -> None:
