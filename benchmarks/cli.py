@@ -23,6 +23,8 @@ def _set_threads() -> None:
         os.environ.setdefault("GOMP_SPINCOUNT", SPINS)
 
 
+# No child imports from the folder where the user stands: a `random.py` there would replace Python's own.
+os.environ["PYTHONSAFEPATH"] = "1"
 _set_threads()  # Read as NumPy, torch and FLIP are loaded, the first of them by the imports below.
 
 from ash.fields import nearest

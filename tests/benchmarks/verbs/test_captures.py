@@ -1,6 +1,8 @@
 """The door's capture verbs, with files that users bring: good ones, broken ones and hostile ones."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -169,3 +171,12 @@ def test_export_and_undistort_have_doors(tmp_path: Path, capsys: pytest.CaptureF
     files = load_capture(tmp_path / "straight").manifest.files
     assert files == load_capture(small_capture).manifest.files  # Pinholes stay as they are, byte for byte.
     assert "empty folder" in capsys.readouterr().err
+
+
+def test_modules_where_the_user_stands_replace_none_of_ours(tmp_path: Path) -> None:
+    """Also in the processes that probe the renderer and that render."""
+    (tmp_path / "random.py").write_text("raise RuntimeError('the wrong module')\n")
+    command = [sys.executable, "-P", "-m", "benchmarks.cli", "synth", "mannequin", "--size", "ci", "--out", "capture"]
+    done = subprocess.run([*command, "--workers", "2"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "capture" / "manifest.json").is_file()
