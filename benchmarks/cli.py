@@ -58,7 +58,6 @@ VERBS = {
     "export-avatar": "avatars:ExportAvatarVerb",
     "share": "avatars:ShareVerb",
     "gate": "gate:GateVerb",
-    "gate-rates": "gate:GateRatesVerb",
     "speed": "checkout:SpeedVerb",
     "doctor": "checkout:DoctorVerb",
     "docs": "checkout:DocsVerb",

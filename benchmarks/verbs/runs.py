@@ -149,7 +149,7 @@ class ReportVerb:
     """Write a report: of a run again, or of any cells and runs together.
 
     What --publish leaves holds cells.zip, every number of every cell. Unpacked, that is a run for `report` and
-    `compare`: `unzip reports/quick/cells.zip -d runs/earlier`.
+    `compare`: `unzip reports/people/cells.zip -d runs/earlier`.
     """
 
     runs: Positional[tuple[Path, ...]]  # folders of runs or of single cells
