@@ -1,4 +1,4 @@
-"""Verbs that show a trained avatar or take it along: play, video, export-avatar, share."""
+"""Commands that show a trained avatar or take it along: play, video, export-avatar, share."""
 
 import contextlib
 import sys
@@ -10,14 +10,14 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from ash.capture.dataset import Pose
 from ash.files import InputError, write_atomic
-from benchmarks.verbs.arguments import DONE, Count, CountIfAny, File, Names, Natural, Trust
-from benchmarks.verbs.devices import CPU, DeviceName, chosen_device
+from benchmarks.commands.arguments import DONE, Count, CountIfAny, File, Names, Natural, Trust
+from benchmarks.commands.devices import CPU, DeviceName, chosen_device
 
 Stretch = Annotated[str | None, arg(metavar="A:B")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlayVerb:
+class PlayCommand:
     """Play a run's avatars in the browser, beside the truth."""
 
     run: Positional[Path]  # a run's folder or a cell's
@@ -63,7 +63,7 @@ class PlayVerb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VideoVerb:
+class VideoCommand:
     """Film a run's avatars: a motion from a camera, a spiral or a rig, beside the truth."""
 
     run: Positional[Path]  # a run's folder or a cell's
@@ -104,7 +104,7 @@ class VideoVerb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportAvatarVerb:
+class ExportAvatarCommand:
     """Write an avatar's Gaussians, mesh or skeleton for other programs."""
 
     cell: Positional[Path]  # a cell's folder, or a run's with one avatar
@@ -143,7 +143,7 @@ class ExportAvatarVerb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShareVerb:
+class ShareCommand:
     """Write one page that plays a clip of an avatar without a server."""
 
     cell: Positional[Path]  # a cell's folder, or a run's with one avatar

@@ -1,4 +1,4 @@
-"""Verbs of the gate."""
+"""Commands of the gate."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from tyro.conf import FlagCreatePairsOff
 
 from ash.files import InputError
-from benchmarks.verbs.arguments import DONE, FAILED, Count, File, Folder
-from benchmarks.verbs.runs import run_and_report
+from benchmarks.commands.arguments import DONE, FAILED, Count, File, Folder
+from benchmarks.commands.runs import run_and_report
 
 if TYPE_CHECKING:
     from benchmarks.gate.gate import Baseline
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GateVerb:
+class GateCommand:
     """Compare a run with a committed baseline; exit code 1 where it is worse."""
 
     baseline: File = Path("reports/baseline.json")  # what the run is compared with

@@ -1,0 +1,6 @@
+"""Old names that still work for one release: commands, and what each is called now."""
+
+OLD_COMMANDS: dict[str, tuple[str, ...]] = {  # old command -> what is typed in its place; arguments follow unchanged
+    "merge": ("report",),
+    "rescore": ("eval", "--scores-only"),
+}
