@@ -57,7 +57,6 @@ COMMANDS = {
     "export-avatar": "avatars:ExportAvatarCommand",
     "share": "avatars:ShareCommand",
     "gate": "gate:GateCommand",
-    "gate-rates": "gate:GateRatesCommand",
     "speed": "checkout:SpeedCommand",
     "doctor": "checkout:DoctorCommand",
     "docs": "checkout:DocsCommand",
