@@ -49,7 +49,6 @@ COMMANDS = {
     "motions": "captures:MotionsCommand",
     "sheets": "captures:SheetsCommand",
     "check-method": "methods:CheckMethodCommand",
-    "search": "methods:SearchCommand",
     "retarget": "methods:RetargetCommand",
     "display": "methods:DisplayCommand",
     "play": "avatars:PlayCommand",

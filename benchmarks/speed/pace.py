@@ -54,9 +54,7 @@ def steps_per_second(preset: PacedPreset, device: torch.device, *, seconds: floa
     with tempfile.TemporaryDirectory() as folder:
         capture = stand_in(Path(folder), preset.width, preset.height)
         skinned = TemplateConfig(kind="skinned")
-        avatar = AshAvatar(
-            replace(config, template=skinned, training=training, search=False, device=str(device)), capture
-        )
+        avatar = AshAvatar(replace(config, template=skinned, training=training, device=str(device)), capture)
         images = load_training_images(capture, avatar.device)
         run = ash.training.loop._Run(avatar, training, replace(images, reserved=()), Path(folder) / "run")
         start, first = time.perf_counter(), 0

@@ -45,7 +45,7 @@ def test_warps_launches_are_counted_beside_torchs() -> None:
 
 
 # Counted: 517, 431 and 592. What the splatter launches, about 30 for both passes, comes on top.
-MOST = {"cpu": 560, "frugal": 470, "paper": 640}
+MOST = {"cpu": 560, "paper": 640}
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def counted_on_meta(tmp_path_factory, monkeypatch: pytest.MonkeyPatch) -> Callab
     tube = write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
 
     def count(preset: str, *, frames: int = 1) -> int:
-        config = replace(named(preset), template=TemplateConfig(kind="skinned"), search=False)
+        config = replace(named(preset), template=TemplateConfig(kind="skinned"))
         avatar, images = AshAvatar(config, tube), load_training_images(tube, META)
         batches = [draw_batch(images, config.training, 0, index) for index in range(frames)]
         optimiser = Adam(avatar.parameter_groups(), eps=1e-15)
