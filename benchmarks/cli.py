@@ -29,6 +29,7 @@ _set_threads()  # Read as NumPy, torch and FLIP are loaded, the first of them by
 
 from ash.fields import nearest
 from ash.files import InputError, disk_problem
+from benchmarks.aliases import current_command
 from benchmarks.cell.children import METHOD_PATH, add_method_paths
 from benchmarks.verbs.arguments import DONE, INTERRUPTED, WRONG_INPUT, Verb, completion, own_name, read_verb
 
@@ -45,7 +46,6 @@ VERBS = {
     "rescore": "runs:RescoreVerb",
     "merge": "runs:MergeVerb",
     "verify": "captures:VerifyVerb",
-    "export": "captures:ExportVerb",
     "undistort": "captures:UndistortVerb",
     "motions": "captures:MotionsVerb",
     "sheets": "captures:SheetsVerb",
@@ -54,9 +54,7 @@ VERBS = {
     "retarget": "methods:RetargetVerb",
     "display": "methods:DisplayVerb",
     "play": "avatars:PlayVerb",
-    "video": "avatars:VideoVerb",
-    "export-avatar": "avatars:ExportAvatarVerb",
-    "share": "avatars:ShareVerb",
+    "export": "avatars:ExportVerb",
     "gate": "gate:GateVerb",
     "gate-rates": "gate:GateRatesVerb",
     "speed": "checkout:SpeedVerb",
@@ -73,7 +71,7 @@ def main(argv: list[str] | None = None) -> int:
     _open_closed_streams()
     try:
         with _terminate_as_interrupt():
-            verb = _parse(_take_method_paths(sys.argv[1:] if argv is None else argv))
+            verb = _parse(current_command(_take_method_paths(sys.argv[1:] if argv is None else argv)))
             return DONE if verb is None else verb()
     except InputError as error:
         return _refuse(str(error))

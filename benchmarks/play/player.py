@@ -31,6 +31,8 @@ class PlayServer:
 
     def __init__(self, cast: Cast, motions: Sequence[str], doors: DoorOptions) -> None:
         self.cast, self.acts = cast, acts_of(cast.capture, motions)
+        names = [act.name for act in self.acts]  # The first of `motions` opens, else motion that is not training's.
+        self.first_act = names.index(motions[0]) if motions else min(1, len(self.acts) - 1)
         self.shelf = TruthShelf(cast.capture)
         self.painter = Painter(cast, self.acts, self.shelf)
         self.studio = TruthStudio(cast.capture.folder)
@@ -59,7 +61,7 @@ class PlayServer:
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
 
     def _arrive(self, client: viser.ClientHandle) -> None:
-        state = ViewState(left=self.cast.titles[0], act=min(1, len(self.acts) - 1))
+        state = ViewState(left=self.cast.titles[0], act=self.first_act)
         viewer = Viewer(client, self.acts, state, self.stream.wake)
         page = Page(viewer, self.painter, self._render_truth)
         with self._lock:

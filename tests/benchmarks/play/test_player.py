@@ -12,9 +12,11 @@ import numpy as np
 import psutil
 import pytest
 from helpers.browser import FLAGS, find_chromium
+from helpers.figures import tube_motion, tube_skeleton
 from helpers.viewers import PATIENCE, FakeBrowser, browsers, state_of
 from helpers.waiting import wait_for
 
+from benchmarks.export.bvh import bvh_bytes
 from benchmarks.play.doors import DoorOptions
 from benchmarks.play.player import PlayServer, playing
 
@@ -157,6 +159,17 @@ def test_browsers_that_are_killed_leave_nothing_behind(player: PlayServer, tmp_p
 
 def thread_names() -> list[str]:
     return sorted(thread.name for thread in threading.enumerate() if "ThreadPool" not in thread.name)
+
+
+@pytest.mark.parametrize("name", ["train", "wave.bvh"])
+def test_it_opens_on_the_motion_that_was_asked_for(tube_run: Path, tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(bvh_bytes(tube_skeleton(), tube_motion(6)))
+    asked = name if name == "train" else str(path)
+    with playing(tube_run, motions=(asked,)) as player, browsers(player.url, 1, width=64, height=64) as (browser,):
+        act = player.acts[state_of(player).act]
+        assert (act.name, len(act)) == (asked, 4 if name == "train" else 6)
+        browser.wait_for(lambda: f"{act.title}, frame" in browser.words, PATIENCE)
 
 
 def test_all_threads_end_with_the_player(tube_run: Path) -> None:
