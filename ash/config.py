@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from ash.files import InputError
 
+MAX_WINDOW = 16  # frames of motion history that a template may depend on
+
 
 def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
     """Refuse a value that is not among those that exist."""
@@ -201,6 +203,8 @@ class TemplateConfig:
             raise InputError(f"template error_static, error_lag: expected 0 to 1 and above -1 and below 1, got {given}")
         if min(self.nodes, self.window, self.passes, self.width, self.blocks, self.steps) < 1:
             raise InputError("template: nodes, window, passes, width, blocks and steps must be at least 1")
+        if self.window > MAX_WINDOW:
+            raise InputError(f"template window: expected 1 to {MAX_WINDOW} frames, got {self.window}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

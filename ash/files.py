@@ -24,6 +24,8 @@ from PIL import Image
 LIMITS = {
     "json bytes": 1 << 30,  # the manifest of a million images has 200 MB
     "npz bytes": 4 << 30,  # all arrays that are asked for, unpacked: the truth of 25,000 frames has 3.3 GB
+    "motion bytes": 128 << 20,  # of motion.npz, unpacked: 25,000 frames of 100 joints have 60 MB
+    "mesh bytes": 1 << 30,  # of template.npz, unpacked: 100,000 vertices and 100 joints have 90 MB
     "npz entries": 1 << 16,
     "npy header bytes": 1 << 16,
     "npy dimensions": 8,

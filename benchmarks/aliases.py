@@ -1,33 +1,11 @@
-"""Old names that users may have typed, accepted for one release: each with what takes its place."""
+"""Old names that still work for one release: commands and formats, and what each is called now."""
 
-import sys
-from collections.abc import Callable, Sequence
-
-# An old command: the arguments that replace it, or a function from the old arguments to the new command line.
-Replacement = list[str] | Callable[[list[str]], list[str]]
-
-
-def _export_avatar(arguments: list[str]) -> list[str]:
-    """`glb` was the format of meshes, which is now `gltf`."""
-    return [
-        "export",
-        *("gltf" if each == "glb" else each.replace("--format=glb", "--format=gltf") for each in arguments),
-    ]
-
-
-COMMANDS: dict[str, Replacement] = {
-    "video": ["export", "--format", "mp4"],
-    "share": ["export", "--format", "html"],
-    "export-avatar": _export_avatar,
+OLD_COMMANDS: dict[str, tuple[str, ...]] = {  # old command -> what is typed in its place; arguments follow unchanged
+    "merge": ("report",),
+    "rescore": ("eval", "--scores-only"),
+    "export-avatar": ("export",),
+    "share": ("export", "--format", "html"),
+    "video": ("export", "--format", "mp4"),
 }
 
-
-def current_command(tokens: Sequence[str]) -> list[str]:
-    """The command line with an old command replaced, and a line on stderr that says what to type instead."""
-    replacement = COMMANDS.get(tokens[0]) if tokens else None
-    if replacement is None:
-        return list(tokens)
-    rest = list(tokens[1:])
-    command = replacement(rest) if callable(replacement) else [*replacement, *rest]
-    print(f"{tokens[0]}: old name; use {' '.join(command)}", file=sys.stderr)
-    return command
+OLD_FORMATS = {"glb": "gltf"}  # of `export`, for avatars

@@ -1,4 +1,4 @@
-"""The one door: `ash-bench VERB`. A verb's module is imported when it is asked for, and what is heavy when it works."""
+"""The command line: `ash-bench COMMAND`. A command's module is imported on demand, heavy packages when it runs."""
 
 import contextlib
 import multiprocessing
@@ -29,50 +29,47 @@ _set_threads()  # Read as NumPy, torch and FLIP are loaded, the first of them by
 
 from ash.fields import nearest
 from ash.files import InputError, disk_problem
-from benchmarks.aliases import current_command
+from benchmarks.aliases import OLD_COMMANDS
 from benchmarks.cell.children import METHOD_PATH, add_method_paths
-from benchmarks.verbs.arguments import DONE, INTERRUPTED, WRONG_INPUT, Verb, completion, own_name, read_verb
+from benchmarks.commands.arguments import DONE, INTERRUPTED, WRONG_INPUT, Command, completion, own_name, read_command
 
 METHOD_PATH_FLAG = "--method-path"
 
-VERBS = {
-    "run": "runs:RunVerb",
-    "suites": "checkout:SuitesVerb",
-    "synth": "captures:SynthVerb",
-    "train": "runs:TrainVerb",
-    "report": "runs:ReportVerb",
-    "compare": "runs:CompareVerb",
-    "eval": "runs:EvalVerb",
-    "rescore": "runs:RescoreVerb",
-    "merge": "runs:MergeVerb",
-    "verify": "captures:VerifyVerb",
-    "undistort": "captures:UndistortVerb",
-    "motions": "captures:MotionsVerb",
-    "sheets": "captures:SheetsVerb",
-    "check-method": "methods:CheckMethodVerb",
-    "search": "methods:SearchVerb",
-    "retarget": "methods:RetargetVerb",
-    "display": "methods:DisplayVerb",
-    "play": "avatars:PlayVerb",
-    "export": "avatars:ExportVerb",
-    "gate": "gate:GateVerb",
-    "gate-rates": "gate:GateRatesVerb",
-    "speed": "checkout:SpeedVerb",
-    "doctor": "checkout:DoctorVerb",
-    "docs": "checkout:DocsVerb",
-    "test": "checkout:TestVerb",
+COMMANDS = {
+    "run": "runs:RunCommand",
+    "suites": "checkout:SuitesCommand",
+    "synth": "captures:SynthCommand",
+    "train": "runs:TrainCommand",
+    "report": "runs:ReportCommand",
+    "compare": "runs:CompareCommand",
+    "eval": "runs:EvalCommand",
+    "verify": "captures:VerifyCommand",
+    "undistort": "captures:UndistortCommand",
+    "motions": "captures:MotionsCommand",
+    "sheets": "captures:SheetsCommand",
+    "check-method": "methods:CheckMethodCommand",
+    "search": "methods:SearchCommand",
+    "retarget": "methods:RetargetCommand",
+    "display": "methods:DisplayCommand",
+    "play": "avatars:PlayCommand",
+    "export": "avatars:ExportCommand",
+    "gate": "gate:GateCommand",
+    "speed": "checkout:SpeedCommand",
+    "doctor": "checkout:DoctorCommand",
+    "docs": "checkout:DocsCommand",
+    "test": "checkout:TestCommand",
 }
 
 HELP = Path(__file__).with_name("help.txt")  # Also printed by the launcher, which then needs no set-up.
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a verb and return the exit code."""
+    """Run a command and return the exit code."""
     _open_closed_streams()
     try:
         with _terminate_as_interrupt():
-            verb = _parse(current_command(_take_method_paths(sys.argv[1:] if argv is None else argv)))
-            return DONE if verb is None else verb()
+            command = _parse(_take_method_paths(sys.argv[1:] if argv is None else argv))
+            return DONE if command is None else command()
     except InputError as error:
         return _refuse(str(error))
     except BrokenPipeError:  # Whoever read our output has seen enough (`| head`).
@@ -130,11 +127,15 @@ def _semaphore_problem(error: OSError) -> str | None:
     return None
 
 
-def _parse(tokens: Sequence[str]) -> Verb | None:
-    """The verb that is asked for; None where it was help, which is printed."""
+def _parse(tokens: Sequence[str]) -> Command | None:
+    """The command that is asked for; None where it was help, which is printed."""
     if not tokens:
-        raise InputError(f"expected a verb, see {own_name()} --help")
+        raise InputError(f"expected a command, see {own_name()} --help")
     first = tokens[0]
+    if first in OLD_COMMANDS:
+        print(f"ash-bench: {first} is now: {' '.join(OLD_COMMANDS[first])}", file=sys.stderr)
+        tokens = (*OLD_COMMANDS[first], *tokens[1:])
+        first = tokens[0]
     if first in ("-h", "--help"):
         print(HELP.read_text().replace("{name}", own_name()), end="")
         return None
@@ -142,15 +143,15 @@ def _parse(tokens: Sequence[str]) -> Verb | None:
         print(f"ash-bench {version('ash-bench')}")
         return None
     if first.startswith("--tyro-"):
-        completion({name: _verb(name) for name in VERBS}, tokens)
-    if first not in VERBS:
-        raise InputError(f"unknown verb {first!r}, {nearest(first, tuple(VERBS))}")
-    return read_verb(_verb(first), first, tokens[1:])
+        completion({name: _command(name) for name in COMMANDS}, tokens)
+    if first not in COMMANDS:
+        raise InputError(f"unknown command {first!r}, {nearest(first, tuple(COMMANDS))}")
+    return read_command(_command(first), first, tokens[1:])
 
 
-def _verb(name: str) -> type[Any]:
-    module, _, verb = VERBS[name].partition(":")
-    found: type[Any] = getattr(import_module(f"benchmarks.verbs.{module}"), verb)
+def _command(name: str) -> type[Any]:
+    module, _, command = COMMANDS[name].partition(":")
+    found: type[Any] = getattr(import_module(f"benchmarks.commands.{module}"), command)
     return found
 
 

@@ -74,12 +74,28 @@ def versions() -> dict[str, str]:
 def cores() -> int:
     """Cores that this process may use: those that it may run on, and as much of them as its cgroup allows."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, math.floor(min(count, cpu_quota(Path("/sys/fs/cgroup")))))
+    return max(1, math.floor(min(count, cpu_quota())))
 
 
-def cpu_quota(cgroup: Path) -> float:
-    """Cores that a container's limit allows, from the files of cgroup v2 or v1; infinite where there is no limit."""
-    for names in (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")):
+def cpu_quota(mount: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> float:
+    """Cores that the limits of this process's cgroup and of those around it allow; infinite where there is no limit.
+
+    `own` names the cgroup: `0::/PATH` in version 2, `N:cpu,cpuacct:/PATH` in version 1.
+    """
+    try:
+        lines = [line.split(":", 2) for line in own.read_text().splitlines()]
+    except OSError:
+        lines = []
+    paths = {line[2].strip("/") for line in lines if len(line) == 3 and line[1] in ("", "cpu", "cpu,cpuacct")}
+    roots = {mount, mount / "cpu"}
+    groups = {
+        root.joinpath(*Path(path).parts[:depth]) for root in roots for path in paths | {""} for depth in range(32)
+    }
+    return min(_quota_of(group) for group in groups)
+
+
+def _quota_of(cgroup: Path) -> float:
+    for names in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):
         try:
             quota, period = " ".join((cgroup / name).read_text() for name in names).split()
             return int(quota) / int(period) if int(quota) > 0 else math.inf

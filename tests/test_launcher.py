@@ -203,7 +203,7 @@ def test_old_python_is_refused(project: Path, environment: dict[str, str], tmp_p
     assert done.stderr == "ash-bench: Python 3.11 or newer is needed, and Python 3.9.2 was found\n"
 
 
-def test_the_verb_test_wants_a_browser_and_goes_on_without(
+def test_the_command_test_wants_a_browser_and_goes_on_without(
     project: Path, environment: dict[str, str], tmp_path: Path
 ) -> None:
     for program in [*Path("/usr/bin").iterdir(), *Path("/bin").iterdir()]:
@@ -310,12 +310,14 @@ def test_help_and_version_need_no_set_up(tmp_path: Path, environment: dict[str, 
     (tmp_path / "benchmarks").mkdir()
     shutil.copy(ROOT / "benchmarks" / "help.txt", tmp_path / "benchmarks")
     for flag, expected in (
-        ("--help", "usage: ./ash-bench VERB"),
+        ("--help", "usage: ./ash-bench COMMAND"),
         ("-h", "exit codes: 0 done"),
         ("--version", "ash-bench 0."),
     ):
         done = launch(tmp_path, flag, env=environment)
         assert (done.returncode, done.stderr) == (0, "") and expected in done.stdout
+    done = launch(tmp_path, env=environment)
+    assert done.returncode == 2 and "expected a command" in done.stderr
     assert not (tmp_path / ".venv").exists()
 
 

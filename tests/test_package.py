@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.cli import VERBS
+from benchmarks.cli import COMMANDS
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("ash", "synth", "baselines", "benchmarks")
@@ -184,15 +184,15 @@ def test_torchvision_is_never_imported() -> None:
 
 
 @pytest.mark.parametrize("document", ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "docs/plugin.md"])
-def test_documents_name_files_and_verbs_that_exist(document: str) -> None:
+def test_documents_name_files_and_commands_that_exist(document: str) -> None:
     text = (ROOT / document).read_text()
     named = set(re.findall(r"\b(?:ash|synth|baselines|benchmarks|tests|docs|reports)/[\w/.-]*[\w/]", text))
     assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
     linked = re.findall(r"\]\((?!https?:)([^)#]+)\)", text)
     assert [name for name in linked if not ((ROOT / document).parent / name).exists()] == []
-    verbs = set(re.findall(r"\./ash-bench ([a-z][a-z-]*)", text))
-    known = set(VERBS)
-    assert verbs <= known
+    commands = set(re.findall(r"\./ash-bench ([a-z][a-z-]*)", text))
+    known = set(COMMANDS)
+    assert commands <= known
 
 
 def test_contracts_allow_only_what_they_name() -> None:

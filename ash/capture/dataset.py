@@ -203,19 +203,32 @@ def require_pose(pose: Pose, skeleton: Skeleton) -> None:
 def fewer_views(capture: Capture, *, cameras: float = 1.0, frames: float = 1.0) -> Capture:
     """The capture with shares (0..1] of its training cameras and frames, at least one; other splits keep theirs.
 
-    Cameras are spread evenly: they are added one by one, each the farthest from those chosen so far, so that a smaller
-    share is a part of a larger. Frames are the first ones; where a part of the cameras saw each frame, frames that none
-    of those left saw are left out.
+    Cameras are chosen by `spread_cameras`. Frames are the first ones; where only some of the cameras recorded each
+    frame, frames that none of the chosen cameras recorded are left out.
     """
     train = capture.splits["train"]
-    positions = np.stack([capture.cameras[name].position for name in train.cameras])
-    chosen = [0]
-    for _ in range(max(1, round(cameras * len(positions))) - 1):
-        distance = np.linalg.norm(positions[:, None] - positions[chosen], axis=-1).min(1)
-        chosen.append(int(distance.argmax()))
-    names = tuple(train.cameras[index] for index in sorted(chosen))
+    names = spread_cameras(capture, max(1, round(cameras * len(train.cameras))))
     first = train.frames[: max(1, round(frames * len(train.frames)))]
     return replace(capture, splits=capture.splits | {"train": train.only(cameras=names, frames=first)})
+
+
+def spread_cameras(capture: Capture, count: int) -> tuple[str, ...]:
+    """`count` training cameras spread evenly, in the split's order.
+
+    Farthest-point sampling of their positions from the first camera on, so that a smaller choice is part of a larger.
+
+    Raises:
+        InputError: the capture has fewer training cameras.
+    """
+    names = capture.splits["train"].cameras
+    if not 1 <= count <= len(names):
+        raise InputError(f"{capture.folder}: expected 1 to {len(names)} training cameras, got {count}")
+    positions = np.stack([capture.cameras[name].position for name in names])
+    chosen = [0]
+    for _ in range(count - 1):
+        distance = np.linalg.norm(positions[:, None] - positions[chosen], axis=-1).min(1)
+        chosen.append(int(distance.argmax()))
+    return tuple(names[index] for index in sorted(chosen))
 
 
 def image_path(folder: Path, camera: str, frame: int) -> Path:

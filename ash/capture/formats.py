@@ -7,7 +7,7 @@ import numpy as np
 
 from ash.capture.dataset import Camera, Capture, Motion, Skeleton, TemplateMesh, scan_path, surface_path
 from ash.capture.manifest import NAME, read_manifest
-from ash.files import InputError, read_arrays, read_json, require_plain, write_arrays, write_json
+from ash.files import LIMITS, InputError, read_arrays, read_json, require_plain, write_arrays, write_json
 
 LARGEST = 1e9  # of a number in a camera or a skeleton: metres, pixels
 
@@ -115,7 +115,8 @@ def write_template(path: Path, template: TemplateMesh) -> None:
 
 def read_template(path: Path, *, joints: int) -> TemplateMesh:
     """Read and check `template.npz` against a skeleton of `joints` joints."""
-    arrays = read_arrays(path, expected=("vertices", "faces", "uvs", "uv_faces", "skin_weights"))
+    names = ("vertices", "faces", "uvs", "uv_faces", "skin_weights")
+    arrays = read_arrays(path, expected=names, most=LIMITS["mesh bytes"])
     template = TemplateMesh(**{name: _widest(array) for name, array in arrays.items()})
     vertices, faces, weights = template.vertices, template.faces, template.skin_weights
     checks = {
@@ -146,7 +147,8 @@ def write_motion(path: Path, motion: Motion) -> None:
 
 def read_motion(path: Path, *, joints: int) -> Motion:
     """Read and check `motion.npz` against a skeleton of `joints` joints."""
-    arrays = {name: _widest(array) for name, array in read_arrays(path, expected=("dofs", "sequence", "fps")).items()}
+    stored = read_arrays(path, expected=("dofs", "sequence", "fps"), most=LIMITS["motion bytes"])
+    arrays = {name: _widest(array) for name, array in stored.items()}
     dofs, sequence = arrays["dofs"], arrays["sequence"]
     checks = {
         f"dofs [t, {3 + 3 * joints}]": dofs.ndim == 2 and dofs.shape[1] == 3 + 3 * joints and len(dofs) > 0,

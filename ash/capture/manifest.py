@@ -153,14 +153,16 @@ def hash_files(folder: Path) -> dict[str, str]:
 
 def verify_capture(folder: Path) -> list[str]:
     """Hash every file of a capture again. Returns one line per file that is missing, altered or not in the manifest."""
-    manifest = read_manifest(folder)
+    manifest, root = read_manifest(folder), folder.resolve()
     problems = []
     for name, expected in sorted(manifest.files.items()):
         path = folder / name
-        if not path.resolve().is_relative_to(folder.resolve()):
+        if ".." in name.split("/"):
             problems.append(f"{name}: outside the capture")
         elif not path.is_file():
             problems.append(f"{name}: missing")
+        elif not path.resolve().is_relative_to(root):
+            problems.append(f"{name}: outside the capture")
         elif sha256_of(path) != expected:
             problems.append(f"{name}: altered (SHA-256 differs from the manifest)")
     return problems + [f"{name}: not in the manifest" for name in files_below(folder) if name not in manifest.files]

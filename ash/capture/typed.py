@@ -28,6 +28,8 @@ def _convert(kind: Any, value: Any, place: str) -> Any:
         return _tuple(inner, value, place)
     if origin is dict:
         _require(isinstance(value, dict), value, "an object", place)
+        if inner[1] is str and all(type(each) is str for each in value.values()):  # A manifest's million hashes.
+            return dict(value)
         return {str(key): _convert(inner[1], each, _below(place, str(key))) for key, each in value.items()}
     if kind is Any:
         return value

@@ -12,6 +12,7 @@ from torch import Tensor
 
 import ash.native.skinning
 from ash.capture.dataset import Capture, Motion, Pose, Skeleton, TemplateMesh, require_pose
+from ash.config import MAX_WINDOW
 from ash.devices import moved
 from ash.files import InputError
 from ash.rotations import RigidTransforms
@@ -176,7 +177,7 @@ class Template:
     def pose(self, pose: Pose) -> PosedTemplate:
         """The template in one frame of a motion."""
         require_pose(pose, self.skeleton)
-        window = pose.window(5)
+        window = pose.window(MAX_WINDOW)
         key = (pose.motion.dofs[window].tobytes(), np.int64(pose.frame).tobytes())
         if key not in self._kept:
             with torch.no_grad():

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.analysis.names import look_of
 from benchmarks.analysis.pareto import Contender
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Scores, foreground
 from benchmarks.analysis.statistics import Difference, compared, detectable, hierarchical_bootstrap, holm
+from benchmarks.analysis.style import style_of
 from benchmarks.cell.methods import is_oracle
 
 COUNTS = (1, 2, 4, 8, 16)  # of captures, for which reports say what they would show
@@ -26,14 +26,14 @@ class Contrast:
     bootstrap: tuple[float, float]
 
     @property
-    def established(self) -> bool:
+    def significant(self) -> bool:
         """Whether chance is excluded at 5 % among all contrasts of the scene."""
         return self.p_adjusted < 0.05
 
     @property
     def title(self) -> str:
         """The other method, for readers."""
-        return look_of(self.method).title
+        return style_of(self.method).title
 
 
 def difference(scores: Scores, scene: str, ours: str, theirs: str, split: str) -> Difference | None:
@@ -74,7 +74,7 @@ def differences(
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Sight:
+class DetectableEffect:
     """The smallest true difference, dB, that so many captures in pairs show: of the middle row, and of the worst."""
 
     captures: int
@@ -82,13 +82,13 @@ class Sight:
     worst: float
 
 
-def sights(found: Sequence[Contrast], split: str) -> tuple[Sight, ...]:
+def detectable_effects(found: Sequence[Contrast], split: str) -> tuple[DetectableEffect, ...]:
     """What 1, 2, 4, 8 and 16 captures would show; of contrasts over a single capture nothing is known."""
     spreads = [contrast.test.spread for contrast in found if contrast.split == split and contrast.test.pairs]
     if not spreads:
         return ()
     return tuple(
-        Sight(
+        DetectableEffect(
             captures=captures,
             middle=detectable(float(np.median(spreads)), captures),
             worst=detectable(max(spreads), captures),

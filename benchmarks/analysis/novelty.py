@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 import pandas as pd
 
-from benchmarks.analysis.names import look_of
 from benchmarks.analysis.scores import HELD_OUT_SPLITS
 from benchmarks.analysis.statistics import intervals
+from benchmarks.analysis.style import style_of
 
 BINS, LEAST = 5, 3  # at most so many bins of motion, of so many frames or more
 NARROW_DEG = 1.0  # Motion that stays within it is none: a curve would be a point.
@@ -53,7 +53,7 @@ def sentences(table: pd.DataFrame) -> list[str]:
     for scene, here in table.groupby("scene", sort=False):
         ends = here.sort_values("novelty_deg").groupby("method", sort=False)
         losses = {str(method): own["psnr"].iloc[0] - own["psnr"].iloc[-1] for method, own in ends if len(own) > 1}
-        told = ", ".join(f"{look_of(m).title} {loss:.1f} dB" for m, loss in sorted(losses.items(), key=lambda p: p[1]))
+        told = ", ".join(f"{style_of(m).title} {loss:.1f} dB" for m, loss in sorted(losses.items(), key=lambda p: p[1]))
         first, last = here["novelty_deg"].min(), here["novelty_deg"].max()
         found.append(
             f"On {scene}, from poses {first:.0f} to poses {last:.0f} degrees from training's, PSNR falls by: {told}."

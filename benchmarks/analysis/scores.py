@@ -15,8 +15,8 @@ from typing import NamedTuple
 import pandas as pd
 
 from ash.files import InputError
-from benchmarks.analysis.names import is_ours
 from benchmarks.analysis.statistics import independent, mean_interval
+from benchmarks.analysis.style import is_ours
 from benchmarks.cell.cells import CellConfig, CellResult
 from benchmarks.cell.metrics import METRICS
 from benchmarks.suites.suites import capture_name

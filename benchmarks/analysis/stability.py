@@ -6,10 +6,10 @@ from math import isnan
 
 import pandas as pd
 
-from benchmarks.analysis.footage import AXIS as FOOTAGE
-from benchmarks.analysis.names import look_of
+from benchmarks.analysis.data_scaling import AXIS as FOOTAGE
 from benchmarks.analysis.scores import RANKED_SPLITS, Scores
 from benchmarks.analysis.statistics import Interval, independent, mean_interval, wilson
+from benchmarks.analysis.style import style_of
 from benchmarks.suites.stress import AXES
 
 TRIVIAL = "nearest"  # the training image of the nearest pose and camera: below half the way to it, a method is broken
@@ -36,7 +36,7 @@ class Course:
     @property
     def title(self) -> str:
         """The method, for readers."""
-        return look_of(self.method).title
+        return style_of(self.method).title
 
     @property
     def breakdown(self) -> float | None:
@@ -85,7 +85,7 @@ class Reliability:
     @property
     def title(self) -> str:
         """The method, for readers."""
-        return look_of(self.method).title
+        return style_of(self.method).title
 
 
 def curves(scores: Scores) -> tuple[Curve, ...]:

@@ -20,9 +20,10 @@ from typing import Any, Literal
 import numpy as np
 
 from ash.capture.dataset import Capture
+from ash.capture.manifest import NAME as MANIFEST
 from ash.capture.typed import from_json
 from ash.fields import nearest
-from ash.files import InputError, hash_of, read_image, read_json, require_plain, write_json
+from ash.files import InputError, hash_of, read_image, read_json, require_plain, sha256_of, write_json
 from ash.protocol import TrainingOutcome
 from benchmarks.cell.metrics import IMAGE_SPLITS, METRICS, PROTOCOL, VIEW_SCORES
 from benchmarks.cell.views import View
@@ -216,9 +217,24 @@ def read_cell(folder: Path) -> Cell:
         _require_names(config)
         if config.key != content["key"]:
             raise ValueError("its key does not fit its content")
-        return Cell(config=config, folder=folder, capture_folder=Path(content["capture_folder"]))
+        capture_folder = _find_capture(Path(content["capture_folder"]), folder, identity=config.capture)
+        return Cell(config=config, folder=folder, capture_folder=capture_folder)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: expected the config of a cell ({error})") from error
+
+
+def _find_capture(recorded: Path, cell_folder: Path, *, identity: str) -> Path:
+    """The capture's folder: the recorded one, or where a run was copied or moved, one of the same name and content.
+
+    That is searched in `data/` and beside it, of the current folder and of those around the cell.
+    """
+    if (recorded / MANIFEST).exists():
+        return recorded
+    for parent in (Path(), *cell_folder.resolve().parents[:5]):
+        for place in (parent / "data" / recorded.name, parent / recorded.name):
+            if (place / MANIFEST).is_file() and sha256_of(place / MANIFEST) == identity:
+                return place
+    return recorded
 
 
 def _require_names(config: CellConfig) -> None:

@@ -26,7 +26,7 @@ from benchmarks.report import escaping
 Verdict = Literal["pass", "fail", "unexplained improvement", "not judged"]
 Kind = Literal["presence", "quality", "time", "memory", "work"]
 FINE = ("pass", "not judged")
-Pair = tuple[str, str]  # a scene and a method
+Row = tuple[str, str]  # scene and method
 
 GATED = (  # (split, region, metric): few, so that the correction for many comparisons leaves power
     ("train_view", "foreground", "psnr"),  # varies least between seeds: what a defect costs shows there first
@@ -179,20 +179,20 @@ def judge(baseline: Baseline, head: Baseline) -> list[Check]:
     return checks
 
 
-def settle(
+def judge_with_retries(
     baseline: Baseline,
     suite: str,
     results: Sequence[CellResult],
-    again: Callable[[Collection[Pair], int], Sequence[CellResult]],
+    remeasured: Callable[[Collection[Row], int], Sequence[CellResult]],
 ) -> tuple[Baseline, list[Check]]:
     """What a run came to and the verdict on it, after the times that fail were measured up to `TIMED_AGAIN` times more.
 
-    `again`: results of another cell for each of some methods on their scenes; its second argument counts the calls.
+    `remeasured`: results of another cell for each of some rows; its second argument counts the calls.
     """
     timed: list[CellResult] = []
-    slow: set[Pair] = set()
+    slow: set[Row] = set()
     for attempt in range(TIMED_AGAIN + 1):
-        timed += again(slow, attempt - 1) if attempt else ()
+        timed += remeasured(slow, attempt - 1) if attempt else ()
         head = summarise(suite, results, timed)
         checks = judge(baseline, head)
         slow = {(check.scene, check.method) for check in checks if (check.kind, check.verdict) == ("time", "fail")}
@@ -234,8 +234,8 @@ def junit(checks: Sequence[Check]) -> str:
     return "\n".join([*lines, "</testsuite>", ""])
 
 
-def _of(pair: Pair, results: Sequence[CellResult]) -> list[CellResult]:
-    return [result for result in results if (result.config.place, result.config.method) == pair]
+def _of(row: Row, results: Sequence[CellResult]) -> list[CellResult]:
+    return [result for result in results if (result.config.place, result.config.method) == row]
 
 
 def _entry(results: Sequence[CellResult], timed: Sequence[CellResult]) -> BaselineEntry:
@@ -293,7 +293,7 @@ def _quality_checks(compared: Sequence[tuple[BaselineEntry, BaselineEntry]]) -> 
                 else:
                     checks.append(_single(base, name, before, after))
     adjusted = holm([test.p for _, _, test, _, _ in tests])
-    return checks + [_established(*test, p=p) for test, p in zip(tests, adjusted, strict=True)]
+    return checks + [_quality_check(*test, p=p) for test, p in zip(tests, adjusted, strict=True)]
 
 
 def _check(
@@ -317,7 +317,7 @@ def _means(name: str, before: Sequence[float], after: Sequence[float]) -> str:
     return f"{sum(before) / len(before):.4g} -> {sum(after) / len(after):.4g}{unit and ' ' + unit}"
 
 
-def _established(
+def _quality_check(
     entry: BaselineEntry, name: str, test: Difference, before: Sequence[float], after: Sequence[float], *, p: float
 ) -> Check:
     margin = METRICS[name.split("/")[-1]].abs_tol

@@ -20,7 +20,7 @@ from ash.gaussians.splatting import Splatted, splat
 from ash.inference import Player
 from ash.model import image_of, mixed, views_of
 from ash.protocol import Avatar, PosedGeometry, PosesGaussians, StageClock
-from benchmarks.analysis.names import look_of
+from benchmarks.analysis.style import style_of
 from benchmarks.cell.cells import CHECKPOINT, Cell, is_trained, read_cell
 from benchmarks.cell.methods import is_oracle
 from benchmarks.cell.process import load_avatar
@@ -211,8 +211,8 @@ def _cells_in(folder: Path) -> Sequence[Cell]:
 
 def _titles(cells: Sequence[Cell]) -> list[str]:
     """Short and different names: the method, and its changes, preset and seed where several have the same."""
-    plain = [look_of(cell.config.method.partition("+")[0]).title for cell in cells]
-    short = [look_of(cell.config.method).title for cell in cells]
+    plain = [style_of(cell.config.method.partition("+")[0]).title for cell in cells]
+    short = [style_of(cell.config.method).title for cell in cells]
     middle = [f"{name} · {cell.config.preset}" for name, cell in zip(short, cells, strict=True)]
     full = [f"{name} · seed {cell.config.seed}" for name, cell in zip(middle, cells, strict=True)]
     for names in (plain, short, middle, full):

@@ -14,9 +14,9 @@ from PIL import Image
 
 from ash.capture.formats import load_capture
 from ash.files import InputError, write_atomic
-from benchmarks.analysis.names import SPLIT_NAMES
 from benchmarks.analysis.scores import RANKED_SPLITS
 from benchmarks.analysis.statistics import Difference, compared
+from benchmarks.analysis.style import SPLIT_NAMES
 from benchmarks.cell.cells import Cell, CellResult, ViewScore, read_result, stored_prediction
 from benchmarks.cell.metrics import METRICS, on_black
 from benchmarks.cell.views import View

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import pandas as pd
 
 from benchmarks.analysis import contrasts, pareto
-from benchmarks.analysis.names import EXACT, SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Score, Scores, foreground
 from benchmarks.analysis.statistics import Difference, intervals
+from benchmarks.analysis.style import EXACT, SPLIT_NAMES, style_of
 from benchmarks.cell.methods import WRONG_BY_MM
 from benchmarks.report import charts, vega
 from benchmarks.report.vega import Figure, Series
@@ -129,7 +129,7 @@ def effects_figure(found: Sequence[tuple[str, str, Difference]], scene: str, *, 
     rows = [
         {
             "panel": SPLIT_NAMES[split].title,
-            "row": look_of(method).title,
+            "row": style_of(method).title,
             "mean": test.mean,
             "low": test.low if told else test.mean,
             "high": test.high if told else test.mean,
@@ -191,7 +191,7 @@ def stage_figure(scores: Scores, scene: str) -> Figure | None:
             continue
         parts = {stage: score.mean if score else 0.0 for stage, score in found.items()}
         parts[""] = max(0.0, whole.mean - sum(parts.values()))
-        name = look_of(method).title
+        name = style_of(method).title
         rows += [{"row": name, "series": STAGES[stage].title, "value": value} for stage, value in parts.items()]
     if not rows:
         return None

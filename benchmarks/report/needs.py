@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pandas as pd
 
-from benchmarks.analysis import contrasts, necessity, pareto
-from benchmarks.analysis.names import SPLIT_NAMES, look_of
-from benchmarks.analysis.necessity import Dose, Matrix, Need
+from benchmarks.analysis import ablation_matrix, contrasts, pareto
+from benchmarks.analysis.ablation_matrix import AblationEffect, Dose, Matrix
 from benchmarks.analysis.scores import RANKED_SPLITS, Quantity, Scores
+from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell.metrics import METRICS
 from benchmarks.report import charts, tables, vega
 from benchmarks.report.content import Block, Bullets, Chart, Entry, Head, Mark, Row, Section, Table, Text
@@ -20,7 +20,8 @@ from benchmarks.report.vega import Figure
 LIMIT_DB = 2.0  # A loss of more has the deepest colour.
 NOTE = (
     "Foreground PSNR in dB that is lost when the column's row takes ASH's place, with its 95 % interval. Needed: a "
-    f"loss of more than {necessity.MARGIN_DB} dB that is sure at 5 %, corrected over all cells (Benjamini-Hochberg). "
+    f"loss of more than {ablation_matrix.MARGIN_DB} dB that is sure at 5 %, corrected over all cells "
+    "(Benjamini-Hochberg). "
     "Few people tell little about how far a loss spreads over people, so cells over several lend each other their "
     "variances (moderated t, Smyth 2004), the mesh's column apart. "
     "Harmful: as sure and as large a gain. Not needed: surely less is lost. One seed on one capture tells nothing."
@@ -41,13 +42,13 @@ def sections(scores: Scores, chosen_on: Scores | None = None) -> list[Section]:
 
 def _matrix_section(scores: Scores) -> list[Section]:
     """The matrix of each split, or in words that there is none, where losses without an interval are all there is."""
-    found = [matrix for split in RANKED_SPLITS if (matrix := necessity.matrix(scores, split))]
+    found = [matrix for split in RANKED_SPLITS if (matrix := ablation_matrix.matrix(scores, split))]
     blocks: list[Block] = []
     if told := [matrix for matrix in found if matrix.has_intervals]:
         for matrix in told:
             blocks += [Chart(figure=_picture(matrix)), *_surprises(matrix)]
         blocks += [*map(_table, told), Text(text=NOTE, note=True)]
-    elif any(need.loss for matrix in found for need in matrix.needs):
+    elif any(effect.loss for matrix in found for effect in matrix.effects):
         blocks.append(Text(text=UNTOLD))
     return [Section(title="What each scene needs", blocks=tuple(blocks))] if blocks else []
 
@@ -57,19 +58,19 @@ def _picture(matrix: Matrix) -> Figure:
     cells = pd.DataFrame(
         [
             {
-                "row": need.scene,
-                "column": need.part.title,
-                "value": None if need.loss is None else need.loss.mean,
-                "text": "n/a" if need.loss is None else f"{need.loss.mean:+z.2f}",
-                "interval": _interval(need),
-                "verdict": need.verdict,
-                "framed": need.expected,
+                "row": effect.scene,
+                "column": effect.part.title,
+                "value": None if effect.loss is None else effect.loss.mean,
+                "text": "n/a" if effect.loss is None else f"{effect.loss.mean:+z.2f}",
+                "interval": _interval(effect),
+                "verdict": effect.verdict,
+                "framed": effect.expected,
             }
-            for need in matrix.needs
+            for effect in matrix.effects
         ]
     )
     words = SPLIT_NAMES[matrix.split].words
-    framed = " Framed: expected to be needed." if any(need.expected for need in matrix.needs) else ""
+    framed = " Framed: expected to be needed." if any(effect.expected for effect in matrix.effects) else ""
     return Figure(
         name=f"needs_{matrix.split}",
         title=f"What each scene needs, {words}",
@@ -84,20 +85,20 @@ def _picture(matrix: Matrix) -> Figure:
     )
 
 
-def _interval(need: Need) -> str:
-    if need.loss is None or math.isnan(need.loss.low):
+def _interval(effect: AblationEffect) -> str:
+    if effect.loss is None or math.isnan(effect.loss.low):
         return ""
-    return f"{need.loss.low:z.1f} to {need.loss.high:z.1f}"
+    return f"{effect.loss.low:z.1f} to {effect.loss.high:z.1f}"
 
 
 def _surprises(matrix: Matrix) -> tuple[Block, ...]:
     """In words: what contradicts the expected diagonal, and how much of it was found."""
-    framed = [need for need in matrix.needs if need.expected]
-    if not any(need.loss for need in framed):
+    framed = [effect for effect in matrix.effects if effect.expected]
+    if not any(effect.loss for effect in framed):
         return ()
-    counts = Counter(need.verdict for need in framed if need.loss)
+    counts = Counter(effect.verdict for effect in framed if effect.loss)
     words = SPLIT_NAMES[matrix.split].words
-    surprises = tuple(need.surprise for need in matrix.needs if need.surprise)
+    surprises = tuple(effect.surprise for effect in matrix.effects if effect.surprise)
     told = f"On {words}, of {counts.total()} parts that were tried where they should be needed, {counts['needed']} are"
     told += f" needed, {counts['not needed'] + counts['harmful']} are not,"
     told += f" and of {counts['unclear'] + counts['unknown']} it cannot be told from so few people or seeds."
@@ -106,7 +107,7 @@ def _surprises(matrix: Matrix) -> tuple[Block, ...]:
 
 
 def _table(matrix: Matrix) -> Table:
-    by_place = {(need.scene, need.part.row): need for need in matrix.needs}
+    by_place = {(effect.scene, effect.part.row): effect for effect in matrix.effects}
     rows = tuple(
         Row(name=scene, entries=tuple(_entry(by_place[scene, part.row]) for part in matrix.parts))
         for scene in matrix.scenes
@@ -115,18 +116,20 @@ def _table(matrix: Matrix) -> Table:
     return Table(title=SPLIT_NAMES[matrix.split].title, corner="scene", columns=columns, rows=rows)
 
 
-def _entry(need: Need) -> Entry:
+def _entry(effect: AblationEffect) -> Entry:
     marks: dict[str, Mark] = {"needed": "best", "harmful": "second"}
-    if need.loss is None:
+    if effect.loss is None:
         return Entry(text="n/a")
-    told = "" if need.verdict == "unknown" else f" [{need.loss.low:+z.2f}, {need.loss.high:+z.2f}] {need.verdict}"
-    return Entry(text=f"{need.loss.mean:+z.2f}{told}", sort=need.loss.mean, mark=marks.get(need.verdict, ""))
+    told = (
+        "" if effect.verdict == "unknown" else f" [{effect.loss.low:+z.2f}, {effect.loss.high:+z.2f}] {effect.verdict}"
+    )
+    return Entry(text=f"{effect.loss.mean:+z.2f}{told}", sort=effect.loss.mean, mark=marks.get(effect.verdict, ""))
 
 
 def _dose_section(scores: Scores) -> list[Section]:
     blocks: list[Block] = []
     for split in RANKED_SPLITS:
-        if found := necessity.doses(scores, split):
+        if found := ablation_matrix.doses(scores, split):
             blocks += [Chart(figure=_dose_figure(found, split)), Bullets(items=tuple(map(_dose_sentence, found)))]
     return [Section(title="More of a phenomenon", blocks=tuple(blocks))] if blocks else []
 
@@ -165,7 +168,7 @@ def _dose_figure(found: Sequence[Dose], split: str) -> Figure:
 
 
 def _dose_sentence(dose: Dose) -> str:
-    course = ", ".join(f"{necessity.told(loss)} at {strength:g}" for strength, loss in dose.losses)
+    course = ", ".join(f"{ablation_matrix.told(loss)} at {strength:g}" for strength, loss in dose.losses)
     rises = "rises" if dose.rises else "does not rise"
     return f"{dose.scene}, {dose.part.title}: {course}; it {rises} with every dose."
 
@@ -216,11 +219,11 @@ def _sufficient(scores: Scores, scene: str, split: str) -> Row | None:
     frames = {contender.name: contender.cost for contender in competing}
     entries = (
         Entry(text=SPLIT_NAMES[split].title),
-        Entry(text=look_of(found.name).title),
+        Entry(text=style_of(found.name).title),
         Entry(text=f"{frames[found.name]:.1f}", sort=frames[found.name]),
         tables.entry_of(scores.get(scene, found.name, PARAMETERS), METRICS["params"]),
         Entry(text=f"{found.loss_bound_db:.2f}", sort=found.loss_bound_db),
-        Entry(text=look_of(found.best).title),
+        Entry(text=style_of(found.best).title),
         Entry(text=f"{frames[found.best]:.1f}", sort=frames[found.best]),
         _confirmation(pareto.confirmed(competing)),
     )
@@ -237,8 +240,8 @@ def _judged(scores: Scores, chosen_on: Scores, scene: str, split: str) -> Row | 
     interval = "" if math.isnan(found.loss.low) else f" [{found.loss.low:z.2f}, {found.loss.high:z.2f}]"
     entries = (
         Entry(text=SPLIT_NAMES[split].title),
-        Entry(text=look_of(found.name).title),
-        Entry(text=look_of(found.best).title),
+        Entry(text=style_of(found.name).title),
+        Entry(text=style_of(found.best).title),
         Entry(text=f"{found.loss.mean:z.2f}{interval}", sort=found.loss.mean),
         Entry(text=found.verdict),
     )

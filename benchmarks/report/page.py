@@ -11,8 +11,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from ash.files import InputError, write_atomic
-from benchmarks.analysis.names import titles_of
 from benchmarks.analysis.scores import Scores, csv_of, scores_of
+from benchmarks.analysis.style import titles_of
 from benchmarks.cell.cells import CellResult, printable
 from benchmarks.report import content, escaping, glossary, needs, sections, sentences, tables, vega
 from benchmarks.report.content import Report, Section

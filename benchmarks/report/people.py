@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 
 from ash.capture.formats import load_capture
-from benchmarks.analysis.names import SPLIT_NAMES, is_ours, look_of
 from benchmarks.analysis.scores import RANKED_SPLITS, Scores, foreground
 from benchmarks.analysis.statistics import spreads
+from benchmarks.analysis.style import SPLIT_NAMES, is_ours, style_of
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.methods import is_oracle
 from benchmarks.report import charts, pictures, vega
@@ -166,7 +166,7 @@ def _told(gains: pd.DataFrame, others: Sequence[str]) -> Iterator[str]:
     for split in gains["split"].unique():
         for method in others:
             here = gains[(gains["split"] == split) & (gains["method"] == method)]["gain"].round(2)
-            words, title = SPLIT_NAMES[split].words, look_of(method).title
+            words, title = SPLIT_NAMES[split].words, style_of(method).title
             span = f"{here.min():+.2f} to {here.max():+.2f} dB"
             if (here == 0).all():
                 yield f"On {words} ASH and {title} are equal on all {len(here)} people, within 0.01 dB."
@@ -186,8 +186,8 @@ def _table(scores: Scores, scene: str, gains: pd.DataFrame, others: Sequence[str
             found = [Entry(text="n/a" if v is None else f"{v:+.2f}", sort=v) for v in values]
             rows.append(Row(name=who, entries=(Entry(text=f"{_mean(own[capture]):.2f}"), *found)))
     heads = (
-        Head(title=look_of(REFERENCE).title, unit="dB"),
-        *(Head(title=f"minus {look_of(m).title}") for m in others),
+        Head(title=style_of(REFERENCE).title, unit="dB"),
+        *(Head(title=f"minus {style_of(m).title}") for m in others),
     )
     return Table(title=SPLIT_NAMES[split].title, corner="person", columns=heads, rows=tuple(rows))
 
@@ -200,7 +200,7 @@ def _spread_table(scores: Scores, scene: str, others: Sequence[str]) -> Table:
         for title in ("between captures", "between seeds")
     )
     rows = tuple(
-        Row(name=look_of(method).title, entries=tuple(_spread_entries(scores, scene, method)))
+        Row(name=style_of(method).title, entries=tuple(_spread_entries(scores, scene, method)))
         for method in (REFERENCE, *others)
     )
     return Table(title="How far scores spread", columns=heads, rows=rows)

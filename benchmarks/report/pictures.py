@@ -15,9 +15,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from ash.capture.dataset import Capture
-from benchmarks.analysis.causes import REGION_COLOURS, psnr_of, worst_frames
-from benchmarks.analysis.names import SPLIT_NAMES, look_of
+from benchmarks.analysis.error_attribution import REGION_COLOURS, psnr_of, worst_frames
 from benchmarks.analysis.scores import RANKED_SPLITS
+from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell import metrics
 from benchmarks.cell.cells import Cell, CellResult, ViewScore, stored_prediction
 from benchmarks.cell.views import View, spread
@@ -39,7 +39,7 @@ class Shown:
     @property
     def title(self) -> str:
         """The method, for readers."""
-        return look_of(self.cell.config.method).title
+        return style_of(self.cell.config.method).title
 
 
 @dataclass(slots=True)
@@ -126,18 +126,18 @@ def comparisons(capture: Capture, shown: Sequence[Shown]) -> list[Frames]:
 def worst(capture: Capture, shown: Shown, *, count: int) -> list[Frames]:
     """A method's worst frames of the held-out motion: truth, prediction, FLIP error, and what explains it."""
     found = []
-    for cause in worst_frames(capture, shown.cell, shown.result, count=count):
-        view, truth, prediction = cause.view, cause.truth, cause.predicted
+    for attribution in worst_frames(capture, shown.cell, shown.result, count=count):
+        view, truth, prediction = attribution.view, attribution.truth, attribution.predicted
         crop = crop_of([truth, prediction])
         flip = view.scores["foreground", "flip"]
         images = (
             Frame(caption="Truth", score="", pixels=on_paper(truth[crop])),
             Frame(caption=shown.title, score=f"{psnr_of(view):.1f} dB", pixels=on_paper(prediction[crop])),
             Frame(caption="FLIP error", score=f"{flip:.3f}", pixels=_flip(prediction, truth, crop)),
-            Frame(caption="Regions", score="", pixels=_paint(cause.map[crop])),
+            Frame(caption="Regions", score="", pixels=_paint(attribution.map[crop])),
         )
         where = f"{shown.title}, camera {view.camera}, frame {view.frame}"
-        found.append(Frames(title=f"{where}. {cause.explanation}", images=images))
+        found.append(Frames(title=f"{where}. {attribution.explanation}", images=images))
     return found
 
 

@@ -8,8 +8,7 @@ from ash.capture.dataset import Capture
 from ash.capture.formats import load_capture
 from ash.files import InputError
 from benchmarks.analysis import contrasts, conventions
-from benchmarks.analysis.causes import REGIONS
-from benchmarks.analysis.names import EXACT, SPLIT_NAMES, is_ours, look_of
+from benchmarks.analysis.error_attribution import REGIONS
 from benchmarks.analysis.scores import (
     HELD_OUT_SPLITS,
     MOTION_SPLITS,
@@ -19,9 +18,10 @@ from benchmarks.analysis.scores import (
     curves_of,
     foreground,
 )
+from benchmarks.analysis.style import EXACT, SPLIT_NAMES, is_ours, style_of
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS
-from benchmarks.report import charts, established, figures, people, pictures, sentences, tables, vega
+from benchmarks.report import charts, differences, figures, people, pictures, sentences, tables, vega
 from benchmarks.report.content import (
     Block,
     Bullets,
@@ -100,13 +100,13 @@ def scene_report(data: SceneData) -> SceneReport:
     compared = contrasts.contrasts(scores, scene)
     beside = contrasts.contrasts(scores, scene, splits=tuple(s for s in MOTION_SPLITS if s not in RANKED_SPLITS))
     apart = (APART_NOTE,) if any(row.apart for row in quality.rows) else ()
-    quality_note = " ".join((QUALITY_NOTE, *apart, VALUES_NOTE, established.note(scores, scene, compared)))
+    quality_note = " ".join((QUALITY_NOTE, *apart, VALUES_NOTE, differences.note(scores, scene, compared)))
     picture_sections, sheets = _picture_sections(data, capture, shown, trouble)
     sections = [
         Section(title=scene, headline=sentences.headline(scores, scene), blocks=tuple(_opening(data, capture))),
         Section(title=quality.title, blocks=(_untitled(quality), *seen, Text(text=quality_note, note=True), *notes)),
         Section(title=cost.title, blocks=(_untitled(cost), Text(text=COST_NOTE, note=True), *notes)),
-        *established.sections(scores, scene, compared, beside),
+        *differences.sections(scores, scene, compared, beside),
         *people.sections(scores, scene),
         *_exact(scores, scene),
         *picture_sections,
@@ -138,7 +138,7 @@ def what_was_compared(data: SceneData, capture: Capture | None) -> str:
     """One paragraph for a stranger: methods, scene, subject, images, cameras, frames, preset and budget."""
     scores, scene, config = data.scores, data.scene, data.results[0].config
     rows = scores.clean.query("scene == @scene")
-    names = [look_of(method).title for method in scores.methods(scene)]
+    names = [style_of(method).title for method in scores.methods(scene)]
     presets = ", ".join(dict.fromkeys(result.config.preset for result in data.results))
     folders, subjects = (list(map(str, rows[name].unique())) for name in ("capture", "subject"))
     shown = f"capture {folders[0]}" if len(folders) == 1 else f"{len(folders)} captures, {folders[0]} to {folders[-1]}"
@@ -215,7 +215,7 @@ def _exact(scores: Scores, scene: str) -> list[Section]:
         means = {m: s.mean for m in (*EXACT, *EXACT.values()) if (s := scores.get(scene, m, foreground(split)))}
         if len(means) < 2 * len(EXACT):
             continue
-        pairs = {look_of(method).title: (means[method], means[exact]) for method, exact in EXACT.items()}
+        pairs = {style_of(method).title: (means[method], means[exact]) for method, exact in EXACT.items()}
         rows = [
             Row(name=name, entries=texts(f"{honest:.2f}", f"{exact:.2f}", f"{exact - honest:+.2f}"))
             for name, (honest, exact) in pairs.items()
@@ -365,7 +365,7 @@ def _convention_table(found: conventions.Comparison) -> Table:
             )
             for region, value in values.items()
         ]
-        rows.append(Row(name=look_of(str(method)).title, entries=tuple(entries)))
+        rows.append(Row(name=style_of(str(method)).title, entries=tuple(entries)))
     taus = tuple(Entry(text=f"{tau:.2f}", sort=tau) for tau in found.agreement)
     rows.append(Row(name="agreement with ours (Kendall's tau)", entries=taus, apart=True))
     heads = tuple(Head(title=title) for title in conventions.CONVENTIONS.values())

@@ -1,12 +1,12 @@
-"""What a report says about a run as a whole, beside its scenes: needs, stability, the template's error, the paper."""
+"""What a report says about a run as a whole, beside its scenes: effects, stability, the template's error, the paper."""
 
 from collections.abc import Iterable, Sequence
 
 import pandas as pd
 
-from benchmarks.analysis import anytime, footage, margin, novelty, paper, stability
-from benchmarks.analysis.names import SPLIT_NAMES, look_of
+from benchmarks.analysis import data_scaling, novelty, paper, stability, template_error, time_to_quality
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Scores, foreground
+from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS, PROTOCOL
 from benchmarks.report import charts, vega
@@ -22,12 +22,12 @@ KEPT = "Avatars kept on the way, at learning rates that fall only at the end."
 
 def margins(scores: Scores) -> list[Section]:
     """Quality and margin against the template's error, where templates of known error were run."""
-    curves = margin.margin_curves(scores)
+    curves = template_error.margin_curves(scores)
     if not curves:
         return []
     levels = pd.DataFrame(
         [
-            _sample(c, margin.LEVEL_TITLES[level.method], mm, psnr.mean, psnr.low, psnr.high)
+            _sample(c, template_error.LEVEL_TITLES[level.method], mm, psnr.mean, psnr.low, psnr.high)
             for c in curves
             for level in c.levels
             for mm, psnr in level.qualities
@@ -39,8 +39,8 @@ def margins(scores: Scores) -> list[Section]:
     rules = [(_place(c), 0.0, "") for c in curves]
     rules += [(_place(c), c.paper_db, f"the paper's {c.paper_db:+.1f} dB") for c in curves if c.paper_db is not None]
     run = {level.method for curve in curves for level in curve.levels}
-    titles = {method: title for method, title in margin.LEVEL_TITLES.items() if method in run}
-    looks = [Series(title=title, colour=look_of(method).colour) for method, title in titles.items()]
+    titles = {method: title for method, title in template_error.LEVEL_TITLES.items() if method in run}
+    looks = [Series(title=title, colour=style_of(method).colour) for method, title in titles.items()]
     pair = [Series(title=known, colour=vega.BLUE), Series(title=own, colour=vega.ORANGE, shape="square")]
     size = (390, 240)
     figures = (
@@ -67,21 +67,23 @@ def margins(scores: Scores) -> list[Section]:
             series=tuple(pair),
         ),
     )
-    placed = [placement for curve in curves if (placement := margin.placement(curve))]
-    findings = Bullets(items=(*map(margin.sentence, curves), *placed))
+    placed = [placement for curve in curves if (placement := template_error.placement(curve))]
+    findings = Bullets(items=(*map(template_error.sentence, curves), *placed))
     return [Section(title="The margin explained", blocks=(*map(_chart, figures), findings))]
 
 
 def spent(results: Sequence[CellResult]) -> list[Section]:
     """Quality against training seconds and against training frames, where a suite made them."""
     found = []
-    if len(table := anytime.curves(results)):
+    if len(table := time_to_quality.curves(results)):
         title = "Accuracy against training seconds"
         figure = _spent_figure(table, "budget", title, "seconds", "seconds of training", KEPT)
-        found.append((figure, anytime.sentences(table)))
-    if len(table := footage.curves(results)):
+        found.append((figure, time_to_quality.sentences(table)))
+    if len(table := data_scaling.curves(results)):
         title = "Held-out motion against the number of training frames"
-        found.append((_spent_figure(table, "footage", title, "frames", "training frames"), footage.sentences(table)))
+        found.append(
+            (_spent_figure(table, "footage", title, "frames", "training frames"), data_scaling.sentences(table))
+        )
     return [Section(title=f.title, blocks=(_chart(f), Bullets(items=tuple(said)))) for f, said in found]
 
 
@@ -219,12 +221,12 @@ def _chart(figure: Figure) -> Chart:
     return Chart(figure=figure)
 
 
-def _place(curve: margin.MarginCurve) -> str:
+def _place(curve: template_error.MarginCurve) -> str:
     return f"{curve.scene}, {SPLIT_NAMES[curve.split].words}"
 
 
 def _sample(
-    curve: margin.MarginCurve, name: str, mm: float, mean: float, low: float | None, high: float | None
+    curve: template_error.MarginCurve, name: str, mm: float, mean: float, low: float | None, high: float | None
 ) -> dict[str, object]:
     where = {"panel": _place(curve), "x_title": "template error [mm rms]", "series": name, "crossed": False}
     return {**where, "x": mm, "y": mean, "low": low, "high": high}
@@ -241,7 +243,7 @@ def _stability(scores: Scores, scene: str, curves: Sequence[stability.Curve]) ->
     for index, split in enumerate(RANKED_SPLITS):
         shown = [curve for curve in curves if curve.split == split]
         samples = pd.DataFrame([row for curve in shown for row in _steps(curve, names)])
-        floor = look_of(stability.TRIVIAL).title
+        floor = style_of(stability.TRIVIAL).title
         rules = [(curve.title, curve.trivial, floor) for curve in shown if curve.trivial is not None]
         panels = charts.lines(
             samples, looks, y="PSNR [dB]", size=(240, 150), rules=pd.DataFrame(rules, columns=["panel", "y", "text"])
@@ -286,7 +288,7 @@ def _breakdowns(curves: Sequence[stability.Curve], methods: Sequence[str]) -> Ta
         own = {course.method: course for course in curve.courses}
         name = f"{curve.title}, {SPLIT_NAMES[curve.split].words}"
         rows.append(Row(name=name, entries=tuple(entry(own.get(method)) for method in methods)))
-    columns = tuple(Head(title=look_of(method).title) for method in methods)
+    columns = tuple(Head(title=style_of(method).title) for method in methods)
     return Table(
         title="Breakdown point (and the worst loss along the axis)", corner="axis", columns=columns, rows=tuple(rows)
     )

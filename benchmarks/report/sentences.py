@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from benchmarks.analysis import contrasts, paper, pareto
-from benchmarks.analysis.names import EXACT, SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Scores, foreground
+from benchmarks.analysis.style import EXACT, SPLIT_NAMES, style_of
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.methods import is_oracle
 from synth.person.cast import VALIDATION
@@ -43,11 +43,11 @@ def _finding(scores: Scores, scene: str) -> str:
     if not ranked:
         return f"On {scene}, no method was ranked on held-out views."
     (best, most), *others = ranked
-    text = f"On {scene}, {look_of(best).title} is best on held-out views with {most:.1f} dB"
+    text = f"On {scene}, {style_of(best).title} is best on held-out views with {most:.1f} dB"
     if others and most - others[0][1] < TOO_CLOSE_DB:
-        text += f", level with {look_of(others[0][0]).title} (within {TOO_CLOSE_DB:g} dB)"
+        text += f", level with {style_of(others[0][0]).title} (within {TOO_CLOSE_DB:g} dB)"
     elif others:
-        text += f", {most - others[0][1]:.1f} dB ahead of {look_of(others[0][0]).title}"
+        text += f", {most - others[0][1]:.1f} dB ahead of {style_of(others[0][0]).title}"
     return _sentence(text)
 
 
@@ -56,12 +56,14 @@ def remarks(scores: Scores, scene: str) -> list[str]:
     found = [CHOOSING] if scores.for_choosing(scene) else []
     found += [_exact(scores, scene), _cost(scores, scene), _template(scores, scene), _noise(scores, scene)]
     choices = scores.outcomes.query("scene == @scene and choice != ''").drop_duplicates(["method", "choice"])
-    said = [f"{look_of(method).title}: {choice}" for method, choice in zip(choices.method, choices.choice, strict=True)]
+    said = [
+        f"{style_of(method).title}: {choice}" for method, choice in zip(choices.method, choices.choice, strict=True)
+    ]
     found.append(f"What a search found to suffice: {'; '.join(said)}." if said else "")
     found.append(_supervision(scores, scene))
     dead = _told(scores, scene, "dead")
     found.append(_sentence(f"Decoders carry nothing, the same output in every frame: {dead}") if dead else "")
-    failed = [look_of(method).title for method in scores.methods(scene) if scores.failed(scene, method)]
+    failed = [style_of(method).title for method in scores.methods(scene) if scores.failed(scene, method)]
     found.append(_sentence(f"Failed, and scored with the worst value: {', '.join(failed)}") if failed else "")
     if not scores.repeated(scene):
         found.append("One seed: a difference of a few tenths of a dB may be chance; --seeds 3 gives intervals.")
@@ -77,7 +79,7 @@ def views_seen(scores: Scores, scene: str) -> tuple[str, ...]:
         counts = [_count_seen(scores, scene, method, what) for what in ("cameras", "frames")]
         if method in paper.SEEN and all(counts):
             seen = ", ".join(counts)
-            found.append(f"{look_of(method).title}: training saw {seen} (paper: {paper.SEEN[method]}).")
+            found.append(f"{style_of(method).title}: training saw {seen} (paper: {paper.SEEN[method]}).")
     return tuple(found)
 
 
@@ -90,20 +92,20 @@ def exposed(results: Sequence[CellResult]) -> tuple[str, ...]:
 def doubts(results: Sequence[CellResult]) -> tuple[str, ...]:
     """What could not be enforced, and clocks that contradict each other: notes under the tables."""
     found = []
-    if titles := [look_of(method).title for method in exposed(results)]:
+    if titles := [style_of(method).title for method in exposed(results)]:
         found.append(
             f"Not isolated: {', '.join(titles)}. The system had no room to lock the method in, so the truth was out of"
-            " sight, and opening it was watched, but not impossible."
+            " effect, and opening it was watched, but not impossible."
         )
     for result in results:
         if result.evaluated_code:
             found.append(f"{result.config.title}: scored by other code ({result.evaluated_code}) than trained it.")
     for kind, words in DRAWN_BY.items():
         timed = (r.config.method for r in results if r.timing is not None and r.timing.drawn_by == kind)
-        if names := [look_of(method).title for method in dict.fromkeys(timed)]:
+        if names := [style_of(method).title for method in dict.fromkeys(timed)]:
             found.append(f"{', '.join(names)}: {words}.")
     for device in sorted({r.drawn_on for r in results} - {"", "cpu"}):
-        names = list(dict.fromkeys(look_of(r.config.method).title for r in results if r.drawn_on == device))
+        names = list(dict.fromkeys(style_of(r.config.method).title for r in results if r.drawn_on == device))
         found.append(f"{', '.join(names)}: drawn on {device}, so that milliseconds are not those of one core.")
     for result in results:
         wall, cpu = (result.value("speed", "", f"train_{clock}_s") for clock in ("wall", "cpu"))
@@ -121,7 +123,7 @@ def frontier(scores: Scores, scene: str) -> tuple[str, ...]:
         competing = contrasts.candidates(scores, scene, split)
         if len(competing) < 2:
             continue
-        names = ", ".join(look_of(name).title for name in pareto.front(competing))
+        names = ", ".join(style_of(name).title for name in pareto.front(competing))
         area = f"hypervolume {pareto.hypervolume(competing):.1f} dB·decades"
         if scores.repeated(scene):
             low, high = pareto.hypervolume_interval(competing, rng=np.random.default_rng(0))
@@ -129,15 +131,15 @@ def frontier(scores: Scores, scene: str) -> tuple[str, ...]:
         sentence = f"On {SPLIT_NAMES[split].words}, nobody beats {names} in both accuracy and speed ({area})."
         sufficient = pareto.smallest_sufficient(competing)
         if sufficient is not None:
-            bound = f"{pareto.SUFFICIENT_DB} dB to {look_of(sufficient.best).title}"
-            cheapest = f"{look_of(sufficient.name).title}, the cheapest that loses less than {bound}"
+            bound = f"{pareto.SUFFICIENT_DB} dB to {style_of(sufficient.best).title}"
+            cheapest = f"{style_of(sufficient.name).title}, the cheapest that loses less than {bound}"
             sentence += f" Smallest sufficient: {cheapest} (95 % bound {sufficient.loss_bound_db:.2f} dB)."
         found.append(sentence)
     return tuple(found)
 
 
 def _duel(scores: Scores, scene: str) -> str:
-    fallen = [look_of(method).title for method in ("ash", "ddc") if scores.failed(scene, method)]
+    fallen = [style_of(method).title for method in ("ash", "ddc") if scores.failed(scene, method)]
     if fallen:
         return f"On {scene}, {' and '.join(fallen)} failed, so ASH and DDC cannot be compared."
     parts = []
@@ -172,7 +174,7 @@ def _cost(scores: Scores, scene: str) -> str:
     if len(known) > FEW_METHODS:
         ends = [pair(known, key=lambda each: each[1])[0] for pair in (min, max)]
         known = [(method, ms) for method, ms in known if method in ("ash", "ddc", *ends)]
-    parts = [f"{look_of(method).title} {ms:.0f} ms" for method, ms in known]
+    parts = [f"{style_of(method).title} {ms:.0f} ms" for method, ms in known]
     return f"A frame takes {', '.join(parts)} on one core." if parts else ""
 
 
@@ -190,7 +192,7 @@ def _supervision(scores: Scores, scene: str) -> str:
     """What each row's template was learned from."""
     rows = scores.outcomes.query("scene == @scene and template != ''").drop_duplicates(["method", "template"])
     said = [
-        f"{template} ({', '.join(look_of(method).title for method in group['method'])})"
+        f"{template} ({', '.join(style_of(method).title for method in group['method'])})"
         for template, group in rows.groupby("template", sort=False)
     ]
     return f"Templates: {'; '.join(said)}." if said else ""
@@ -199,7 +201,7 @@ def _supervision(scores: Scores, scene: str) -> str:
 def _told(scores: Scores, scene: str, what: str) -> str:
     """The methods of which a cell tells so of its training."""
     methods = scores.outcomes.query(f"scene == @scene and {what}")["method"].unique()
-    return ", ".join(look_of(method).title for method in scores.methods(scene) if method in methods)
+    return ", ".join(style_of(method).title for method in scores.methods(scene) if method in methods)
 
 
 def _count_seen(scores: Scores, scene: str, method: str, what: str) -> str:

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pandas as pd
 
-from benchmarks.analysis.names import SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import HELD_OUT_SPLITS, RANKED_SPLITS, Quantity, Score, Scores, foreground
+from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell.methods import is_oracle
 from benchmarks.cell.metrics import METRICS, Metric
 from benchmarks.report.content import Entry, Head, Mark, Row, Table
@@ -46,7 +46,7 @@ def build(
     marks = {q: _marks({m: s for m, s in found[q].items() if s and m not in lost}, METRICS[q.metric]) for q in kept}
     rows = [
         Row(
-            name=look_of(method).title,
+            name=style_of(method).title,
             entries=tuple(
                 _entry(found[q][method], METRICS[q.metric], marks[q].get(method, ""), method in lost) for q in kept
             ),

@@ -13,7 +13,7 @@ from typing import Any
 import altair as alt
 import vl_convert
 
-from benchmarks.analysis.names import look_of
+from benchmarks.analysis.style import style_of
 from benchmarks.cell.methods import is_oracle
 
 VERSION = "6.4"  # of Vega-Lite, among those that vl-convert brings
@@ -100,7 +100,7 @@ def series_of(methods: Sequence[str]) -> tuple[Series, ...]:
     """The looks of methods; those of one colour differ in shape."""
     found: list[Series] = []
     for method in methods:
-        look, hollow = look_of(method), is_oracle(method)
+        look, hollow = style_of(method), is_oracle(method)
         alike = sum((other.colour, other.hollow) == (look.colour, hollow) for other in found)
         title = method if any(other.title == look.title for other in found) else look.title
         shape = SHAPES[alike % len(SHAPES)]

@@ -3,24 +3,32 @@
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from ash.files import InputError, read_json, write_json
 from benchmarks.cell.cells import read_result, result_of
 from benchmarks.suites.runs import RUN_FILE, read_run
 
 
+def are_shards(folders: Sequence[Path]) -> bool:
+    """Whether several folders hold parts of one run: the same suite and the same cells."""
+    descriptions = [read_json(path) if (path := folder / RUN_FILE).is_file() else None for folder in folders]
+    first = descriptions[0]
+    return len(folders) > 1 and isinstance(first, dict) and all(_same_cells(first, other) for other in descriptions)
+
+
+def _same_cells(one: dict[str, Any], other: Any) -> bool:
+    return isinstance(other, dict) and all(one.get(name) == other.get(name) for name in ("suite", "cells"))
+
+
 def merge_runs(shards: Sequence[Path], out: Path) -> None:
     """Copy every finished cell of the shards into `out`; a cell that several have is taken once.
 
     Raises:
-        InputError: the shards are not of one run, disagree about a cell, or together lack one.
+        InputError: the shards disagree about a cell, or together lack one.
     """
     runs = [read_run(shard) for shard in shards]
-    descriptions = [read_json(shard / RUN_FILE) for shard in shards]
-    for shard, description in zip(shards, descriptions, strict=True):
-        for name in ("suite", "cells"):
-            if description[name] != descriptions[0][name]:
-                raise InputError(f"{shard}: its {name} differ from those of {shards[0]}: not shards of one run")
+    description = read_json(shards[0] / RUN_FILE)
     finished: dict[str, Path] = {}
     for run in runs:
         for cell in run.cells:
@@ -30,13 +38,12 @@ def merge_runs(shards: Sequence[Path], out: Path) -> None:
             before = finished.setdefault(cell.config.key, cell.folder)
             if before != cell.folder and (earlier := read_result(before)) is not None and earlier.views != result.views:
                 raise InputError(f"{cell.folder} and {before}: two results of one cell that differ")
-    missing = [key for key in descriptions[0]["cells"] if key not in finished]
+    missing = [key for key in description["cells"] if key not in finished]
     if missing:
-        raise InputError(
-            f"{len(missing)} of {len(descriptions[0]['cells'])} cells are in no shard, the first is {missing[0]}"
-        )
+        first = description.get("cell_titles", {}).get(missing[0], missing[0])
+        raise InputError(f"{len(missing)} of {len(description['cells'])} cells are in no shard, the first: {first}")
     for key, folder in finished.items():
         target = out / "cells" / key
         if not (target / "result.json").exists():
             shutil.copytree(folder, target, dirs_exist_ok=True)
-    write_json(out / RUN_FILE, descriptions[0])
+    write_json(out / RUN_FILE, description)

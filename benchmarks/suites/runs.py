@@ -58,6 +58,7 @@ class RunFile:
     command: str
     cells: tuple[str, ...]
     titles: dict[str, str] = field(default_factory=dict)
+    cell_titles: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -217,6 +218,7 @@ def description_of(run: Run) -> dict[str, Any]:
         "command": run.command,
         "cells": [cell.config.key for cell in run.cells],
         **({"titles": run.titles} if run.titles else {}),
+        "cell_titles": {cell.config.key: cell.config.title for cell in run.cells},
     }
 
 
@@ -230,6 +232,9 @@ def read_run(folder: Path) -> Run:
         cell = read_cell(folder)
         return Run(folder=folder, suite="one cell", about=cell.config.title, command="", cells=(cell,))
     path = folder / RUN_FILE
+    if not path.exists() and (trained := sorted(folder.glob("cells/*/config.json"))):  # As `train` leaves them.
+        cells = tuple(read_cell(each.parent) for each in trained)
+        return Run(folder=folder, suite="train", about="cells trained by hand", command="", cells=cells)
     content = read_json(path)
     try:
         told: RunFile = from_json(RunFile, content)

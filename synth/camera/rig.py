@@ -258,15 +258,3 @@ def rotation(rig: Rig, frames: int) -> list[list[int]]:
         [int(sector[(frame + number * (frame // len(sector))) % len(sector)]) for number, sector in enumerate(sectors)]
         for frame in range(frames)
     ]
-
-
-def spread(positions: np.ndarray, count: int) -> list[int]:
-    """Indices of `count` cameras `[n, 3]` far from each other; a larger subset contains the smaller."""
-    directions = positions - positions.mean(axis=0)
-    directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
-    chosen = [int(np.argmin(positions[:, 1]))]
-    distance = np.linalg.norm(directions - directions[chosen[0]], axis=1)
-    while len(chosen) < count:
-        chosen.append(int(np.argmax(distance)))
-        distance = np.minimum(distance, np.linalg.norm(directions - directions[chosen[-1]], axis=1))
-    return chosen

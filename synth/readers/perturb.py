@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter1d
 
-from ash.capture.dataset import Camera, Capture, Motion, image_path, pixels_path, plate_path
+from ash.capture.dataset import Camera, Capture, Motion, image_path, pixels_path, plate_path, spread_cameras
 from ash.capture.formats import load_capture, write_cameras, write_motion
 from ash.files import InputError, hash_of, link_or_copy, read_arrays, read_image, sha256_of, write_image
-from synth.camera.rig import spread
 from synth.posing import rotvec_to_rotmat
 
 
@@ -65,10 +64,7 @@ def _subset(capture: Capture, perturbation: Perturbation) -> Capture:
     train = capture.splits["train"]
     cameras, frames = train.cameras, train.frames
     if perturbation.cameras is not None:
-        if perturbation.cameras > len(cameras):
-            raise InputError(f"perturbation: {perturbation.cameras} cameras of {len(cameras)}")
-        positions = np.stack([capture.cameras[name].position for name in cameras])
-        cameras = tuple(cameras[k] for k in sorted(spread(positions, perturbation.cameras)))
+        cameras = spread_cameras(capture, perturbation.cameras)
     if perturbation.frames is not None:
         if perturbation.frames > len(frames):
             raise InputError(f"perturbation: {perturbation.frames} frames of {len(frames)}")

@@ -1,4 +1,5 @@
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -15,11 +16,11 @@ from ash.capture.manifest import read_manifest
 from benchmarks import cli
 from benchmarks.cell import methods
 from benchmarks.cell.children import METHOD_PATH
+from benchmarks.commands import arguments
+from benchmarks.commands.captures import SynthCommand
 from benchmarks.suites import captures
 from benchmarks.suites.files import find_suite
 from benchmarks.suites.suites import CaptureSpec
-from benchmarks.verbs import arguments
-from benchmarks.verbs.captures import SynthVerb
 
 pytestmark = pytest.mark.usefixtures("installed_fakes")
 
@@ -55,12 +56,29 @@ def test_rescore_recomputes_every_number_from_the_stored_images(capture: Path, t
     path = next(tmp_path.rglob("result.json"))
     out, original = path.parent, path.read_bytes()
     path.write_bytes(original.replace(b'"foreground/psnr": ', b'"foreground/psnr": 1'))
-    assert cli.main(["rescore", str(out)]) == arguments.DONE
+    assert cli.main(["eval", "--scores-only", str(out)]) == arguments.DONE
     assert path.read_bytes() == original
     capsys.readouterr()
     image = sorted(path.parent.rglob("*.png"))[0]
     shutil.copy(sorted(path.parent.rglob("*.png"))[1], image)
-    assert "altered since it was scored" in refused(capsys, "rescore", str(out))
+    assert "altered since it was scored" in refused(capsys, "eval", "--scores-only", str(out))
+
+
+def test_what_train_made_is_reported_and_evaluated_also_when_it_was_moved(
+    capture: Path, tmp_path: Path, capsys
+) -> None:
+    before, after = tmp_path / "before", tmp_path / "after"
+    shutil.copytree(capture, before / "data" / "boxes")
+    train = ["train", "fake_good", str(before / "data" / "boxes"), "--preset", "ci", "--out", str(before / "runs")]
+    assert cli.main(train) == arguments.DONE
+    before.rename(after)
+    cell = next(after.glob("runs/cells/*"))
+    for command in (["report", str(after / "runs")], ["report", str(cell)], ["eval", str(cell)]):
+        capsys.readouterr()
+        assert cli.main(command) == arguments.DONE, command
+        assert "fake_good" in capsys.readouterr().out
+    assert "Side by side" in (cell / "report.html").read_text()
+    assert "No pictures" not in (after / "runs" / "report.html").read_text()
 
 
 def test_a_methods_configuration_is_flags_recorded_hashed_and_used(capture: Path, tmp_path: Path, capsys) -> None:
@@ -91,24 +109,26 @@ def test_a_methods_configuration_is_flags_recorded_hashed_and_used(capture: Path
 
 def test_a_scenes_fields_are_flags_and_part_of_what_it_is(capsys) -> None:
     command = ["mannequin", "--size", "ci", "--rig.cameras", "9", "--train.0.frames", "6", "--outfit.skirt", "False"]
-    scene, name = arguments.read_verb(SynthVerb, "synth", command)._described()
+    scene, name = arguments.read_command(SynthCommand, "synth", command)._described()
     assert (scene.rig.cameras, scene.train[0].frames, scene.train[1].frames, scene.outfit.skirt) == (9, 6, 4, False)
     assert scene.name == "mannequin+skirt=False+cameras=9+frames=6"
     assert name == f"mannequin-ci-0-{scene.identity[:8]}" and scene.parameters["rig"]["cameras"] == 9
-    same, _ = arguments.read_verb(SynthVerb, "synth", ["mannequin", "--rig.cameras=9", "--size", "quick"])._described()
+    same, _ = arguments.read_command(
+        SynthCommand, "synth", ["mannequin", "--rig.cameras=9", "--size", "quick"]
+    )._described()
     assert same.identity != scene.identity and same.rig.cameras == 9
-    plain, name = arguments.read_verb(SynthVerb, "synth", ["mannequin", "--size", "ci"])._described()
+    plain, name = arguments.read_command(SynthCommand, "synth", ["mannequin", "--size", "ci"])._described()
     assert (plain, name) == (
-        arguments.read_verb(SynthVerb, "synth", ["mannequin", "--size", "ci"]).settings(),
+        arguments.read_command(SynthCommand, "synth", ["mannequin", "--size", "ci"]).settings(),
         "mannequin-ci-0",
     )
     for command, wanted in (
         ("mannequin --size ci --subject 3", "mannequin-ci-0-subject3"),
         ("mannequin --size ci --subject 103 --seed 7", "mannequin-ci-7-subject103"),
     ):
-        person, name = arguments.read_verb(SynthVerb, "synth", command.split())._described()
+        person, name = arguments.read_command(SynthCommand, "synth", command.split())._described()
         assert (name, person.name, person.subject) == (wanted, "mannequin", int(wanted.rpartition("subject")[2]))
-    splats, _ = arguments.read_verb(SynthVerb, "synth", ["splats", "--size", "ci", "--name", "mine"])._described()
+    splats, _ = arguments.read_command(SynthCommand, "synth", ["splats", "--size", "ci", "--name", "mine"])._described()
     assert (splats.name, splats.body) == ("mine", "mannequin")
 
 
@@ -284,8 +304,13 @@ def test_shards_are_merged_into_the_undisturbed_run(finished: Path, boxes: str, 
     shards = [tmp_path / "a", tmp_path / "b"]
     for index, shard in enumerate(shards, 1):
         assert cli.main(["run", boxes, "--out", str(shard), "--shard", f"{index}/2"]) == arguments.DONE
-    assert "are in no shard" in refused_last(capsys, "merge", str(shards[0]), "--out", str(tmp_path / "half"))
-    assert cli.main(["merge", *map(str, shards), "--out", str(tmp_path / "merged")]) == arguments.DONE
+    twice = ["report", str(shards[0]), str(shards[0]), "--out", str(tmp_path / "half")]
+    assert re.search(r"cells are in no shard, the first: \w+ .* seed 0", refused_last(capsys, *twice))
+    assert cli.main(["report", *map(str, shards), "--out", str(tmp_path / "merged")]) == arguments.DONE
+    assert cli.main(["merge", *map(str, shards), "--out", str(tmp_path / "old")]) == arguments.DONE
+    assert "merge is now: report" in capsys.readouterr().err
+    for name in ("run.json", "results.csv"):
+        assert (tmp_path / "old" / name).read_bytes() == (tmp_path / "merged" / name).read_bytes()
     quality = [
         [
             line

@@ -13,8 +13,8 @@ import pytest
 from helpers.commands import ash_bench, refused
 
 from benchmarks import cli
+from benchmarks.commands import arguments
 from benchmarks.suites.progress import Progress
-from benchmarks.verbs import arguments
 
 pytestmark = pytest.mark.usefixtures("installed_fakes")
 

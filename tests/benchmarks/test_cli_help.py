@@ -7,7 +7,7 @@ import pytest
 from helpers.commands import ash_bench, refused
 
 from benchmarks import cli
-from benchmarks.verbs import arguments
+from benchmarks.commands import arguments
 
 pytestmark = pytest.mark.usefixtures("installed_fakes")
 
@@ -20,40 +20,44 @@ def test_help_tells_a_methods_configuration(capsys) -> None:
     assert "--detail FLOAT" in told and "(default: 0.9)" in told and "--shift-m" in told
 
 
-def test_help_lists_every_verb_and_how_to_go_on(capsys) -> None:
+def test_help_lists_every_command_and_how_to_go_on(capsys) -> None:
     assert cli.main(["--help"]) == arguments.DONE
     told = capsys.readouterr().out
     listed = dict(re.findall(r"^  ([a-z][a-z-]*)  +([A-Z].*)$", told, re.MULTILINE))
-    assert listed == {verb: (cli._verb(verb).__doc__ or "").splitlines()[0].rstrip(".") for verb in cli.VERBS}
+    assert listed == {
+        command: (cli._command(command).__doc__ or "").splitlines()[0].rstrip(".") for command in cli.COMMANDS
+    }
     assert f"{arguments.own_name()} run my.toml" in told
 
 
-def test_a_verbs_help_needs_nothing_heavy() -> None:
+def test_a_commands_help_needs_nothing_heavy() -> None:
     code = """
 import sys
-from benchmarks.cli import VERBS, main
-for verb in VERBS:
+from benchmarks.cli import COMMANDS, main
+for command in COMMANDS:
     try:
-        main([verb, "--help"])
+        main([command, "--help"])
     except SystemExit as end:
-        assert end.code == 0, verb
+        assert end.code == 0, command
     heavy = {"torch", "mitsuba", "pandas", "altair", "scipy", "matplotlib"} & set(sys.modules)
-    assert not heavy, (verb, heavy)
+    assert not heavy, (command, heavy)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert [verb for verb in cli.VERBS if f"ash-bench {verb}" not in done.stdout] == []
+    assert [command for command in cli.COMMANDS if f"ash-bench {command}" not in done.stdout] == []
 
 
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        ("", "expected a verb"),
-        ("rn", "unknown verb 'rn', did you mean run"),
+        ("", "expected a command"),
+        ("rn", "unknown command 'rn', did you mean run"),
         ("run --seeds 0", "--seeds: expected at least 1, got 0"),
         ("run ci --subjects 101", "subjects: expected 1 to 100, got 101: those from 100 on are for validation"),
         ("synth loose --subject -1", "--subject: expected at least 0, got -1"),
         ("sheets --subjects 2 --scene tight", "--subjects shows people in both outfits: expected it or --scene"),
+        ("train ash x --seed 18446744073709551616", "--seed: expected at most 2147483647, got 18446744073709551616"),
+        ("report --out x", "expected"),
         ("run --workers x", "--workers: expected a whole number, got 'x'"),
         ("run --sedes 3", "unknown option '--sedes', did you mean --seeds"),
         ("run ci extra", "unexpected 'extra'"),
@@ -78,7 +82,7 @@ def test_wrong_use_is_one_line_and_exits_with_2(command: str, message: str, caps
     assert message in refused(capsys, *command.split())
 
 
-def test_a_shell_can_complete_verbs_and_flags(tmp_path: Path) -> None:
+def test_a_shell_can_complete_commands_and_flags(tmp_path: Path) -> None:
     script = ash_bench("--tyro-print-completion", "bash").stdout
     (tmp_path / "completion").write_text(script)
     asked = (

@@ -24,13 +24,22 @@ def test_a_container_s_limit_on_cores_is_read(files: dict[str, str], expected: f
     for name, content in files.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(f"{content}\n")
-    assert provenance.cpu_quota(tmp_path) == expected
+    assert provenance.cpu_quota(tmp_path, tmp_path / "none") == expected
+
+
+def test_the_limit_of_a_cgroup_within_another_is_read(tmp_path: Path) -> None:
+    (tmp_path / "own").write_text("0::/pod/job\n")
+    (tmp_path / "pod" / "job").mkdir(parents=True)
+    (tmp_path / "pod" / "job" / "cpu.max").write_text("200000 100000\n")
+    assert provenance.cpu_quota(tmp_path, tmp_path / "own") == 2.0
+    (tmp_path / "pod" / "cpu.max").write_text("150000 100000\n")
+    assert provenance.cpu_quota(tmp_path, tmp_path / "own") == 1.5
 
 
 def test_workers_follow_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
     for quota, cores in ((math.inf, 8), (2.5, 2), (0.5, 1)):
-        monkeypatch.setattr(provenance, "cpu_quota", lambda _, quota=quota: quota)
+        monkeypatch.setattr(provenance, "cpu_quota", lambda quota=quota: quota)
         assert provenance.cores() == cores
 
 

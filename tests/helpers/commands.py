@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from benchmarks import cli
-from benchmarks.verbs import arguments
+from benchmarks.commands import arguments
 
 
 def ash_bench(*command: str, preexec_fn=None) -> subprocess.CompletedProcess[str]:

@@ -82,6 +82,19 @@ def test_verify_does_not_leave_the_folder(capture_folder):
     assert "../outside: outside the capture" in verify_capture(capture_folder)
 
 
+def test_a_motion_file_that_unpacks_to_gigabytes_is_refused_before_memory_is_taken(capture_folder):
+    with zipfile.ZipFile(capture_folder / "motion.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("sequence", "fps", "dofs"):
+            with archive.open(f"{name}.npy", "w") as entry:
+                np.lib.format.write_array_header_1_0(
+                    entry, {"descr": "<f8", "fortran_order": False, "shape": (17 << 20,)}
+                )
+                for _ in range(17):
+                    entry.write(bytes(8 << 20))
+    with pytest.raises(InputError, match=r"motion\.npz: .* bytes unpacked, expected at most"):
+        load_capture(capture_folder)
+
+
 def test_another_schema_or_an_unfinished_capture_is_refused(capture_folder):
     seal(capture_folder, schema=99)
     with pytest.raises(InputError, match="expected capture schema 1, got 99"):

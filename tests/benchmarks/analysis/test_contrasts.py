@@ -9,11 +9,11 @@ import pytest
 from helpers.cells import cell
 from scipy import stats
 
-from benchmarks.analysis.contrasts import candidates, contrasts, difference, sights
+from benchmarks.analysis.contrasts import candidates, contrasts, detectable_effects, difference
 from benchmarks.analysis.scores import COLUMNS, Scores, scores_of
 from benchmarks.analysis.statistics import detectable
 from benchmarks.cell.cells import CellResult, Summary
-from benchmarks.report import established
+from benchmarks.report import differences
 from benchmarks.report.content import Table, Text
 
 ROUNDS, TABLES = 600, 200
@@ -62,7 +62,7 @@ def test_false_alarms_are_at_most_five_percent(captures: int, seeds: int) -> Non
 def test_a_table_of_contrasts_keeps_the_level_over_all_its_rows() -> None:
     methods = ("ash", "ddc", "mlp", "static", "wo_mot")
     scores = null_run(np.random.default_rng(9), captures=8, seeds=1, methods=methods, rounds=TABLES)
-    wolves = sum(any(c.established for c in contrasts(scores, scene)) for scene in scores.scenes)
+    wolves = sum(any(c.significant for c in contrasts(scores, scene)) for scene in scores.scenes)
     assert stats.binomtest(wolves, TABLES, 0.05, alternative="greater").pvalue > 0.01, wolves / TABLES
 
 
@@ -84,8 +84,8 @@ def test_methods_compete_on_the_captures_that_all_have() -> None:
 def test_what_more_captures_would_show_follows_from_the_spread_over_captures() -> None:
     levels = {"ash": (20.0, 25.0, 30.0, 35.0), "ddc": (19.0, 24.2, 29.2, 34.0), "mlp": (18.0, 25.0, 27.0, 30.0)}
     found = contrasts(scores_of(people(levels)), "loose")
-    seen = sights(found, "novel_view")
-    assert [sight.captures for sight in seen] == [1, 2, 4, 8, 16] and math.isinf(seen[0].middle)
+    seen = detectable_effects(found, "novel_view")
+    assert [effect.captures for effect in seen] == [1, 2, 4, 8, 16] and math.isinf(seen[0].middle)
     assert seen[2].worst == pytest.approx(found[1].test.detectable)
     spreads = [np.std(np.subtract(levels["ash"], levels[name]), ddof=1) for name in ("ddc", "mlp")]
     assert seen[3].middle == pytest.approx(detectable(float(np.mean(spreads)), 8))
@@ -93,28 +93,28 @@ def test_what_more_captures_would_show_follows_from_the_spread_over_captures() -
 
 def test_a_report_says_what_was_compared_and_what_could_be_seen() -> None:
     many = scores_of(people({"ash": (20.0, 25.0, 30.0), "ddc": (19.0, 24.2, 29.2)}))
-    (section,) = established.sections(many, "loose", contrasts(many, "loose"))
+    (section,) = differences.sections(many, "loose", contrasts(many, "loose"))
     tables = [block for block in section.blocks if isinstance(block, Table)]
     assert tables[0].columns[2].unit == "captures, paired t"
     assert tables[1].rows[0].entries[0].text == "none"
-    assert "Smallest detectable difference to ASH, middle row: 0." in established.note(
+    assert "Smallest detectable difference to ASH, middle row: 0." in differences.note(
         many, "loose", contrasts(many, "loose")
     )
-    assert "3 captures, compared in pairs" in established.note(many, "loose", contrasts(many, "loose"))
+    assert "3 captures, compared in pairs" in differences.note(many, "loose", contrasts(many, "loose"))
     one = scores_of(people({"ash": (20.0,), "ddc": (19.0,)}, seeds=(0.0, 0.1, 0.3)))
-    (section,) = established.sections(one, "loose", contrasts(one, "loose"))
+    (section,) = differences.sections(one, "loose", contrasts(one, "loose"))
     (table,) = (block for block in section.blocks if isinstance(block, Table))
     assert table.columns[2].unit == "seeds, Welch" and isinstance(section.blocks[-1], Text)
-    assert "nothing about other people" in established.note(one, "loose", contrasts(one, "loose"))
+    assert "nothing about other people" in differences.note(one, "loose", contrasts(one, "loose"))
     alone = scores_of(people({"ash": (20.0,), "ddc": (19.0,)}))
-    assert established.sections(alone, "loose", contrasts(alone, "loose")) == [], "so few rows are read in their table"
+    assert differences.sections(alone, "loose", contrasts(alone, "loose")) == [], "so few rows are read in their table"
     levels = {"ash": (20.0,), "ddc": (19.0,), "mlp": (17.5,), "wo_mot": (19.8,), "res_128": (20.1,), "res_64": (18.0,)}
-    (section,) = established.sections(scores_of(people(levels)), "loose", ())
+    (section,) = differences.sections(scores_of(people(levels)), "loose", ())
     (chart,) = section.blocks
     drawn = chart.figure.svg()
     assert chart.figure.name == "effects_loose" and "one seed: no interval" in drawn
     assert drawn.index("w/ MLP") < drawn.index("DDC") < drawn.index("w/o mot."), "by what ASH is ahead"
     assert (
-        established.note(alone, "loose", contrasts(alone, "loose"))
+        differences.note(alone, "loose", contrasts(alone, "loose"))
         == "One value per row: no difference between rows is established."
     )

@@ -13,7 +13,7 @@ from ash.capture.dataset import Split
 from ash.capture.formats import load_capture
 from ash.capture.manifest import verify_capture
 from ash.files import InputError
-from benchmarks.analysis import margin, stability
+from benchmarks.analysis import stability, template_error
 from benchmarks.analysis.scores import scores_of
 from benchmarks.cell.cells import CellResult, failed_result
 from benchmarks.cell.methods import configured, offered
@@ -82,17 +82,17 @@ def test_the_margin_is_read_off_templates_of_known_error() -> None:
     pairs = {"ash_truth": 30.0, "ddc_truth": 31.0, "ash_4mm": 27.0, "ddc_4mm": 26.0, "ash_16mm": 24.0, "ddc_16mm": 16.0}
     results = [cell(method, psnr, seed=seed) for method, psnr in pairs.items() for seed in range(3)]
     results += [cell("ash", 26.0), cell("ddc", 24.5)]
-    view = margin.margin_curves(scores_of(results))[0]
+    view = template_error.margin_curves(scores_of(results))[0]
     assert [(m.error_mm, m.mean) for m in view.known] == [(0.0, -1.0), (4.0, 1.0), (16.0, 8.0)]
     assert view.crossing_mm == pytest.approx(2.0)
     assert view.paper_db == 7.4
     assert view.error_at(7.4) == pytest.approx(4 + 12 * 6.4 / 7)
     assert [(m.template, m.error_mm, m.mean) for m in view.learned] == [("images", 5.0, 1.5)]
     assert view.margin_at(5.0) == pytest.approx(1 + 7 / 12) and view.margin_at(17.0) is None
-    said = margin.sentence(view)
+    said = template_error.sentence(view)
     assert "the two are equal at 2.0 mm" in said
     assert "learned from images (5.0 mm) it is +1.5 dB, on a planted error of that size +1.6 dB" in said
-    assert margin.margin_curves(scores_of(results[:6])) == ()
+    assert template_error.margin_curves(scores_of(results[:6])) == ()
 
 
 def test_learned_templates_have_their_place_on_the_curve_of_their_kind() -> None:
@@ -104,14 +104,14 @@ def test_learned_templates_have_their_place_on_the_curve_of_their_kind() -> None
     results += [replace(result, config=replace(result.config, scene="tight")) for result in elsewhere]
     scores = scores_of(results)
     loose, tight = (
-        next(c for c in margin.margin_curves(scores) if (c.scene, c.split) == (scene, "novel_view"))
+        next(c for c in template_error.margin_curves(scores) if (c.scene, c.split) == (scene, "novel_view"))
         for scene in ("loose", "tight")
     )
     assert [(m.template, m.mean) for m in loose.learned] == [("images", 1.5), ("scans", 1.0)]
     assert [(p.method, p.psnr) for p in loose.placed] == [("ash", 26.0), ("by_scans", 26.5), ("by_vertices", 27.5)]
     assert {p.planted_psnr for p in loose.placed} == {27 - 3 * 1 / 12}
-    assert (tight.learned, tight.placed) == ((), ()) and margin.placement(tight) == ""
-    assert "ASH 26.0 dB at 5.0 mm (26.8)" in margin.placement(loose)
+    assert (tight.learned, tight.placed) == ((), ()) and template_error.placement(tight) == ""
+    assert "ASH 26.0 dB at 5.0 mm (26.8)" in template_error.placement(loose)
 
 
 def test_quality_on_templates_of_known_error_has_a_curve_per_method_and_shows_no_failed_one() -> None:
@@ -119,7 +119,7 @@ def test_quality_on_templates_of_known_error_has_a_curve_per_method_and_shows_no
     results = [cell(method, psnr, seed=seed) for method, psnr in known.items() for seed in range(3)]
     results += [failed_result(cell("texture_4mm", 20.0).config, "diverged", "NaN")]
     scores = scores_of(results)
-    view = margin.margin_curves(scores)[0]
+    view = template_error.margin_curves(scores)[0]
     found = {level.method: [(mm, quality.mean) for mm, quality in level.qualities] for level in view.levels}
     expected = {"ash_truth": [(0.0, 30.0), (4.0, 27.0)], "ddc_truth": [(0.0, 31.0), (4.0, 26.0)]}
     assert found == {**expected, "oracle_texture": [(0.0, 29.0)]}

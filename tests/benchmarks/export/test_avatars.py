@@ -107,11 +107,11 @@ def test_old_commands_are_aliases_that_say_what_to_type(tube_cells, tmp_path: Pa
     cell, out = str(tube_cells["ddc"]), tmp_path / "frame.glb"
     assert cli.main(["export-avatar", cell, "--format", "glb", "--out", str(out)]) == cli.DONE
     assert out.read_bytes().startswith(b"glTF")
-    assert capsys.readouterr().err == f"export-avatar: old name; use export {cell} --format gltf --out {out}\n"
+    assert capsys.readouterr().err == "ash-bench: export-avatar is now: export\n"
     for old, form, out in (("video", "mp4", "x.gif"), ("share", "html", "x.txt")):
         assert cli.main([old, cell, "--out", out]) == cli.WRONG_INPUT
         message = capsys.readouterr().err
-        assert f"{old}: old name; use export --format {form} {cell}" in message and "expected a name that" in message
+        assert f"{old} is now: export --format {form}\n" in message and "expected a name that" in message
 
 
 def test_bvh_says_where_every_joint_is(tmp_path: Path) -> None:

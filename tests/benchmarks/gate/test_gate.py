@@ -14,20 +14,20 @@ from benchmarks import provenance
 from benchmarks.cell.cells import CellConfig, CellResult, Summary, Timing, ViewScore, failed_result
 from benchmarks.cell.methods import methods
 from benchmarks.cell.metrics import PROTOCOL
-from benchmarks.gate import words as summary
+from benchmarks.gate import summary
 from benchmarks.gate.gate import (
     TIMED_AGAIN,
     Check,
     judge,
+    judge_with_retries,
     junit,
     markdown,
     read_baseline,
     replacement,
-    settle,
     summarise,
     write_baseline,
 )
-from benchmarks.gate.words import terminal
+from benchmarks.gate.summary import terminal
 from benchmarks.report import escaping
 
 
@@ -97,7 +97,7 @@ def test_a_time_that_fails_is_measured_again_before_it_is_believed(quiet_at: int
         return [result(3 + attempt, psnr=0.0, ms=ms(attempt + 1))]
 
     calls: list[int] = []
-    head, checks = settle(BASE, "ci", run([25.0, 25.1, 24.9], ms=ms(0)), again)
+    head, checks = judge_with_retries(BASE, "ci", run([25.0, 25.1, 24.9], ms=ms(0)), again)
     assert calls == list(range(asked))
     assert {check.verdict for check in checks if check.name in ("frame", "stg4")} == {verdict}
     assert len(head.entries[0].seeds) == 3, "of the others nothing counts but their times"

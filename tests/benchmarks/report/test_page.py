@@ -20,6 +20,7 @@ from benchmarks import cli
 from benchmarks.analysis.scores import Quantity, scores_of
 from benchmarks.cell.cells import CellResult, Summary, failed_result, result_of
 from benchmarks.cell.metrics import PROTOCOL
+from benchmarks.commands import arguments
 from benchmarks.report import charts, sentences, tables, vega
 from benchmarks.report.content import Text
 from benchmarks.report.figures import speed_figure
@@ -28,7 +29,6 @@ from benchmarks.report.pictures import Album
 from benchmarks.report.scene import SceneData, scene_report
 from benchmarks.suites import runs
 from benchmarks.suites.runs import Run, read_run, results_of
-from benchmarks.verbs import arguments
 
 
 def scored(method: str, *, view: float, pose: float, frame_ms: float = 10.0, seed: int = 0) -> CellResult:

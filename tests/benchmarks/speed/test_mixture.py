@@ -1,4 +1,4 @@
-"""How idle threads wait: what the door settles for every verb, and the benchmark that shows what it is worth."""
+"""How idle threads wait: what the door settles for every command, and the benchmark that shows what it is worth."""
 
 import os
 import re

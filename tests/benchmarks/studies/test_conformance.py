@@ -11,9 +11,9 @@ from ash.files import sha256_of
 from benchmarks import cli
 from benchmarks.cell.cells import Cell, CellConfig, read_result
 from benchmarks.cell.sealing import Tampering, Trespass, seen_by_method, training_copy, watched
+from benchmarks.commands import arguments
 from benchmarks.studies.conformance import check_method
 from benchmarks.suites.engine import Limits, run_in_process, write_config
-from benchmarks.verbs import arguments
 
 LIMITS = Limits(seconds=60.0, memory_mb=700)
 

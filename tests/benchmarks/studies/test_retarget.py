@@ -12,7 +12,7 @@ from PIL import Image
 from ash.capture.formats import load_capture, read_template_truth
 from ash.files import InputError
 from benchmarks import cli
-from benchmarks.verbs import arguments
+from benchmarks.commands import arguments
 from synth.capture import make_body, make_capture
 from synth.motion.importing import import_motion
 from synth.readers.retargeting import retargeted, scene_of
@@ -89,6 +89,8 @@ def test_the_scene_of_a_capture_comes_back_from_its_manifest(capture: Path, moti
         scene_of(replace(manifest, seed=1, parameters=manifest.parameters | {"seed": 1}), capture)
     with pytest.raises(InputError, match="no scene of this version"):
         scene_of(replace(manifest, parameters={}), capture)
+    with pytest.raises(InputError, match="fps: expected float, got '12'"):
+        scene_of(replace(manifest, parameters=manifest.parameters | {"fps": "12"}), capture)
 
 
 def test_nothing_to_drive_and_a_bad_motion_are_refused(run: Path, tmp_path: Path, capsys) -> None:

@@ -8,7 +8,7 @@ import pytest
 from helpers import fakes
 
 from ash.files import InputError
-from benchmarks.analysis.names import is_ours, look_of, titles_of, user_rows
+from benchmarks.analysis.style import is_ours, style_of, titles_of, user_rows
 from benchmarks.cell.cells import write_config
 from benchmarks.cell.methods import WRONG_BY_MM, is_oracle
 from benchmarks.suites.captures import described
@@ -200,9 +200,9 @@ def test_a_users_row_does_not_take_our_title(tmp_path: Path) -> None:
     suite = read_suite(written(tmp_path, text))
     configs = [cell_for(cell, capture, tmp_path).config for cell in suite.cells]
     with titles_of(configs):
-        assert [look_of(config.method).title for config in configs] == ["ASH", "refined", "wo_mot"]
+        assert [style_of(config.method).title for config in configs] == ["ASH", "refined", "wo_mot"]
         assert [is_ours(config.method) for config in configs] == [True, False, False]
-    assert look_of("refined").title != "refined", "outside of the report the title is ours again"
+    assert style_of("refined").title != "refined", "outside of the report the title is ours again"
 
 
 def test_a_row_has_the_title_that_its_suite_gives(tmp_path: Path) -> None:
@@ -220,7 +220,7 @@ def test_a_row_has_the_title_that_its_suite_gives(tmp_path: Path) -> None:
     write_run(Run(folder=tmp_path, suite="mine", about="a", command="", cells=cells, titles=titles))
     run = read_run(tmp_path)
     with titles_of([cell.config for cell in run.cells], run.titles):
-        assert [look_of(c.config.method).title for c in run.cells] == ["ASH", "Half the width", "ASH (narrow)"]
+        assert [style_of(c.config.method).title for c in run.cells] == ["ASH", "Half the width", "ASH (narrow)"]
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import torch
 from helpers.cells import config
 
 import ash.devices
-import benchmarks.verbs.runs
+import benchmarks.commands.runs
 from benchmarks import cli
 from benchmarks.cell.cells import Cell, read_result
 from benchmarks.suites import gpus
@@ -103,7 +103,7 @@ def test_a_run_takes_as_many_cells_side_by_side_as_there_are_gpus(
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 3)
     monkeypatch.setattr(ash.devices, "obstacle", lambda name="cuda": "")
     monkeypatch.setattr("benchmarks.provenance.cores", lambda: 5)
-    monkeypatch.setattr(benchmarks.verbs.runs, "run_and_report", lambda suite, options: taken.append(options) or 0)
+    monkeypatch.setattr(benchmarks.commands.runs, "run_and_report", lambda suite, options: taken.append(options) or 0)
     assert cli.main(["run", "ci", *flags]) == cli.DONE
     (options,) = taken
     assert options.side_by_side == cells

@@ -1,4 +1,4 @@
-"""The door's capture verbs, with files that users bring: good ones, broken ones and hostile ones."""
+"""The door's capture commands, with files that users bring: good ones, broken ones and hostile ones."""
 
 import json
 import subprocess

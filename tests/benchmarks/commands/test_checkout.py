@@ -7,7 +7,7 @@ from helpers.commands import refused
 
 from benchmarks import cli
 from benchmarks.cell import isolation
-from benchmarks.verbs import arguments
+from benchmarks.commands import arguments
 
 
 @pytest.mark.parametrize("failing", ["", "pytest", "mypy", "ruff"])

@@ -1,7 +1,7 @@
-"""How a command line becomes a verb: frozen dataclasses whose fields are arguments, read by tyro.
+"""How a command line becomes a command: frozen dataclasses whose fields are arguments, read by tyro.
 
-A verb is a frozen dataclass that is called to do its work and returns an exit code. A verb that is about a scene's or
-a method's configuration has the method `settings`, which gives that: then each of its fields is a flag as well.
+A command is a frozen dataclass that is called to do its work and returns an exit code. A command about a scene's or a
+method's configuration has the method `settings`, which returns that: then each of its fields is a flag as well.
 """
 
 import re
@@ -27,22 +27,24 @@ from tyro.constructors import PrimitiveConstructorSpec
 from ash.fields import Changes, changed, flat, nearest
 from ash.files import InputError
 
-Verb = Callable[[], int]  # Does its work, and returns the exit code.
+Command = Callable[[], int]  # Does its work, and returns the exit code.
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 SHELLS = ("bash", "zsh", "fish", "tcsh")
 MARKERS = (PositionalMetavarFromFieldName, DisallowNone)
 POSITIONAL = Positional[str].__metadata__[0]  # type: ignore[attr-defined]
-SETTINGS = "settings_"  # The field of a verb that holds a configuration.
+SETTINGS = "settings_"  # The field of a command that holds a configuration.
 
 _typed: list[str] = []
 
 
-def _whole(least: int) -> PrimitiveConstructorSpec[Any]:
+def _whole(least: int, most: int | None = None) -> PrimitiveConstructorSpec[Any]:
     def read(texts: list[str]) -> int:
         if not re.fullmatch(r"[+-]?\d+", texts[0]):
             raise ValueError(f"expected a whole number, got {texts[0]!r}")
         if int(texts[0]) < least:
             raise ValueError(f"expected at least {least}, got {texts[0]}")
+        if most is not None and int(texts[0]) > most:
+            raise ValueError(f"expected at most {most}, got {texts[0]}")
         return int(texts[0])
 
     return PrimitiveConstructorSpec(
@@ -65,6 +67,7 @@ def _names() -> PrimitiveConstructorSpec[tuple[str, ...]]:
 
 
 Natural = Annotated[int, _whole(0)]
+Seed = Annotated[int, _whole(0, 2**31 - 1)]
 Count = Annotated[int, _whole(1)]
 CountIfAny = Annotated[int | None, _whole(1)]
 Names = Annotated[tuple[str, ...], _names()]  # Separated by commas.
@@ -84,37 +87,37 @@ def typed() -> str:
     return shlex.join([own_name(), *_typed])
 
 
-def read_verb(verb: type[Any], name: str, tokens: Sequence[str]) -> Verb:
-    """The verb with the arguments of a command line. Asked for help, it prints that and ends the process.
+def read_command(command: type[Any], name: str, tokens: Sequence[str]) -> Command:
+    """The command with the arguments of a command line. Asked for help, it prints that and ends the process.
 
     Raises:
         InputError: an argument is missing, unknown or wrong; one line, with the nearest names.
     """
     _typed[:] = [name, *tokens]
-    wanted, config = verb, None
-    if hasattr(verb, "settings"):
-        known = _as_far_as_known(verb, name, tokens)
+    wanted, config = command, None
+    if hasattr(command, "settings"):
+        known = _as_far_as_known(command, name, tokens)
         config = None if known is None else known.settings()
-        wanted = verb if config is None else _with_settings(verb, config)
-    return cast(Verb, _read(wanted, f"{own_name()} {name}", tokens, _flags(verb, config)))
+        wanted = command if config is None else _with_settings(command, config)
+    return cast(Command, _read(wanted, f"{own_name()} {name}", tokens, _flags(command, config)))
 
 
-def changes_of(verb: Any) -> Changes:
-    """What the command line changed in the configuration that the verb is about."""
-    settings = getattr(verb, SETTINGS, None)
+def changes_of(command: Any) -> Changes:
+    """What the command line changed in the configuration that the command is about."""
+    settings = getattr(command, SETTINGS, None)
     return () if settings is None else changed(type(settings)(), settings)
 
 
-def completion(verbs: dict[str, type[Any]], tokens: Sequence[str]) -> None:
-    """Print a script that completes verbs and flags in a shell (`--tyro-print-completion bash`), and end."""
+def completion(commands: dict[str, type[Any]], tokens: Sequence[str]) -> None:
+    """Print a script that completes commands and flags in a shell (`--tyro-print-completion bash`), and end."""
     if len(tokens) < 2 or tokens[1] not in SHELLS:
         raise InputError(f"{tokens[0]}: expected one of {', '.join(SHELLS)}")
-    tyro.extras.subcommand_cli_from_dict(cast(Any, verbs), prog="ash-bench", args=list(tokens), config=MARKERS)
+    tyro.extras.subcommand_cli_from_dict(cast(Any, commands), prog="ash-bench", args=list(tokens), config=MARKERS)
 
 
-def _with_settings(verb: type[Any], config: Any) -> type[Any]:
-    """The verb with the configuration's fields as further flags; those that the verb has itself stay its own."""
-    own = {f.name for f in fields(verb)}
+def _with_settings(command: type[Any], config: Any) -> type[Any]:
+    """The command with the configuration's fields as further flags; those that the command has itself stay its own."""
+    own = {f.name for f in fields(command)}
     flags: list[Any] = []
     for f in fields(config):
         if f.init and f.name not in own:
@@ -124,18 +127,18 @@ def _with_settings(verb: type[Any], config: Any) -> type[Any]:
     settings.__doc__ = (type(config).__doc__ or "").splitlines()[0] or None
     where = FlagConversionOff[Annotated[settings, arg(name="", prefix_name=False)]]  # type: ignore[valid-type]
     return make_dataclass(
-        verb.__name__,
+        command.__name__,
         [(SETTINGS, where, field(default=settings()))],
-        bases=(verb,),
+        bases=(command,),
         frozen=True,
         kw_only=True,
-        namespace={"__doc__": verb.__doc__},
+        namespace={"__doc__": command.__doc__},
     )
 
 
-def _as_far_as_known(verb: type[Any], name: str, tokens: Sequence[str]) -> Any:
-    """The verb without what belongs to a configuration, or None where even its own arguments are incomplete."""
-    known = _flags(verb, None)
+def _as_far_as_known(command: type[Any], name: str, tokens: Sequence[str]) -> Any:
+    """The command without what belongs to a configuration, or None where even its own arguments are incomplete."""
+    known = _flags(command, None)
     kept: list[str] = []
     waiting = iter(range(len(tokens)))
     for index in waiting:
@@ -152,7 +155,7 @@ def _as_far_as_known(verb: type[Any], name: str, tokens: Sequence[str]) -> Any:
     for missing in ([], ["."]) if helped else ([],):  # Help on a method needs no capture.
         try:
             with _errors.on_parse_error(_stop):
-                return tyro.cli(verb, prog=name, args=[*kept, *missing], config=MARKERS, return_unknown_args=True)[0]
+                return tyro.cli(command, prog=name, args=[*kept, *missing], config=MARKERS, return_unknown_args=True)[0]
         except _StoppedError:
             continue
     return None
@@ -166,18 +169,18 @@ def _stop(event: Any) -> None:
     raise _StoppedError
 
 
-def _read(verb: type[Any], prog: str, tokens: Sequence[str], known: tuple[str, ...]) -> Any:
+def _read(command: type[Any], prog: str, tokens: Sequence[str], known: tuple[str, ...]) -> Any:
     def refuse(event: _errors.ParseErrorEvent) -> None:
         raise InputError(_problem(event, known))
 
     with _errors.on_parse_error(refuse):
-        return tyro.cli(verb, prog=prog, args=list(tokens), config=MARKERS)
+        return tyro.cli(command, prog=prog, args=list(tokens), config=MARKERS)
 
 
-def _flags(verb: type[Any], config: Any) -> tuple[str, ...]:
+def _flags(command: type[Any], config: Any) -> tuple[str, ...]:
     """Every flag that there is, as it is typed."""
     names = []
-    for f in fields(verb):
+    for f in fields(command):
         marks = getattr(f.type, "__metadata__", ())
         if is_dataclass(f.default):
             names += [key.name for key in fields(f.default)]

@@ -14,9 +14,9 @@ from typing import Literal
 from scipy import stats
 
 from benchmarks.analysis.contrasts import difference
-from benchmarks.analysis.names import look_of
 from benchmarks.analysis.scores import Scores
 from benchmarks.analysis.statistics import Difference, moderated
+from benchmarks.analysis.style import style_of
 from benchmarks.cell.methods import is_oracle
 from synth.presets import RUNGS
 
@@ -29,7 +29,7 @@ RIVAL = "ddc"  # a column of its own: what a mesh would lose in ASH's place
 COLOUR = "sh_3"  # what the part is called, whichever degree was the highest
 DEGREES = {COLOUR: 3, "sh_2": 2, "sh_1": 1}
 # The expected diagonal: which rows lack what the one phenomenon of a scene asks for. Who lacks all motion lacks its
-# window as well; decoders are off without motion, which `skinned` should not need.
+# window as well; decoders are off without motion, which `skinned` should not effect.
 EXPECTED = {
     "splats": (),
     "still": (),
@@ -51,7 +51,7 @@ EXPERIMENTS = {
 ON_TRIAL = tuple(dict.fromkeys(row for rows in EXPECTED.values() for row in rows))  # Of others nothing is expected.
 ZERO_DOSE = "skinned"  # A rung of strength 0 has its images, bit for bit.
 DOSES = {"_half": 0.5, "": 1.0, "_twice": 2.0}  # how a scene's name ends, times the rung's strength
-MARGIN_DB = 0.2  # A loss below this is no need.
+MARGIN_DB = 0.2  # A loss below this is no effect.
 LEVEL = 0.05
 
 
@@ -67,12 +67,12 @@ class Part:
     def title(self) -> str:
         """What is missing, for readers."""
         if self.row not in DEGREES:
-            return look_of(self.row).title
+            return style_of(self.row).title
         return f"SH {DEGREES.get(self.without, 0)}, not {DEGREES[self.within]}"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Need:
+class AblationEffect:
     """A cell: foreground PSNR lost without the part in dB (None: not run there), with p corrected over all cells."""
 
     scene: str
@@ -122,12 +122,12 @@ class Matrix:
     split: str
     scenes: tuple[str, ...]
     parts: tuple[Part, ...]
-    needs: tuple[Need, ...]
+    effects: tuple[AblationEffect, ...]
 
     @property
     def has_intervals(self) -> bool:
         """Whether a cell has one; without any, nothing can be told."""
-        return any(need.verdict != "unknown" for need in self.needs)
+        return any(effect.verdict != "unknown" for effect in self.effects)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -152,8 +152,8 @@ def matrix(scores: Scores, split: str) -> Matrix | None:
     if len(scenes) < 2 or all(part.row == RIVAL for part in parts):
         return None
     found = losses(scores, split)
-    needs = [
-        Need(
+    effects = [
+        AblationEffect(
             scene=scene,
             part=part,
             loss=found.get((scene, part)),
@@ -162,7 +162,7 @@ def matrix(scores: Scores, split: str) -> Matrix | None:
         for scene in scenes
         for part in parts
     ]
-    return Matrix(split=split, scenes=scenes, parts=parts, needs=corrected(needs))
+    return Matrix(split=split, scenes=scenes, parts=parts, effects=corrected(effects))
 
 
 def losses(scores: Scores, split: str) -> dict[tuple[str, Part], Difference]:
@@ -212,13 +212,15 @@ def _column(row: str) -> tuple[int, int]:
     return ON_TRIAL.index(beside) if beside in ON_TRIAL else len(ON_TRIAL), -DEGREES.get(row, 0)
 
 
-def corrected(needs: Sequence[Need]) -> tuple[Need, ...]:
+def corrected(effects: Sequence[AblationEffect]) -> tuple[AblationEffect, ...]:
     """The cells with their p corrected for how many of them there are."""
-    known = [need.loss.p for need in needs if need.loss is not None and not math.isnan(need.loss.p)]
+    known = [effect.loss.p for effect in effects if effect.loss is not None and not math.isnan(effect.loss.p)]
     adjusted = iter(stats.false_discovery_control(known) if known else ())
     return tuple(
-        need if need.loss is None or math.isnan(need.loss.p) else replace(need, p_adjusted=float(next(adjusted)))
-        for need in needs
+        effect
+        if effect.loss is None or math.isnan(effect.loss.p)
+        else replace(effect, p_adjusted=float(next(adjusted)))
+        for effect in effects
     )
 
 

@@ -1,4 +1,4 @@
-"""Verbs that make, score and report cells and runs: run, train, eval, rescore, report, compare, merge."""
+"""Commands that make, score and report cells and runs: run, train, eval, report, compare."""
 
 import os
 import sys
@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from ash.files import InputError
-from benchmarks.verbs.arguments import (
+from benchmarks.commands.arguments import (
     DONE,
     FAILED,
     INTERRUPTED,
     CountIfAny,
     Folder,
     Names,
-    Natural,
+    Seed,
     changes_of,
     typed,
 )
-from benchmarks.verbs.devices import CPU, DeviceName, DeviceNameIfAny, chosen_device, gpus_for, on_device
+from benchmarks.commands.devices import CPU, DeviceName, DeviceNameIfAny, chosen_device, gpus_for, on_device
 
 if TYPE_CHECKING:
     from benchmarks.suites.runs import Run as RunOnDisk
@@ -34,7 +34,7 @@ LpipsWeights = Annotated[Path | None, arg(metavar="FILE")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunVerb:
+class RunCommand:
     """Run a suite: capture, train, evaluate, report.
 
     SUITE is one of ours (`suites` prints them) or a file of yours. Flags narrow or widen it.
@@ -42,8 +42,8 @@ class RunVerb:
     On a cluster whose machines share a disk, as a Slurm array of 20 jobs, each one core, all into one folder; each job
     resumes if started again: `ash-bench synth tight`, `ash-bench synth loose` once, then `sbatch --array=1-20 --wrap
     'ash-bench run table --out runs/table --workers 1 --shard $SLURM_ARRAY_TASK_ID/20'`, then `ash-bench report
-    runs/table`. Without a shared disk give each shard its own --out and put them together with `ash-bench merge`. On a
-    Dask cluster, `ash-bench run table --executor dask://HOST:8786`; with --device cuda, on the workers that were
+    runs/table`. Without a shared disk give each shard its own --out, then `ash-bench report A B --out RUN` merges them.
+    On a Dask cluster, `ash-bench run table --executor dask://HOST:8786`; with --device cuda, on the workers that were
     started with `--resources GPU=1`.
     """
 
@@ -145,11 +145,13 @@ def run_and_report(suite: "Suite", options: "RunOptions") -> int:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReportVerb:
+class ReportCommand:
     """Write a report: of a run again, or of any cells and runs together.
 
+    Shards of one run are merged: their cells are copied to --out, which is then the whole run.
+
     What --publish leaves holds cells.zip, every number of every cell. Unpacked, that is a run for `report` and
-    `compare`: `unzip reports/quick/cells.zip -d runs/earlier`.
+    `compare`: `unzip reports/people/cells.zip -d runs/earlier`.
     """
 
     runs: Positional[tuple[Path, ...]]  # folders of runs or of single cells
@@ -159,12 +161,16 @@ class ReportVerb:
 
     def __call__(self) -> int:
         """Write it, and copy it where that is asked for."""
+        from benchmarks.suites.merge import are_shards, merge_runs
         from benchmarks.suites.runs import gathered, read_run, require_for_choosing
 
         if not self.runs:
             raise InputError("expected the folder of a run or of a cell")
         if len(self.runs) == 1 and self.out is None:
             run = read_run(self.runs[0])
+        elif are_shards(self.runs):
+            merge_runs(self.runs, out := self.out or Path("runs/report"))
+            run = read_run(out)
         else:
             run = gathered(self.runs, self.out or Path("runs/report"), command=typed())
         if self.chosen_on is None:
@@ -181,7 +187,7 @@ class ReportVerb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareVerb:
+class CompareCommand:
     """Put two runs side by side: before and after, row by row, with the worst frames of each."""
 
     before: Positional[Path]  # a run's folder or a cell's
@@ -200,23 +206,7 @@ class CompareVerb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MergeVerb:
-    """Put the cells of shards together and report."""
-
-    shards: Positional[tuple[Path, ...]]  # folders of runs
-    out: Folder  # of the whole run
-
-    def __call__(self) -> int:
-        """Copy, then report."""
-        from benchmarks.suites.merge import merge_runs
-        from benchmarks.suites.runs import read_run
-
-        merge_runs(self.shards, self.out)
-        return _report(read_run(self.out))
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainVerb:
+class TrainCommand:
     """Train and evaluate one method on one capture.
 
     Every field of the method's configuration is a flag (--model.texels 128 --training.steps 5000), if the method offers
@@ -226,7 +216,7 @@ class TrainVerb:
     method: Positional[str]  # an entry point, or package.module:factory
     capture: Positional[Path]  # the capture's folder
     preset: str = "cpu"  # budget of the method: ci, cpu, ...
-    seed: Natural = 0  # of the training
+    seed: Seed = 0  # of the training
     device: DeviceName = CPU  # where it learns and draws: cpu, cuda, cuda:1, or auto
     out: Folder = Path("runs/train")  # where cells go
     row: str = ""  # what it is called in tables; default: the method's name and what is changed
@@ -277,33 +267,25 @@ class TrainVerb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvalVerb:
-    """Render and score a run's cells again from their checkpoints."""
+class EvalCommand:
+    """Render and score a run's cells again from their checkpoints, or score their stored predictions again."""
 
     run: Positional[Path]  # a run's folder or a cell's
+    scores_only: FlagCreatePairsOff[bool] = False  # score the stored predictions: nothing is loaded or rendered
     device: DeviceNameIfAny = None  # where avatars draw that have a choice: cpu, cuda, ...; default: as they learned
-
-    def __call__(self) -> int:
-        """Render and score."""
-        from benchmarks.cell.process import evaluate_cell
-
-        device = None if self.device is None else chosen_device(self.device)
-        return _again(self.run, partial(evaluate_cell, device=device))
-
-
-@dataclass(frozen=True, kw_only=True)
-class RescoreVerb:
-    """Recompute every quality from a run's stored predictions."""
-
-    run: Positional[Path]  # a run's folder or a cell's
     lpips_weights: LpipsWeights = None  # AlexNet's, of torchvision; default: torch's cache; without them LPIPS is n/a
 
     def __call__(self) -> int:
-        """Score."""
-        from benchmarks.cell.process import rescore_cell
+        """Render where that is asked for, and score."""
+        from benchmarks.cell.process import evaluate_cell, rescore_cell
 
+        if self.scores_only and self.device is not None:
+            raise InputError("--scores-only renders nothing: expected no --device")
         _use_lpips(self.lpips_weights)
-        return _again(self.run, rescore_cell)
+        if self.scores_only:
+            return _again(self.run, rescore_cell)
+        device = None if self.device is None else chosen_device(self.device)
+        return _again(self.run, partial(evaluate_cell, device=device))
 
 
 def _use_lpips(weights: Path | None) -> None:

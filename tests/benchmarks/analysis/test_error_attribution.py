@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from ash.capture.formats import load_capture
-from benchmarks.analysis import causes
-from benchmarks.analysis.causes import REGIONS, Cause, Share, region_map, shares
+from benchmarks.analysis import error_attribution
+from benchmarks.analysis.error_attribution import REGIONS, ErrorAttribution, Share, region_map, shares
 from benchmarks.cell import metrics
 from benchmarks.cell.cells import ViewScore
 
 VIEW = ViewScore(split="novel_pose", camera="a", frame=0, prediction="d" * 64, scores={})
 
 
-def cause(error: dict[str, float], pixels: dict[str, float], rank: float = 0.0) -> Cause:
+def cause(error: dict[str, float], pixels: dict[str, float], rank: float = 0.0) -> ErrorAttribution:
     found = tuple(Share(region=name, pixels=pixels.get(name, 0.0), error=error.get(name, 0.0)) for name in REGIONS)
     nothing = np.zeros((1, 1, 4), np.uint8)
-    return Cause(
+    return ErrorAttribution(
         view=VIEW,
         shares=found,
         novelty_deg=21.4,
@@ -50,9 +50,9 @@ def test_a_region_explains_a_frame_if_its_error_is_dense_and_the_largest() -> No
 def test_depth_bends_at_edges_and_not_on_slopes() -> None:
     slope = np.tile(np.linspace(2.0, 4.0, 9), (9, 1))  # 25 cm per pixel
     hit = np.ones((9, 9), bool)
-    assert not causes._depth_steps(slope, hit).any()
+    assert not error_attribution._depth_steps(slope, hit).any()
     slope[:, 5:] += 0.2
-    assert set(np.flatnonzero(causes._depth_steps(slope, hit).any(0))) == {4, 5}
+    assert set(np.flatnonzero(error_attribution._depth_steps(slope, hit).any(0))) == {4, 5}
 
 
 def test_regions_cover_truth_and_prediction_and_nothing_else(small_capture: Path) -> None:
@@ -60,7 +60,7 @@ def test_regions_cover_truth_and_prediction_and_nothing_else(small_capture: Path
     camera, frame = capture.splits["novel_pose"].views[0]
     truth = metrics.foreground(metrics.on_black(capture.image(camera, frame)))
     predicted = np.roll(truth, 6, axis=1)
-    seen = causes._seen_triangles(capture.folder, capture.identity)
+    seen = error_attribution._seen_triangles(capture.folder, capture.identity)
     regions = region_map(capture, camera, frame, truth, predicted, seen)
     assert ((regions >= 0) == (truth | predicted)).all()
     assert (regions[truth & ~predicted] == REGIONS.index("silhouette")).all()

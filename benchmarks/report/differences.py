@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 from benchmarks.analysis import contrasts
 from benchmarks.analysis.contrasts import Contrast
-from benchmarks.analysis.names import SPLIT_NAMES
 from benchmarks.analysis.scores import RANKED_SPLITS, Scores
+from benchmarks.analysis.style import SPLIT_NAMES
 from benchmarks.report import figures
 from benchmarks.report.content import Block, Chart, Entry, Head, Row, Section, Table, Text
 
@@ -14,7 +14,7 @@ NOTE = (
     "Foreground PSNR. Bold: chance is excluded at 5 % among all rows of a table. Detectable: the smallest true "
     "difference that this design would find four times in five."
 )
-SIGHT_NOTE = (
+DETECTABLE_NOTE = (
     "The smallest true difference that so many captures (subjects in this outfit) would show four times in five, from "
     "how the differences spread over the captures here: of the middle row, and of the row that spreads most. A single "
     "capture shows none: whatever is found on it may be its own."
@@ -32,7 +32,7 @@ def sections(scores: Scores, scene: str, found: Sequence[Contrast], beside: Sequ
     if not found:
         return [Section(title=f"Differences to ASH on {scene}", blocks=charted)] if charted else []
     apart = (_table(scores, scene, beside, title="On near and far motion"),) if beside else ()
-    blocks = (*charted, _table(scores, scene, found), *apart, Text(text=NOTE, note=True), *_sights(found))
+    blocks = (*charted, _table(scores, scene, found), *apart, Text(text=NOTE, note=True), *_detectable(found))
     return [Section(title=f"Which differences are established on {scene}", blocks=blocks)]
 
 
@@ -70,7 +70,7 @@ def _table(scores: Scores, scene: str, found: Sequence[Contrast], *, title: str 
 def _row(c: Contrast) -> Row:
     numbers = (
         Entry(text=SPLIT_NAMES[c.split].title),
-        Entry(text=f"{c.test.mean:+.2f}", sort=c.test.mean, mark="strong" if c.established else ""),
+        Entry(text=f"{c.test.mean:+.2f}", sort=c.test.mean, mark="strong" if c.significant else ""),
         Entry(text=f"[{c.test.low:+.2f}, {c.test.high:+.2f}]", sort=c.test.low),
         Entry(text="n/a" if math.isnan(c.bootstrap[0]) else f"[{c.bootstrap[0]:+.2f}, {c.bootstrap[1]:+.2f}]"),
         Entry(text=f"{c.p_adjusted:.2g}", sort=c.p_adjusted),
@@ -80,12 +80,12 @@ def _row(c: Contrast) -> Row:
     return Row(name=c.title, entries=numbers)
 
 
-def _sights(found: Sequence[Contrast]) -> tuple[Block, ...]:
-    by_split = {split: contrasts.sights(found, split) for split in RANKED_SPLITS}
+def _detectable(found: Sequence[Contrast]) -> tuple[Block, ...]:
+    by_split = {split: contrasts.detectable_effects(found, split) for split in RANKED_SPLITS}
     rows = tuple(
-        Row(name=SPLIT_NAMES[split].title, entries=tuple(map(_sight, sights)))
-        for split, sights in by_split.items()
-        if sights
+        Row(name=SPLIT_NAMES[split].title, entries=tuple(map(_detectable_entry, detectable_effects)))
+        for split, detectable_effects in by_split.items()
+        if detectable_effects
     )
     if not rows:
         return ()
@@ -93,10 +93,10 @@ def _sights(found: Sequence[Contrast]) -> tuple[Block, ...]:
         Head(title=f"{count} {'capture' if count == 1 else 'captures'}", unit="dB") for count in contrasts.COUNTS
     )
     table = Table(title="What more captures would show", corner="split", columns=heads, rows=rows)
-    return table, Text(text=SIGHT_NOTE, note=True)
+    return table, Text(text=DETECTABLE_NOTE, note=True)
 
 
-def _sight(sight: contrasts.Sight) -> Entry:
-    if math.isinf(sight.middle):
+def _detectable_entry(effect: contrasts.DetectableEffect) -> Entry:
+    if math.isinf(effect.middle):
         return Entry(text="none")
-    return Entry(text=f"{sight.middle:.2f} to {sight.worst:.2f}", sort=sight.middle)
+    return Entry(text=f"{effect.middle:.2f} to {effect.worst:.2f}", sort=effect.middle)

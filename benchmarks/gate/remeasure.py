@@ -1,22 +1,22 @@
-"""More cells of a suite's methods, with seeds of their own, for the gate's times."""
+"""More cells of a suite's methods, with other seeds, to measure times again."""
 
 from collections.abc import Collection
 from dataclasses import replace
 
 from benchmarks.cell.cells import CellResult, result_of
-from benchmarks.gate.gate import Pair
+from benchmarks.gate.gate import Row
 from benchmarks.suites.captures import make_capture
 from benchmarks.suites.runs import RunOptions, cell_for, run_missing
 from benchmarks.suites.suites import Suite
 
 
-def run_again(
-    suite: Suite, options: RunOptions, seeds: Collection[int], pairs: Collection[Pair] | None = None
+def remeasure(
+    suite: Suite, options: RunOptions, seeds: Collection[int], rows: Collection[Row] | None = None
 ) -> list[CellResult]:
-    """Results of more cells of a suite's methods, or of `pairs` of them alone; interrupted ones are left out."""
+    """Results of more cells of all methods of a suite, or of `rows` alone; interrupted cells are left out."""
     specs = [replace(spec, seed=seed) for seed in seeds for spec in suite.narrowed(seeds=1).cells]
     folders = {spec.capture: make_capture(spec.capture, options.data, workers=options.workers) for spec in specs}
     cells = [cell_for(spec, folders[spec.capture], options.out) for spec in specs]
-    chosen = [cell for cell in cells if pairs is None or (cell.config.place, cell.config.method) in pairs]
+    chosen = [cell for cell in cells if rows is None or (cell.config.place, cell.config.method) in rows]
     run_missing(chosen, suite, options)
     return [result for cell in chosen if (result := result_of(cell)) is not None]

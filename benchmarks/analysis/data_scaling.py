@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import pandas as pd
 
-from benchmarks.analysis.names import look_of
 from benchmarks.analysis.scores import HELD_OUT_SPLITS
 from benchmarks.analysis.statistics import independent, mean_interval
+from benchmarks.analysis.style import style_of
 from benchmarks.cell.cells import CellResult
 from benchmarks.suites.stress import FOOTAGE_FRAMES
 
@@ -53,9 +53,9 @@ def pays_at(table: pd.DataFrame, method: str) -> dict[str, pd.Series]:
 
 def sentences(table: pd.DataFrame) -> list[str]:
     """When motion pays, for every method that learns from it."""
-    rest = f"{look_of(STATIC).title} on held-out motion"
+    rest = f"{style_of(STATIC).title} on held-out motion"
     return [
-        f"On {scene}, {look_of(method).title} is above {rest} {_when(ahead)}."
+        f"On {scene}, {style_of(method).title} is above {rest} {_when(ahead)}."
         for method in dict.fromkeys(table.method)
         if method != STATIC
         for scene, ahead in pays_at(table, method).items()

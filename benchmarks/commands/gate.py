@@ -1,4 +1,4 @@
-"""Verbs of the gate."""
+"""Commands of the gate."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from tyro.conf import FlagCreatePairsOff
 
 from ash.files import InputError
-from benchmarks.verbs.arguments import DONE, FAILED, Count, File, Folder, Natural
-from benchmarks.verbs.runs import run_and_report
+from benchmarks.commands.arguments import DONE, FAILED, Count, File, Folder
+from benchmarks.commands.runs import run_and_report
 
 if TYPE_CHECKING:
     from benchmarks.gate.gate import Baseline
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GateVerb:
+class GateCommand:
     """Compare a run with a committed baseline; exit code 1 where it is worse."""
 
     baseline: File = Path("reports/baseline.json")  # what the run is compared with
@@ -32,8 +32,8 @@ class GateVerb:
         """Judge the run, or make it the baseline."""
         from ash.files import write_atomic
         from benchmarks.gate import gate as rules
-        from benchmarks.gate.again import run_again
-        from benchmarks.gate.words import terminal
+        from benchmarks.gate.remeasure import remeasure
+        from benchmarks.gate.summary import terminal
         from benchmarks.provenance import changed_since, cores
         from benchmarks.suites.runs import RunOptions, read_run, require_complete, results_of
 
@@ -52,10 +52,10 @@ class GateVerb:
             results = results_of(read_run(options.out))
             if baseline is None:
                 more = range(suite.seeds, suite.seeds + rules.TIMED_AGAIN)
-                head = rules.summarise(suite.name, results, run_again(suite, options, more))
+                head = rules.summarise(suite.name, results, remeasure(suite, options, more))
             else:
-                head, checks = rules.settle(
-                    baseline, suite.name, results, lambda slow, k: run_again(suite, options, [suite.seeds + k], slow)
+                head, checks = rules.judge_with_retries(
+                    baseline, suite.name, results, lambda slow, k: remeasure(suite, options, [suite.seeds + k], slow)
                 )
         if baseline is None:
             rules.write_baseline(self.baseline, rules.replacement(self.baseline, head))
@@ -80,20 +80,3 @@ class GateVerb:
                 f"--suite {self.suite}: expected the suite {baseline.suite!r}, which {self.baseline} is of"
             )
         return suite
-
-
-@dataclass(frozen=True, kw_only=True)
-class GateRatesVerb:
-    """Measure the gate's false alarms and the planted defects it catches."""
-
-    reruns: Natural = 20  # unchanged runs
-    out: Folder = Path("runs/gate-rates")  # where they go
-    data: Folder = Path("data")  # where captures are kept
-
-    def __call__(self) -> int:
-        """Measure and print."""
-        from benchmarks.gate.rates import markdown, measure
-        from benchmarks.provenance import cores
-
-        print(markdown(measure(self.out, self.data, reruns=self.reruns, workers=cores())))
-        return DONE

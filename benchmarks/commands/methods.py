@@ -1,4 +1,4 @@
-"""Verbs that look at single methods: check-method, search, display, retarget."""
+"""Commands that look at single methods: check-method, search, display, retarget."""
 
 import sys
 import tempfile
@@ -8,11 +8,11 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from ash.files import InputError
-from benchmarks.verbs.arguments import DONE, FAILED, Count, CountIfAny, File, Folder, Trust, typed
+from benchmarks.commands.arguments import DONE, FAILED, Count, CountIfAny, File, Folder, Trust, typed
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckMethodVerb:
+class CheckMethodCommand:
     """Check that a method keeps the rules (docs/plugin.md)."""
 
     method: Positional[str]  # an entry point, or package.module:factory
@@ -51,7 +51,7 @@ class CheckMethodVerb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DisplayVerb:
+class DisplayCommand:
     """Time a trained mesh avatar's OpenGL display, and compare its picture."""
 
     run: Positional[Path]  # a run's folder or a cell's
@@ -85,7 +85,7 @@ class DisplayVerb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RetargetVerb:
+class RetargetCommand:
     """Drive a run's avatars with a motion file, and score them against its truth."""
 
     run: Positional[Path]  # a run's folder or a cell's
@@ -112,7 +112,7 @@ class RetargetVerb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchVerb:
+class SearchCommand:
     """Train ash or ddc with one setting of its preset changed at a time."""
 
     method: Positional[str]  # ash or ddc

@@ -19,26 +19,26 @@ from ash.files import InputError
 from benchmarks import cli
 from benchmarks.cell.cells import CellConfig, read_cell, read_result, write_config, write_result
 from benchmarks.cell.process import placed_on
+from benchmarks.commands import doctor
+from benchmarks.commands.devices import chosen_device, on_device
 from benchmarks.play.actors import open_cast
 from benchmarks.provenance import gpu_name
 from benchmarks.report.sentences import doubts
 from benchmarks.speed import pace, rows
 from benchmarks.suites.files import find_suite
-from benchmarks.verbs import doctor
-from benchmarks.verbs.devices import chosen_device, on_device
 
 without_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
 
 
 @without_cuda
 @pytest.mark.parametrize(
-    "verb",
+    "command",
     [("run", "ci"), ("train", "ash", "a-folder"), ("eval", "a-run"), ("play", "a-run"), ("speed", "kernels")],
-    ids=lambda verb: verb[0],
+    ids=lambda command: command[0],
 )
-def test_a_gpu_that_is_not_there_is_one_line_and_exit_code_2(verb: tuple[str, ...], capsys) -> None:
-    assert refused(capsys, *verb, "--device", "cuda").endswith(f"device cuda: {obstacle()}")
-    assert "expected cpu, cuda or cuda:N, got 'gpu'" in refused(capsys, *verb, "--device", "gpu")
+def test_a_gpu_that_is_not_there_is_one_line_and_exit_code_2(command: tuple[str, ...], capsys) -> None:
+    assert refused(capsys, *command, "--device", "cuda").endswith(f"device cuda: {obstacle()}")
+    assert "expected cpu, cuda or cuda:N, got 'gpu'" in refused(capsys, *command, "--device", "gpu")
 
 
 def test_auto_takes_cuda_where_it_works_and_says_why_where_not(monkeypatch: pytest.MonkeyPatch, capsys) -> None:

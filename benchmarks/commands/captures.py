@@ -1,4 +1,4 @@
-"""Verbs that make and check captures: synth, verify, undistort, motions, sheets."""
+"""Commands that make and check captures: synth, verify, undistort, motions, sheets."""
 
 import contextlib
 import sys
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, UseAppendAction, arg
 
 from ash.files import InputError
-from benchmarks.verbs.arguments import DONE, WRONG_INPUT, Count, CountIfAny, File, Folder, Natural, changes_of
+from benchmarks.commands.arguments import DONE, WRONG_INPUT, Count, CountIfAny, File, Folder, Seed, changes_of
 
 if TYPE_CHECKING:
     from synth.scene import Scene, Take
@@ -49,7 +49,7 @@ Excerpts = Annotated[Excerpt, arg(name="", prefix_name=False)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class SynthVerb:
+class SynthCommand:
     """Render the ground truth of a scene into a capture folder.
 
     Every field of the scene is a flag (--rig.cameras 44 --outfit.swing 0.8); `synth SCENE --help` lists them.
@@ -63,8 +63,8 @@ class SynthVerb:
     scene: Positional[str]  # its name
     size: str = "quick"  # of the capture: ci, rung, quick, long, table or paper
     out: Folder | None = None  # default: data/SCENE-SIZE-SEED
-    seed: Natural = 0  # root seed of the scene
-    subject: Natural = 0  # who it is: body, skin, hair, clothes and prints follow from the number
+    seed: Seed = 0  # root seed of the scene
+    subject: Seed = 0  # who it is: body, skin, hair, clothes and prints follow from the number
     motion: File | None = None  # train on this motion (BVH or AMASS .npz)
     test_motion: File | None = None  # test on this motion
     excerpt: Excerpts = Excerpt()
@@ -165,7 +165,7 @@ def _shard(text: str | None) -> tuple[int, int]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VerifyVerb:
+class VerifyCommand:
     """Hash every file of a capture again."""
 
     folder: Positional[Path]  # of the capture
@@ -187,7 +187,7 @@ class VerifyVerb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class UndistortVerb:
+class UndistortCommand:
     """Resample a capture whose lenses distort for pinhole cameras."""
 
     folder: Positional[Path]  # of the capture
@@ -202,7 +202,7 @@ class UndistortVerb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionsVerb:
+class MotionsCommand:
     """Draw what a motion file becomes on our skeleton, in seconds: nothing is rendered."""
 
     file: Positional[Path]  # BVH or AMASS .npz
@@ -228,7 +228,7 @@ class MotionsVerb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SheetsVerb:
+class SheetsCommand:
     """Draw a contact sheet of all scenes and a turntable, or one of people."""
 
     out: Folder | None = None  # where they go; default: reports/scenes, or reports/people

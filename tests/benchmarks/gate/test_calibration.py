@@ -1,4 +1,4 @@
-"""The gate's own rates: planted defects do what they say, and the verdicts on them are counted right."""
+"""The gate's error rates: planted defects have an effect, and the verdicts on them are counted."""
 
 import subprocess
 import sys
@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import fakes
+from helpers import fakes, planted_defects
 from helpers.captures import tiny_preset, write_tube_capture
 
 from ash.capture.dataset import Capture, Pose
 from ash.files import InputError, read_json
 from ash.protocol import Avatar, StageClock
 from benchmarks.cell.methods import code_version, find_method
-from benchmarks.gate import again, defects, gate, rates
+from benchmarks.gate import calibration, gate, remeasure
 from benchmarks.suites.files import read_suite
 from benchmarks.suites.runs import RunOptions
 
@@ -41,7 +41,7 @@ def trained_image(
     factory: Callable[..., Avatar], capture: Capture, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> np.ndarray:
     """What a method draws after a few steps of training on a tiny model."""
-    monkeypatch.setattr(defects, "named", lambda _: tiny_preset(steps=6, warmup_steps=2))
+    monkeypatch.setattr(planted_defects, "named", lambda _: tiny_preset(steps=6, warmup_steps=2))
     avatar = factory(capture.training_only(), seed=0, preset="ci")
     avatar.fit(capture.training_only(), folder=folder)
     camera = next(iter(capture.cameras.values()))
@@ -49,10 +49,10 @@ def trained_image(
 
 
 def none(capture: Capture, *, seed: int, preset: str) -> Avatar:
-    return defects._ash(capture, seed, preset)
+    return planted_defects._ash(capture, seed, preset)
 
 
-@pytest.mark.parametrize("defect", defects.DEFECTS, ids=lambda defect: defect.__name__)
+@pytest.mark.parametrize("defect", planted_defects.DEFECTS, ids=lambda defect: defect.__name__)
 def test_a_defect_changes_what_is_drawn_or_what_it_costs(
     defect: Callable[..., Avatar],
     tube: Capture,
@@ -60,23 +60,23 @@ def test_a_defect_changes_what_is_drawn_or_what_it_costs(
     monkeypatch: pytest.MonkeyPatch,
     changes_undone: None,
 ) -> None:
-    sound = defects.sound_sh if defect is defects.sh_frame else none
+    sound = planted_defects.sound_sh if defect is planted_defects.sh_frame else none
     before = trained_image(sound, tube, tmp_path / "sound", monkeypatch)
     after = trained_image(defect, tube, tmp_path / "defect", monkeypatch)
     assert np.isfinite(after).all()
-    assert np.array_equal(before, after) == (defect in (defects.slow_splatter, defects.more_memory))
+    assert np.array_equal(before, after) == (defect in (planted_defects.slow_splatter, planted_defects.more_memory))
 
 
 def test_defects_can_be_loaded_where_the_generator_of_truth_is_hidden() -> None:
     """As in a cell: a defect that cannot start is none."""
-    told = "import sys; sys.modules['synth'] = None; import benchmarks.gate.defects"
-    subprocess.run([sys.executable, "-c", told], check=True)
+    code = "import sys; sys.path.append(sys.argv[1]); sys.modules['synth'] = None; import helpers.planted_defects"
+    subprocess.run([sys.executable, "-c", code, str(Path(__file__).parents[2])], check=True)
 
 
 def test_one_camera_off_is_off_by_so_many_pixels(tube: Capture) -> None:
     camera = next(iter(tube.cameras.values()))
     point = (-camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3] + 3 * camera.viewmat[2, :3])[None]  # on its axis
-    shift = defects._turned(camera, 2.0).project(point)[0] - camera.project(point)[0]
+    shift = planted_defects._turned(camera, 2.0).project(point)[0] - camera.project(point)[0]
     np.testing.assert_allclose(shift[0], [2.0, 0.0], atol=0.01)
 
 
@@ -85,28 +85,28 @@ def on_fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rates of methods that need no training: the names of defects are names of methods."""
     capture = fakes.write_capture(tmp_path / "capture")
     fakes.use(tmp_path / "plugins", monkeypatch)
-    for module in (rates, again):
+    for module in (calibration, remeasure):
         monkeypatch.setattr(module, "make_capture", lambda *_, **__: capture)
-    monkeypatch.setattr(rates, "SEEDS", 2)
-    monkeypatch.setattr(rates, "TIMED_AGAIN", 1)
+    monkeypatch.setattr(calibration, "SEEDS", 2)
+    monkeypatch.setattr(calibration, "TIMED_AGAIN", 1)
     monkeypatch.setattr(gate, "TIMED_AGAIN", 1)
-    monkeypatch.setattr(rates, "SOUND", "fake_good")
-    monkeypatch.setattr(rates, "SOUND_FOR", {})
-    monkeypatch.setattr(rates, "_target", lambda name: name)
+    monkeypatch.setattr(calibration, "SOUND", "fake_good")
+    monkeypatch.setattr(calibration, "SOUND_FOR", {})
+    monkeypatch.setattr(calibration, "_target", lambda name: name)
 
 
 @pytest.mark.usefixtures("on_fakes")
 def test_unchanged_code_and_defects_are_judged_and_written_down(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rates, "DEFECTS", (fake_bad,))
-    found = rates.measure(tmp_path / "out", tmp_path, reruns=2, workers=2)
-    assert [trial.name for trial in found.unchanged] == ["seeds 3 to 4", "seeds 6 to 7"]
+    monkeypatch.setattr(planted_defects, "DEFECTS", (fake_bad,))
+    found = calibration.calibrate(2, tmp_path / "out", tmp_path, workers=2)
+    assert [trial.name for trial in found.unchanged] == ["rerun 1", "rerun 2"]
     (defect,) = found.defects
-    assert defect.alarm and any("psnr" in check.what for check in defect.flagged)
-    text = (tmp_path / "out" / "rates.md").read_text()
-    assert "Planted defects caught: 1 of 1" in text and "of 2 (95 % interval" in text
-    assert len(read_json(tmp_path / "out" / "rates.json")["defects"]) == 1
+    assert any("psnr" in check.what for check in defect.flagged)
+    text = (tmp_path / "out" / "calibration.md").read_text()
+    assert "Planted defects reported: 1 of 1" in text and "of 2 (95 % interval" in text
+    assert len(read_json(tmp_path / "out" / "calibration.json")["defects"]) == 1
 
 
 def fake_bad() -> None:
@@ -115,9 +115,9 @@ def fake_bad() -> None:
 
 @pytest.mark.usefixtures("on_fakes")
 def test_a_defect_that_fails_is_none_that_was_caught(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rates, "DEFECTS", (fake_raising,))
+    monkeypatch.setattr(planted_defects, "DEFECTS", (fake_raising,))
     with pytest.raises(InputError, match="fake_raising, seed 3: expected a result to judge"):
-        rates.measure(tmp_path / "out", tmp_path, reruns=0, workers=2)
+        calibration.calibrate(0, tmp_path / "out", tmp_path, workers=2)
 
 
 def fake_raising() -> None:
@@ -125,10 +125,10 @@ def fake_raising() -> None:
 
 
 def test_a_method_may_be_named_by_its_path_and_is_known_by_its_source() -> None:
-    method = find_method("benchmarks.gate.defects:holes")
-    assert method.load() is defects.holes
+    method = find_method("helpers.planted_defects:holes")
+    assert method.load() is planted_defects.holes
     assert not method.is_ours
-    assert code_version("benchmarks.gate.defects:holes") != code_version("ash")
+    assert code_version("helpers.planted_defects:holes") != code_version("ash")
     for wrong in ("benchmarks.nothing:holes", "nothing.at.all:f"):
         with pytest.raises(InputError, match="unknown method"):
             find_method(wrong)
@@ -139,8 +139,8 @@ def test_more_cells_are_run_of_all_methods_or_of_some(tmp_path: Path, monkeypatc
     fakes.use(tmp_path / "plugins", monkeypatch)
     suite = read_suite(fakes.write_suite(tmp_path, capture))
     options = RunOptions(out=tmp_path / "out", data=tmp_path, workers=1)
-    both = again.run_again(suite, options, [7])
+    both = remeasure.remeasure(suite, options, [7])
     assert [(result.config.method, result.config.seed) for result in both] == [("fake_good", 7), ("fake_bad", 7)]
     assert all(result.timing is not None for result in both)
-    (one,) = again.run_again(suite, options, [7], {(both[1].config.place, "fake_bad")})
+    (one,) = remeasure.remeasure(suite, options, [7], {(both[1].config.place, "fake_bad")})
     assert one == both[1], "what is there is not run again"

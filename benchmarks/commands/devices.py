@@ -1,4 +1,4 @@
-"""The flag `--device` of verbs that train or draw: which device is meant, and which rows of a suite can take it."""
+"""The flag `--device` of commands that train or draw: which device is meant, and which rows of a suite can take it."""
 
 import sys
 from dataclasses import replace

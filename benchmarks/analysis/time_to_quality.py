@@ -6,9 +6,9 @@ from itertools import combinations, pairwise
 import numpy as np
 import pandas as pd
 
-from benchmarks.analysis.names import SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import HELD_OUT_SPLITS
 from benchmarks.analysis.statistics import independent, mean_interval
+from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell.cells import CellResult
 
 COLUMNS = ("scene", "split", "method", "seconds", "capture", "seed", "psnr")
@@ -90,8 +90,8 @@ def sentences(table: pd.DataFrame) -> list[str]:
     """The crossings in words; and pairs that never cross, by who leads throughout."""
     crossed = crossings(table)
     found = [
-        f"On {row.scene}, {SPLIT_NAMES[row.split].words}, {look_of(row.leader).title} is ahead of"
-        f" {look_of(row.other).title} from {row.seconds:.0f} s of training on."
+        f"On {row.scene}, {SPLIT_NAMES[row.split].words}, {style_of(row.leader).title} is ahead of"
+        f" {style_of(row.other).title} from {row.seconds:.0f} s of training on."
         for row in crossed.itertuples()
     ]
     for (scene, split), here in table.groupby(["scene", "split"], sort=False):
@@ -101,7 +101,8 @@ def sentences(table: pd.DataFrame) -> list[str]:
             if len(margin) and ((margin > 0).all() or (margin < 0).all()):
                 ahead, behind = (first, second) if margin.iloc[0] > 0 else (second, first)
                 found.append(
-                    f"On {scene}, {SPLIT_NAMES[split].words}, {look_of(ahead).title} is ahead of"
-                    f" {look_of(behind).title} at every time, by {abs(margin).min():.1f} to {abs(margin).max():.1f} dB."
+                    f"On {scene}, {SPLIT_NAMES[split].words}, {style_of(ahead).title} is ahead of"
+                    f" {style_of(behind).title} at every time,"
+                    f" by {abs(margin).min():.1f} to {abs(margin).max():.1f} dB."
                 )
     return found

@@ -7,7 +7,7 @@ import pytest
 from helpers.cells import cell
 
 from ash.protocol import TrainingOutcome
-from benchmarks.analysis import anytime, footage, stability
+from benchmarks.analysis import data_scaling, stability, time_to_quality
 from benchmarks.analysis.scores import scores_of
 from benchmarks.cell.cells import CellResult, CurvePoint, Snapshot
 from benchmarks.cell.curves import seconds_to_settle
@@ -31,29 +31,29 @@ LEARNED = {30: 22.0, 60: 23.5, 120: 25.0, 240: 26.0}
 
 def test_methods_cross_where_their_scores_are_equal():
     """ASH is 0.5 dB behind after a minute and 1 dB ahead after two: a third of the way, in the logarithm."""
-    table = anytime.curves([trained("wo_mot", STATIC), trained("ash", LEARNED)])
+    table = time_to_quality.curves([trained("wo_mot", STATIC), trained("ash", LEARNED)])
     views = table[table.split == "novel_view"]
     assert views[views.method == "ash"].psnr.tolist() == [22.0, 23.5, 25.0, 26.0]
     assert views[views.method == "wo_mot"].psnr.tolist() == [23.0, 24.0, 24.0, 24.0]  # It had ended: kept.
-    found = anytime.crossings(views)
+    found = time_to_quality.crossings(views)
     assert (found.leader.tolist(), found.other.tolist()) == (["ash"], ["wo_mot"])
     assert found.seconds.item() == pytest.approx(60 * 2 ** (1 / 3))
-    said = anytime.sentences(views)
+    said = time_to_quality.sentences(views)
     assert said == ["On loose, held-out views, ASH is ahead of w/o mot. from 76 s of training on."]
 
 
 def test_a_pair_that_never_crosses_is_said_to():
-    table = anytime.curves([trained("wo_mot", STATIC), trained("ash", {s: p + 1 for s, p in STATIC.items()})])
-    assert anytime.sentences(table)[0].endswith("ASH is ahead of w/o mot. at every time, by 1.0 to 1.0 dB.")
+    table = time_to_quality.curves([trained("wo_mot", STATIC), trained("ash", {s: p + 1 for s, p in STATIC.items()})])
+    assert time_to_quality.sentences(table)[0].endswith("ASH is ahead of w/o mot. at every time, by 1.0 to 1.0 dB.")
 
 
 def test_seeds_give_intervals():
     cells = [
         trained("ash", {s: p + shift for s, p in LEARNED.items()}, seed=i) for i, shift in enumerate((-0.2, 0, 0.2))
     ]
-    table = anytime.curves(cells)
+    table = time_to_quality.curves(cells)
     assert (table.high > table.psnr).all() and (table.low < table.psnr).all()
-    assert np.isnan(anytime.curves(cells[:1]).low).all()
+    assert np.isnan(time_to_quality.curves(cells[:1]).low).all()
 
 
 def test_seeds_are_averaged_within_captures_and_captures_give_intervals():
@@ -63,7 +63,7 @@ def test_seeds_are_averaged_within_captures_and_captures_give_intervals():
         for seed in (0, 1)
         for run in [trained("ash", {s: p + shift + seed for s, p in LEARNED.items()}, seed=seed)]
     ]
-    first = anytime.curves(runs).query("split == 'novel_view'").iloc[0]
+    first = time_to_quality.curves(runs).query("split == 'novel_view'").iloc[0]
     assert (first.psnr, first.high - first.psnr) == (24.5, pytest.approx(12.706 * 2.0, rel=1e-4))  # t of 1 degree
 
 
@@ -85,9 +85,9 @@ def test_motion_pays_from_the_frames_on_after_which_it_never_loses(scores: tuple
 
     results = [made("ash", score, count) for count, score in frames.items()]
     results += [made("wo_mot", 23.0, count) for count in frames]
-    table = footage.curves(results)
+    table = data_scaling.curves(results)
     assert table[(table.method == "ash") & (table.split == "novel_pose")].frames.tolist() == [20, 40, 80, 160, 320]
-    assert footage.sentences(table) == [f"On loose, ASH is above w/o mot. on held-out motion {expected}"]
+    assert data_scaling.sentences(table) == [f"On loose, ASH is above w/o mot. on held-out motion {expected}"]
     assert list(dict.fromkeys(table.split)) == ["novel_view", "novel_pose"], "as they are told everywhere"
     assert stability.curves(scores_of(results)) == (), "less footage spoils nothing"
 

@@ -31,7 +31,7 @@ def terminal(baseline: Baseline, head: Baseline, checks: Sequence[Check], change
         lines.append(f"  {check.verdict:22} {check.what}: {check.detail}")
     if bad:
         one_of_many = len({c.scene for c in bad}) < len({c.scene for c in checks})
-        lines += ["", f"What moved: {pattern(checks)}.", *suspects(bad, changed, one_of_many=one_of_many)]
+        lines += ["", f"What moved: {pattern(checks)}.", *likely_sources(bad, changed, one_of_many=one_of_many)]
     else:
         lines += [f"  {check.what}: {check.detail}" for check in checks]
     not_judged: dict[str, list[str]] = {}
@@ -60,7 +60,7 @@ def pattern(checks: Sequence[Check]) -> str:
     return f"{methods}, on {scenes}, in {kinds}{', for the better: a leak looks like progress' if better else ''}"
 
 
-def suspects(bad: Sequence[Check], changed: Sequence[str] | None, *, one_of_many: bool) -> list[str]:
+def likely_sources(bad: Sequence[Check], changed: Sequence[str] | None, *, one_of_many: bool) -> list[str]:
     """Where to look, and which files there changed since the baseline."""
     places = _places(bad, one_of_many)
     lines = [f"Look at: {', '.join(places)}."]

@@ -1,4 +1,4 @@
-"""Verbs that show a trained avatar, or write it or a capture for other programs: play, export."""
+"""Commands that show a trained avatar, or write it or a capture for other programs: play, export."""
 
 import contextlib
 import sys
@@ -10,8 +10,8 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from ash.capture.dataset import Pose
 from ash.files import InputError, write_atomic
-from benchmarks.verbs.arguments import DONE, Count, CountIfAny, File, Names, Natural, Trust
-from benchmarks.verbs.devices import CPU, DeviceName, chosen_device
+from benchmarks.commands.arguments import DONE, Count, CountIfAny, File, Names, Natural, Trust
+from benchmarks.commands.devices import CPU, DeviceName, chosen_device
 
 if TYPE_CHECKING:
     from benchmarks.play.actors import Cast
@@ -21,7 +21,7 @@ Stretch = Annotated[str | None, arg(metavar="A:B")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlayVerb:
+class PlayCommand:
     """Play a run's avatars in the browser, beside the truth."""
 
     run: Positional[Path]  # a run's folder or a cell's
@@ -67,7 +67,7 @@ class PlayVerb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportVerb:
+class ExportCommand:
     """Write a capture or a trained avatar for other programs.
 
     Captures: ash (the release's files), nerfstudio, colmap, plain (images, cameras and poses of the training part),
@@ -97,11 +97,14 @@ class ExportVerb:
     def __call__(self) -> int:
         """Write it."""
         from ash.capture.manifest import is_capture
+        from benchmarks.aliases import OLD_FORMATS
         from benchmarks.export.formats import FORMATS as OF_AVATARS
         from benchmarks.export.formats import suffix_of
         from synth.readers.export import FORMATS as OF_CAPTURES
 
         capture = is_capture(self.source)
+        if not capture and self.form in OLD_FORMATS:
+            return replace(self, form=OLD_FORMATS[self.form])()
         allowed, kind = (OF_CAPTURES, "a capture") if capture else (OF_AVATARS, "a trained avatar")
         if self.form not in allowed:
             expected = f"expected one of {', '.join(allowed)} for {kind}"

@@ -42,7 +42,7 @@ class Share:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Cause:
+class ErrorAttribution:
     """A bad frame: its regions, the pose's distance to the nearest training pose, and where that ranks in its split."""
 
     view: ViewScore
@@ -70,7 +70,7 @@ class Cause:
 
 def worst_frames(
     capture: Capture, cell: Cell, result: CellResult, *, split: str = "novel_pose", count: int = 3
-) -> tuple[Cause, ...]:
+) -> tuple[ErrorAttribution, ...]:
     """The causes of a method's worst frames by foreground PSNR, each from another frame; none without pixel truth."""
     if not (capture.folder / "truth" / "surface.npz").exists():
         return ()
@@ -88,20 +88,20 @@ def worst_frames(
     novelty = dict(zip(frames, novelty_deg(capture.motion, train=train, test=frames), strict=True))
     ranks = {frame: _rank(list(novelty.values()), novelty[frame]) for frame in frames}
     return tuple(
-        _cause(capture, cell, view, seen, novelty_deg=novelty[view.frame], novelty_rank=ranks[view.frame])
+        _attribution(capture, cell, view, seen, novelty_deg=novelty[view.frame], novelty_rank=ranks[view.frame])
         for view in chosen
     )
 
 
-def _cause(
+def _attribution(
     capture: Capture, cell: Cell, view: ViewScore, seen: np.ndarray, *, novelty_deg: float, novelty_rank: float
-) -> Cause:
+) -> ErrorAttribution:
     truth = metrics.on_black(capture.image(view.camera, view.frame))
     predicted = stored_prediction(cell, capture, View(split=view.split, camera=view.camera, frame=view.frame))
     masks = metrics.foreground(truth), metrics.foreground(predicted)
     regions = region_map(capture, view.camera, view.frame, *masks, seen)
     error = ((truth[..., :3].astype(float) - predicted[..., :3]) ** 2).sum(-1)
-    return Cause(
+    return ErrorAttribution(
         view=view,
         shares=shares(regions, error),
         novelty_deg=novelty_deg,

@@ -1,4 +1,4 @@
-"""Verbs about this checkout and machine: speed, doctor, test, suites, docs."""
+"""Commands about this checkout and machine: speed, doctor, test, suites, docs."""
 
 import os
 import subprocess
@@ -13,8 +13,8 @@ from typing import Literal
 from tyro.conf import FlagCreatePairsOff, Positional
 
 from ash.files import InputError
-from benchmarks.verbs.arguments import DONE, FAILED, File, Folder, Trust
-from benchmarks.verbs.devices import CPU, DeviceName, DeviceNameIfAny, chosen_device
+from benchmarks.commands.arguments import DONE, FAILED, File, Folder, Trust
+from benchmarks.commands.devices import CPU, DeviceName, DeviceNameIfAny, chosen_device
 
 PUBLIC = (
     "ash.capture",
@@ -29,7 +29,7 @@ PUBLIC = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class SpeedVerb:
+class SpeedCommand:
     """Time the kernels, or whole frames by stage, beside their definitions."""
 
     what: Positional[Literal["kernels", "frame"]]  # kernels or frame
@@ -81,14 +81,14 @@ class SpeedVerb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DoctorVerb:
+class DoctorCommand:
     """What this machine has, and what follows from it."""
 
     device: DeviceNameIfAny = None  # where training steps are timed, for five seconds; default: on a GPU that works
 
     def __call__(self) -> int:
         """Look and print."""
-        from benchmarks.verbs.doctor import examine, table
+        from benchmarks.commands.doctor import examine, table
 
         findings = examine(Path(), None if self.device is None else chosen_device(self.device))
         print(table(findings))
@@ -96,7 +96,7 @@ class DoctorVerb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SuitesVerb:
+class SuitesCommand:
     """Print our suites, each as the file that makes it: a copy of one is a start for your own (`run FILE.toml`)."""
 
     name: Positional[str] = ""  # only this one
@@ -116,7 +116,7 @@ class SuitesVerb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DocsVerb:
+class DocsCommand:
     """Write the reference of the public names as HTML, from their docstrings; needs pdoc."""
 
     out: Folder = Path("runs/docs")  # where the pages go
@@ -134,7 +134,7 @@ class DocsVerb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TestVerb:
+class TestCommand:
     """Run every check that CI runs; what follows -- goes to pytest."""
 
     pytest: Positional[tuple[str, ...]] = ()  # arguments for pytest

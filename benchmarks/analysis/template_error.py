@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from itertools import pairwise, product
 
 from benchmarks.analysis.contrasts import difference
-from benchmarks.analysis.names import SPLIT_NAMES, look_of
 from benchmarks.analysis.scores import Quantity, Scores, foreground
 from benchmarks.analysis.statistics import Interval, mean_interval
+from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell.methods import ON_EXACT, WRONG_BY_MM
 
 # ASH (CVPR 2024), Table 1: PSNR of ASH minus DDC, tight and loose clothes.
@@ -162,7 +162,7 @@ def placement(curve: MarginCurve) -> str:
     """Where ASH stands on templates of its own, in one sentence; empty where it has none."""
     said = []
     for placed in curve.placed:
-        text = f"{look_of(placed.method).title} {placed.psnr:.1f} dB at {placed.error_mm:.1f} mm"
+        text = f"{style_of(placed.method).title} {placed.psnr:.1f} dB at {placed.error_mm:.1f} mm"
         said.append(text if placed.planted_psnr is None else f"{text} ({placed.planted_psnr:.1f})")
     if not said:
         return ""

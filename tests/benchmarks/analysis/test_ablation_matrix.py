@@ -9,7 +9,17 @@ import pytest
 from helpers.cells import cell
 from scipy import stats
 
-from benchmarks.analysis.necessity import EXPECTED, EXPERIMENTS, ON_TRIAL, Matrix, Need, Part, corrected, doses, matrix
+from benchmarks.analysis.ablation_matrix import (
+    EXPECTED,
+    EXPERIMENTS,
+    ON_TRIAL,
+    AblationEffect,
+    Matrix,
+    Part,
+    corrected,
+    doses,
+    matrix,
+)
 from benchmarks.analysis.scores import Scores, scores_of
 from benchmarks.analysis.statistics import Difference, paired
 from benchmarks.cell.cells import CellResult, Summary, failed_result
@@ -55,7 +65,7 @@ def view(scores: Scores) -> Matrix:
 
 
 def verdicts(scores: Scores) -> dict[tuple[str, str], str]:
-    return {(need.scene, need.part.row): need.verdict for need in view(scores).needs}
+    return {(effect.scene, effect.part.row): effect.verdict for effect in view(scores).effects}
 
 
 def test_parts_are_the_rows_of_the_run_in_the_order_of_the_expected_diagonal(ladder: Scores) -> None:
@@ -63,7 +73,7 @@ def test_parts_are_the_rows_of_the_run_in_the_order_of_the_expected_diagonal(lad
     assert [part.row for part in found.parts] == ["wo_mot", "sh_3", "sh_1", "wo_heading"]
     assert [part.title for part in found.parts][1:3] == ["SH 0, not 3", "SH 1, not 3"]
     assert found.scenes == ("skinned", "wrinkles", "swing", "turning", "glossy"), "doses are no rungs"
-    assert len(found.needs) == 4 * 5
+    assert len(found.effects) == 4 * 5
 
 
 def test_verdicts_are_what_the_numbers_allow(ladder: Scores) -> None:
@@ -82,12 +92,12 @@ def test_verdicts_are_what_the_numbers_allow(ladder: Scores) -> None:
 def test_degrees_of_colour_are_told_against_the_highest_that_was_run() -> None:
     base = {"ash": 27.0, "sh_1": 27.9, "sh_2": 28.0}
     results = people("skinned", {"ash": 27.0, "wo_mot": 26.0}) + people("glossy", base)
-    found = {need.part.title: need for need in view(scores_of(results)).needs if need.scene == "glossy"}
+    found = {effect.part.title: effect for effect in view(scores_of(results)).effects if effect.scene == "glossy"}
     assert [title for title in found if title.startswith("SH")] == ["SH 0, not 2", "SH 1, not 2"]
     assert found["SH 0, not 2"].expected and found["SH 0, not 2"].verdict == "needed"
     assert not found["SH 1, not 2"].expected and found["SH 1, not 2"].verdict == "not needed"
     alone = people("skinned", {"ash": 27.0, "wo_mot": 26.0}) + people("glossy", {"ash": 27.0, "sh_1": 27.9})
-    told = {need.part.title: need for need in view(scores_of(alone)).needs if need.scene == "glossy"}
+    told = {effect.part.title: effect for effect in view(scores_of(alone)).effects if effect.scene == "glossy"}
     assert told["SH 0, not 1"].expected and told["SH 0, not 1"].verdict == "needed"
 
 
@@ -101,13 +111,13 @@ def test_one_scene_or_no_part_makes_no_matrix() -> None:
 
 def test_a_part_that_was_not_run_on_a_scene_is_unknown_there() -> None:
     results = people("still", {"ash": 27.0, "wo_mot": 26.0}) + people("swing", {"ash": 27.0, "wo_phi": 26.0})
-    found = {(need.scene, need.part.row): need for need in view(scores_of(results)).needs}
+    found = {(effect.scene, effect.part.row): effect for effect in view(scores_of(results)).effects}
     assert found["still", "wo_phi"].loss is None and found["still", "wo_phi"].verdict == "unknown"
     assert found["still", "wo_phi"].surprise == ""
 
 
 def test_surprises_are_what_contradicts_the_expected_diagonal(ladder: Scores) -> None:
-    told = [need.surprise for need in view(ladder).needs if need.surprise]
+    told = [effect.surprise for effect in view(ladder).effects if effect.surprise]
     assert [text.partition(":")[0] for text in told] == ["skinned, w/o mot.", "swing, w/o mot.", "turning, w/o heading"]
     assert told[0].endswith("needed though nothing in the scene asks for it.")
     assert told[1].endswith("not needed where it should be needed.")
@@ -118,21 +128,23 @@ def test_a_surprise_names_the_experiment_that_explains_it_where_it_was_run() -> 
     base = {"ash": 27.0, "wo_mot": 26.0, "wo_disp": 27.0}
     shown = people("skinned", base) + people("wrinkles", base)
     run = [*shown, *people("overcast", base | {"wo_mot": 26.9}), *people("wrinkles_twice", base | {"wo_disp": 25.0})]
-    told = {need.surprise.partition(":")[0]: need.surprise for need in view(scores_of(run)).needs if need.surprise}
+    told = {
+        effect.surprise.partition(":")[0]: effect.surprise for effect in view(scores_of(run)).effects if effect.surprise
+    }
     assert "asks for it. By experiment, under an even sky" in told["skinned, w/o mot."]
     assert "+0.10 dB" in told["skinned, w/o mot."].partition("(overcast)")[2]
     assert "+2.00 dB" in told["wrinkles, w/o disp."].partition("(wrinkles_twice)")[2]
-    assert not any("experiment" in need.surprise for need in view(scores_of(shown)).needs)
+    assert not any("experiment" in effect.surprise for effect in view(scores_of(shown)).effects)
     ladder = {scene.name: set(scene.methods) for scene in find_suite("ladder").scenes}
     assert all({part, "ash"} <= ladder[place] for (_, part), (place, _) in EXPERIMENTS.items()), "our suite runs them"
 
 
 def test_significance_is_corrected_over_all_cells_as_by_hand() -> None:
-    def need(p: float) -> Need:
+    def need(p: float) -> AblationEffect:
         loss = Difference(mean=1.0, low=0.5, high=1.5, p=p, spread=1.0, effect=1.0, detectable=1.0)
-        return Need(scene="wrinkles", part=PART, loss=loss)
+        return AblationEffect(scene="wrinkles", part=PART, loss=loss)
 
-    empty = Need(scene="swing", part=PART, loss=None)
+    empty = AblationEffect(scene="swing", part=PART, loss=None)
     found = corrected([need(0.04), empty, need(0.01), need(math.nan), need(0.9)])
     assert [each.p_adjusted for each in found[::2]] == pytest.approx([0.06, 0.03, 0.9])
     assert math.isnan(found[1].p_adjusted) and math.isnan(found[3].p_adjusted)
@@ -143,7 +155,7 @@ def test_a_matrix_of_chance_cries_wolf_in_one_of_twenty_cases_at_most() -> None:
     rng, rounds, wolves = np.random.default_rng(7), 120, 0
     for _ in range(rounds):
         losses = [paired(list(rng.normal(0, 0.6, 4)), [0.0] * 4) for _ in range(30)]
-        cells = corrected([Need(scene="still", part=PART, loss=loss) for loss in losses])
+        cells = corrected([AblationEffect(scene="still", part=PART, loss=loss) for loss in losses])
         wolves += any(each.verdict in ("needed", "harmful") for each in cells)
     assert stats.binomtest(wolves, rounds, 0.05, alternative="greater").pvalue > 0.01, wolves / rounds
 
@@ -169,7 +181,7 @@ def test_the_matrix_is_a_picture_with_the_expected_cells_framed(ladder: Scores) 
     text = "".join(drawn.itertext())
     assert "+1.50" in text and "1.5 to 1.5" in text and "SH 0, not 3" in text
     framed = [path for path in drawn.iter("{http://www.w3.org/2000/svg}path") if path.get("stroke-width") == "2.5"]
-    expected = sum(need.expected for need in view(ladder).needs)
+    expected = sum(effect.expected for effect in view(ladder).effects)
     assert len(framed) == expected == 5 - 1
     assert "Framed" in figures["needs_novel_view"].caption
     assert figures["needs_novel_view"].specs()[0]["width"] == "container"

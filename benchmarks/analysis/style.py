@@ -1,0 +1,177 @@
+"""How methods are called and coloured in tables and charts; a method of someone else keeps its own name."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from functools import cache
+
+from ash.files import hash_of
+from benchmarks.cell.cells import CellConfig
+from benchmarks.cell.methods import DECIDING_PACKAGES, methods
+from benchmarks.suites.files import our_rows
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class MethodStyle:
+    """A method's name for readers and its colour, which reads on white and on dark paper."""
+
+    title: str
+    colour: str
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SplitName:
+    """What a split, or the place of costs, is called over a column, and in a sentence."""
+
+    title: str
+    words: str
+
+
+STYLES = {
+    "ash": MethodStyle(title="ASH", colour="#2f6fde"),
+    "ash_truth": MethodStyle(title="ASH, exact surface", colour="#2f6fde"),
+    "ddc": MethodStyle(title="DDC", colour="#dd6b20"),
+    "ddc_truth": MethodStyle(title="DDC, exact surface", colour="#dd6b20"),
+    "wo_disp": MethodStyle(title="w/o disp.", colour="#2a9d8f"),
+    "wo_motion_offset": MethodStyle(title="w/o the motion's offset", colour="#2a9d8f"),
+    "wo_offset": MethodStyle(title="w/o any offset", colour="#5b8c2a"),
+    "wo_mot": MethodStyle(title="w/o mot.", colour="#9b59b6"),
+    "wo_mot_truncated": MethodStyle(title="w/o mot., 1/27 of the frames", colour="#7a869a"),
+    "ash_wo_base": MethodStyle(title="ASH, no learned texels", colour="#008fb3"),
+    "ddc_wo_base": MethodStyle(title="DDC, no learned texels", colour="#b8860b"),
+    "res_128": MethodStyle(title="half texels", colour="#5b8c2a"),
+    "half_width": MethodStyle(title="half width", colour="#c2415c"),
+    "res_128_half_width": MethodStyle(title="half texels and width", colour="#008fb3"),
+    "res_64": MethodStyle(title="quarter texels", colour="#a0522d"),
+    "res_512": MethodStyle(title="double texels", colour="#008fb3"),
+    "cams_12": MethodStyle(title="1/10 of the cameras", colour="#a0522d"),
+    "cams_30": MethodStyle(title="1/4 of the cameras", colour="#b8860b"),
+    "cams_60": MethodStyle(title="1/2 of the cameras", colour="#7a869a"),
+    "ash_studio": MethodStyle(title="ASH, empty studio known", colour="#5b8c2a"),
+    "ash_frugal": MethodStyle(title="ASH, frugal", colour="#2a9d8f"),
+    "window_1": MethodStyle(title="window 1", colour="#008fb3"),
+    "unlearned": MethodStyle(title="template only skinned", colour="#b8860b"),
+    "wo_phi": MethodStyle(title="w/o Phi", colour="#c2415c"),
+    "wo_light": MethodStyle(title="w/o light", colour="#b8860b"),
+    "wo_phi_and_light": MethodStyle(title="w/o Phi and light", colour="#5b8c2a"),
+    "sh_1": MethodStyle(title="SH 1", colour="#a0522d"),
+    "sh_2": MethodStyle(title="SH 2", colour="#7a869a"),
+    "sh_3": MethodStyle(title="SH 3", colour="#008fb3"),
+    "wo_heading": MethodStyle(title="w/o heading", colour="#8d6e63"),
+    "mlp": MethodStyle(title="w/ MLP", colour="#c2415c"),
+    "mlp_base": MethodStyle(title="w/ MLP on learned texels", colour="#a0522d"),
+    "smpl": MethodStyle(title="bare-body template", colour="#8d6e63"),
+    # The switches.
+    "warm_up_paper": MethodStyle(title="warm-up as in the paper", colour="#5b8c2a"),
+    "warm_up_released": MethodStyle(title="warm-up as released", colour="#7a869a"),
+    "warm_up_none": MethodStyle(title="no warm-up", colour="#b8860b"),
+    "loss_paper": MethodStyle(title="loss as in the paper", colour="#b8860b"),
+    "loss_released": MethodStyle(title="loss as released", colour="#c2415c"),
+    "norm_released": MethodStyle(title="batch norm as released", colour="#5b8c2a"),
+    "norm_instance": MethodStyle(title="instance norm", colour="#b8860b"),
+    "world_rotations": MethodStyle(title="rotations in the world", colour="#008fb3"),
+    "released_phi": MethodStyle(title="Phi as released", colour="#a0522d"),
+    "wide_dilation": MethodStyle(title="dilation of 0.3 square pixels", colour="#008fb3"),
+    "wo_base": MethodStyle(title="no learned texels, no warm-up", colour="#008fb3"),
+    "blended_anchor": MethodStyle(title="texels on blended corners", colour="#5b8c2a"),
+    "wo_light_and_motion": MethodStyle(title="w/o light and motion", colour="#8d6e63"),
+    "wo_standardise": MethodStyle(title="textures not standardised", colour="#c2415c"),
+    "wo_bound": MethodStyle(title="textures not cut off", colour="#9b59b6"),
+    "two_trunks": MethodStyle(title="two trunks", colour="#2a9d8f"),
+    "noisy_textures": MethodStyle(title="noise on textures", colour="#7a869a"),
+    "last_weights": MethodStyle(title="last weights, no mean", colour="#a0522d"),
+    "blendshapes": MethodStyle(title="blendshapes", colour="#dd6b20"),
+    # What a template is learned from.
+    "by_scans": MethodStyle(title="template by scans", colour="#2a9d8f"),
+    "ddc_by_scans": MethodStyle(title="DDC, template by scans", colour="#b8860b"),
+    "by_surface": MethodStyle(title="template by the true surface", colour="#5b8c2a"),
+    "by_vertices": MethodStyle(title="template by true vertices", colour="#008fb3"),
+    "by_graph": MethodStyle(title="template by a graph network", colour="#a0522d"),
+    "refined": MethodStyle(title="template refined by what is drawn", colour="#c2415c"),
+    "static": MethodStyle(title="static", colour="#7a869a"),
+    "nearest": MethodStyle(title="nearest image", colour="#7a869a"),
+    "oracle_texture": MethodStyle(title="best texture, exact mesh", colour="#b8860b"),
+}
+SPLIT_NAMES = {
+    "novel_view": SplitName(title="Novel view", words="held-out views"),
+    "near_pose": SplitName(title="Held-out motion: near", words="near held-out motion"),
+    "novel_pose": SplitName(title="Held-out motion: new", words="held-out motion"),
+    "far_pose": SplitName(title="Held-out motion: far", words="far held-out motion"),
+    "train_view": SplitName(title="Training view", words="training views"),
+    "speed": SplitName(title="Cost", words="cost"),
+    "memory": SplitName(title="Cost", words="cost"),
+}
+SPARE_COLOURS = ("#b8860b", "#c2415c", "#5b8c2a", "#7a869a", "#008fb3", "#a0522d")
+# Rows of published results that no suite has any more: name, factory, changes.
+FORMER_ROWS = (
+    ("ash_studio", "ash", {"training.background": "studio"}),
+    ("wo_bound", "ash", {"model.bound": "inf"}),
+)
+EXACT = {"ash": "ash_truth", "ddc": "ddc_truth"}  # A method and the same method given the exact surface.
+
+
+_USER_ROWS: ContextVar[dict[str, str]] = ContextVar("_USER_ROWS")  # titles by name
+
+
+def user_rows(configs: Iterable[CellConfig]) -> frozenset[str]:
+    """Rows that have a name of ours but another factory or other changes than ours."""
+    ours = our_rows() | {(name, factory, hash_of(changes)) for name, factory, changes in FORMER_ROWS}
+    found = set()
+    for config in configs:
+        changes = {key: value for key, value in config.changes.items() if key != "device"}
+        plain = not config.factory and not changes  # the installed method itself
+        if not plain and (config.method, config.source, hash_of(changes)) not in ours:
+            found.add(config.method)
+    return frozenset(found)
+
+
+@contextmanager
+def titles_of(configs: Iterable[CellConfig], titles: Mapping[str, str] | None = None) -> Iterator[None]:
+    """In its block, `style_of` and `is_ours` give our titles to our own rows only, not to the user's.
+
+    `titles`: those that the suite gives. A title that another row has as well is followed by the row's name.
+    """
+    configs, titles = tuple(configs), titles or {}
+    names = dict.fromkeys(config.method for config in configs)
+    users = user_rows(configs)
+    given = {
+        name: titles.get(name) or (name if name in STYLES else style_of(name).title)
+        for name in names
+        if name in titles or name in users
+    }
+    token = _USER_ROWS.set(given)
+    try:
+        shown = [style_of(name).title for name in names]
+        _USER_ROWS.set({n: title if shown.count(title) == 1 else f"{title} ({n})" for n, title in given.items()})
+        yield
+    finally:
+        _USER_ROWS.reset(token)
+
+
+def style_of(method: str) -> MethodStyle:
+    """The look of a method; unknown ones get a colour by the sum of their letters, the same in every report."""
+    own = _USER_ROWS.get({})
+    if method in STYLES and method not in own:
+        return STYLES[method]
+    name = method.rpartition(":")[2]
+    title = name.replace("_", " ") if name != method else method  # A factory's name, where it came by its path.
+    return MethodStyle(title=own.get(method, title), colour=SPARE_COLOURS[sum(method.encode()) % len(SPARE_COLOURS)])
+
+
+def is_ours(method: str) -> bool:
+    """Whether the method comes with the suite, installed or as a variant that has a look here.
+
+    A user's own stand first in reports.
+    """
+    if method in _USER_ROWS.get({}):
+        return False
+    if ":" in method:
+        return method.partition(".")[0] in DECIDING_PACKAGES
+    return _installed().get(method, method in STYLES)
+
+
+@cache
+def _installed() -> dict[str, bool]:
+    """Of each installed method, whether it is ours."""
+    return {name: method.is_ours for name, method in methods().items()}
