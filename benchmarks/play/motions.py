@@ -49,6 +49,11 @@ def acts_of(capture: Capture, more: Sequence[str] = ()) -> tuple[Act, ...]:
     return (*own, *(act_named(capture, name) for name in names))
 
 
+def first_act(acts: Sequence[Act], asked: Sequence[str]) -> int:
+    """Which of the acts a player opens on: the first that was asked for, else one that was not learned from."""
+    return [act.name for act in acts].index(asked[0]) if asked else min(1, len(acts) - 1)
+
+
 def _frames(capture: Capture, split: str) -> tuple[int, ...]:
     """The frames of a split; of near and far motion, some of which have images, the whole clips."""
     frames = capture.splits[split].frames

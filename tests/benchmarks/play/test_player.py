@@ -12,12 +12,12 @@ import numpy as np
 import psutil
 import pytest
 from helpers.browser import FLAGS, find_chromium
-from helpers.figures import tube_motion, tube_skeleton
 from helpers.viewers import PATIENCE, FakeBrowser, browsers, state_of
 from helpers.waiting import wait_for
 
-from benchmarks.export.bvh import bvh_bytes
+from ash.capture.formats import load_capture
 from benchmarks.play.doors import DoorOptions
+from benchmarks.play.motions import acts_of, first_act
 from benchmarks.play.player import PlayServer, playing
 
 
@@ -161,15 +161,18 @@ def thread_names() -> list[str]:
     return sorted(thread.name for thread in threading.enumerate() if "ThreadPool" not in thread.name)
 
 
-@pytest.mark.parametrize("name", ["train", "wave.bvh"])
-def test_it_opens_on_the_motion_that_was_asked_for(tube_run: Path, tmp_path: Path, name: str) -> None:
-    path = tmp_path / name
-    path.write_bytes(bvh_bytes(tube_skeleton(), tube_motion(6)))
-    asked = name if name == "train" else str(path)
-    with playing(tube_run, motions=(asked,)) as player, browsers(player.url, 1, width=64, height=64) as (browser,):
-        act = player.acts[state_of(player).act]
-        assert (act.name, len(act)) == (asked, 4 if name == "train" else 6)
-        browser.wait_for(lambda: f"{act.title}, frame" in browser.words, PATIENCE)
+@pytest.mark.parametrize(
+    ("asked", "opens"), [((), "test"), (("train",), "train"), (("walk",), "walk"), (("dance", "test"), "dance")]
+)
+def test_it_opens_on_the_motion_that_was_asked_for(asked: tuple[str, ...], opens: str, small_capture: Path) -> None:
+    acts = acts_of(load_capture(small_capture), asked)
+    assert len({act.name for act in acts}) == len(acts) == 2 + len(set(asked) - {"train", "test"})
+    assert acts[first_act(acts, asked)].name == opens
+
+
+def test_a_new_viewer_sees_the_motion_that_was_asked_for(tube_run: Path) -> None:
+    with playing(tube_run, motions=("train",)) as player, browsers(player.url, 1, width=64, height=64) as (browser,):
+        browser.wait_for(lambda: "Training motion, frame" in browser.words, PATIENCE)
 
 
 def test_all_threads_end_with_the_player(tube_run: Path) -> None:
