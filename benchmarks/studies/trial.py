@@ -8,6 +8,7 @@ which the method runs: a check for authors, no defence.
 import hashlib
 import sys
 import time
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
@@ -24,7 +25,7 @@ from ash.capture.typed import from_json
 from ash.files import InputError, read_json, write_json
 from ash.protocol import Avatar, StageClock
 from benchmarks.cell.children import add_method_paths
-from benchmarks.cell.methods import find_method
+from benchmarks.cell.methods import find_method, located
 from benchmarks.cell.sealing import Tampering, Trespass, watched_folders
 from benchmarks.cell.timing import peak_memory_mb
 
@@ -73,6 +74,10 @@ def main(folder: Path) -> int:
     except InputError as error:
         print(error, file=sys.stderr)
         return 2
+    except Exception as error:
+        traceback.print_exc()
+        print(located(error, trial.target), file=sys.stderr)  # The last line is what the user reads first.
+        return 1
     write_json(folder / "outcome.json", asdict(outcome))
     return 0
 

@@ -58,4 +58,4 @@ def test_every_stage_is_timed_and_they_add_up_to_the_frame(results: list[CellRes
         assert timing is not None and list(timing.stage_ms) == [f"stg{i}" for i in range(1, 5)]
         frames = np.asarray(timing.frame_ms)
         shares = np.sum(list(timing.stage_ms.values()), axis=0) / frames
-        assert (shares <= 1).all() and shares.max() > 1 / 3  # The same unit, whatever else the machine does.
+        assert (shares <= 1).all() and np.median(shares) > 0.8

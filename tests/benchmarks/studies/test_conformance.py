@@ -1,5 +1,6 @@
 """The conformance checker tells planted cheats from an honest method, and a real run is sealed in the same way."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,13 @@ def test_a_method_that_takes_too_long_is_ended(capture: Path, tmp_path: Path) ->
     checks = check_method("sleeping", capture, tmp_path / "trials", preset="ci", limits=short, workers=3)
     assert {check.rule for check in checks if check.kept is False} == {"keeps to its time"}
     assert sum(check.kept is None for check in checks) > 5, "what was not seen is not called kept"
+
+
+def test_a_crash_is_reported_with_file_and_line(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fakes.use(tmp_path / "fakes", monkeypatch)
+    checks = check_method("fake_raising", capture, tmp_path / "trials", preset="ci", limits=LIMITS, workers=2)
+    (crash,) = [check.seen for check in checks if check.rule == "comes through"]
+    assert re.fullmatch(r"seed 0: RuntimeError: the method's own mistake \(helpers/fakes\.py:\d+\)", crash)
 
 
 def test_an_honest_method_keeps_all_rules(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
