@@ -45,7 +45,13 @@ def acts_of(capture: Capture, more: Sequence[str] = ()) -> tuple[Act, ...]:
         for name, split in SPLIT_OF.items()
         if split in capture.splits
     ]
-    return (*own, *(act_named(capture, name) for name in more))
+    names = dict.fromkeys(name for name in more if name not in [act.name for act in own])
+    return (*own, *(act_named(capture, name) for name in names))
+
+
+def first_act(acts: Sequence[Act], asked: Sequence[str]) -> int:
+    """Which of the acts a player opens on: the first that was asked for, else one that was not learned from."""
+    return [act.name for act in acts].index(asked[0]) if asked else min(1, len(acts) - 1)
 
 
 def _frames(capture: Capture, split: str) -> tuple[int, ...]:
@@ -57,13 +63,14 @@ def _frames(capture: Capture, split: str) -> tuple[int, ...]:
     return tuple(np.flatnonzero(np.isin(sequence, sequence[list(frames)])).tolist())
 
 
-def _from_file(capture: Capture, path: Path) -> Act:
+def _from_file(capture: Capture, name: str) -> Act:
+    path = Path(name)
     motion = import_motion(path, capture.skeleton, fps=capture.motion.fps)
     dofs = motion.dofs[:MOST_FRAMES].copy()
     root = dofs[:, [0, 2]] + capture.skeleton.heads[0, [0, 2]]
     dofs[:, [0, 2]] -= (root.min(axis=0) + root.max(axis=0)) / 2  # Our cameras look at the middle of the floor.
     motion = replace(motion, dofs=dofs, sequence=motion.sequence[: len(dofs)])
-    return Act(name=path.stem, title=path.name, motion=motion, frames=tuple(range(len(dofs))), captured=False)
+    return Act(name=name, title=path.name, motion=motion, frames=tuple(range(len(dofs))), captured=False)
 
 
 def act_named(capture: Capture, name: str) -> Act:
@@ -80,7 +87,7 @@ def act_named(capture: Capture, name: str) -> Act:
     if Path(name).suffix.lower() not in (".bvh", ".npz"):
         known = ", ".join((*own, *GENERATORS))
         raise InputError(f"motion: expected {known}, a .bvh or an AMASS .npz file, got {name!r}")
-    return _from_file(capture, Path(name))
+    return _from_file(capture, name)
 
 
 def _made(capture: Capture, name: str) -> Act:

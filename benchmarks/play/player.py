@@ -13,7 +13,7 @@ import viser
 from benchmarks.play.actors import Cast, open_cast
 from benchmarks.play.cameras import first_camera, fov_of, middle_of, starting_place
 from benchmarks.play.doors import DoorOptions, close_server, open_server
-from benchmarks.play.motions import acts_of
+from benchmarks.play.motions import acts_of, first_act
 from benchmarks.play.page import LABEL, Page
 from benchmarks.play.picture import Painter
 from benchmarks.play.shelf import TruthShelf, truth_from
@@ -31,6 +31,7 @@ class PlayServer:
 
     def __init__(self, cast: Cast, motions: Sequence[str], doors: DoorOptions) -> None:
         self.cast, self.acts = cast, acts_of(cast.capture, motions)
+        self.first_act = first_act(self.acts, motions)
         self.shelf = TruthShelf(cast.capture)
         self.painter = Painter(cast, self.acts, self.shelf)
         self.studio = TruthStudio(cast.capture.folder)
@@ -59,7 +60,7 @@ class PlayServer:
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
 
     def _arrive(self, client: viser.ClientHandle) -> None:
-        state = ViewState(left=self.cast.titles[0], act=min(1, len(self.acts) - 1))
+        state = ViewState(left=self.cast.titles[0], act=self.first_act)
         viewer = Viewer(client, self.acts, state, self.stream.wake)
         page = Page(viewer, self.painter, self._render_truth)
         with self._lock:

@@ -48,8 +48,11 @@ def test_a_viewer_shows_the_frame_that_the_avatar_renders(
 ) -> None:
     page, out = tmp_path / "page.html", tmp_path / f"frame.{form}"
     cell = str(tube_cells["ash"])
-    assert cli.main(["share", cell, "--motion", "train", "--frames", "0", "--out", str(page)]) == cli.DONE
-    command = ["export-avatar", cell, "--format", form, "--motion", "train", "--frames", "2", "--out", str(out)]
+    assert (
+        cli.main(["export", cell, "--format", "html", "--motion", "train", "--frames", "0", "--out", str(page)])
+        == cli.DONE
+    )
+    command = ["export", cell, "--format", form, "--motion", "train", "--frames", "2", "--out", str(out)]
     assert cli.main(command) == cli.DONE
     seen = visit(page, size=(200, 200))
     seen.page.wait_for_function("window.avatar", timeout=PATIENCE)

@@ -26,7 +26,7 @@ from benchmarks.report.pictures import on_paper
 
 
 def film(run: Path, out: Path, *more: str) -> int:
-    return cli.main(["video", str(run), "--out", str(out), *more])
+    return cli.main(["export", str(run), "--format", "mp4", "--out", str(out), *more])
 
 
 def panel(frame: np.ndarray, number: int) -> np.ndarray:
@@ -76,7 +76,7 @@ def test_a_rig_gives_a_row_per_avatar_and_a_spiral_turns(tube_run: Path, tmp_pat
 
 def test_what_cannot_be_filmed_is_refused(tube_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, more, words in (
-        ("a.gif", [], "ends with .mp4 or .webp"),
+        ("a.gif", [], "ends with .mp4 or .webp for the format mp4"),
         ("a.webp", ["--camera", "cam9"], "expected spiral, rig or one of cam0"),
         ("a.webp", ["--methods", "nerf"], "method: expected one of"),
         ("a.webp", ["--frames", "9"], "within 0:2"),

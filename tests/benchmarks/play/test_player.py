@@ -15,7 +15,9 @@ from helpers.browser import FLAGS, find_chromium
 from helpers.viewers import PATIENCE, FakeBrowser, browsers, state_of
 from helpers.waiting import wait_for
 
+from ash.capture.formats import load_capture
 from benchmarks.play.doors import DoorOptions
+from benchmarks.play.motions import acts_of, first_act
 from benchmarks.play.player import PlayServer, playing
 
 
@@ -157,6 +159,20 @@ def test_browsers_that_are_killed_leave_nothing_behind(player: PlayServer, tmp_p
 
 def thread_names() -> list[str]:
     return sorted(thread.name for thread in threading.enumerate() if "ThreadPool" not in thread.name)
+
+
+@pytest.mark.parametrize(
+    ("asked", "opens"), [((), "test"), (("train",), "train"), (("walk",), "walk"), (("dance", "test"), "dance")]
+)
+def test_it_opens_on_the_motion_that_was_asked_for(asked: tuple[str, ...], opens: str, small_capture: Path) -> None:
+    acts = acts_of(load_capture(small_capture), asked)
+    assert len({act.name for act in acts}) == len(acts) == 2 + len(set(asked) - {"train", "test"})
+    assert acts[first_act(acts, asked)].name == opens
+
+
+def test_a_new_viewer_sees_the_motion_that_was_asked_for(tube_run: Path) -> None:
+    with playing(tube_run, motions=("train",)) as player, browsers(player.url, 1, width=64, height=64) as (browser,):
+        browser.wait_for(lambda: "Training motion, frame" in browser.words, PATIENCE)
 
 
 def test_all_threads_end_with_the_player(tube_run: Path) -> None:

@@ -27,7 +27,10 @@ PATIENCE = 120_000  # milliseconds: software graphics on a busy machine
 @pytest.fixture(scope="module")
 def page(tube_cells: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("shared") / "avatar.html"
-    assert cli.main(["share", str(tube_cells["ash"]), "--motion", "train", "--out", str(out)]) == cli.DONE
+    assert (
+        cli.main(["export", str(tube_cells["ash"]), "--format", "html", "--motion", "train", "--out", str(out)])
+        == cli.DONE
+    )
     return out
 
 
@@ -98,6 +101,6 @@ def test_what_cannot_be_shared_is_refused(tube_run: Path, tube_cells, tmp_path: 
         ([str(tube_cells["ash"]), "--motion", "fly", "--out", str(tmp_path / "a.html")], "expected train, test, walk"),
         ([str(tube_cells["ash"]), "--motion", "walk", "--out", str(tmp_path / "a.html")], "a person's skeleton"),
     ):
-        assert cli.main(["share", *arguments]) == cli.WRONG_INPUT
+        assert cli.main(["export", "--format", "html", *arguments]) == cli.WRONG_INPUT
         assert words in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
