@@ -25,7 +25,7 @@ from ash.decoders import Decoders
 from ash.devices import CPU, finish
 from ash.model import Decode, image_of
 from ash.protocol import StageClock
-from ash.textures import Conditions
+from ash.textures import FrameInputs
 
 LEAST_AGREEMENT_DB = 45.0  # An image at 30 dB from the truth changes by less than 0.3 dB.
 ROUNDS = 5
@@ -62,7 +62,7 @@ class Player:
         decoders = self._model.decoders
         if decoders is None:
             return ()
-        conditions = self._model.conditions(Pose(self._motion, 0))
+        conditions = self._model.frame_inputs(Pose(self._motion, 0))
         ways: dict[str, Decode] = {"float32": decoders, "bfloat16": _in_bfloat16(decoders)}
         here = conditions.textures.device == CPU
         if here and isinstance(decoders, Decoders) and find_spec("openvino") is not None:
@@ -85,7 +85,7 @@ def _in_bfloat16(decoders: nn.Module) -> Decode:
     """The decoders with weights and activations of half the size: faster where the processor multiplies them."""
     half = deepcopy(decoders).to(torch.bfloat16)
 
-    def decode(conditions: Conditions) -> Tensor:
+    def decode(conditions: FrameInputs) -> Tensor:
         with torch.autocast(conditions.textures.device.type, torch.bfloat16):
             raw: Tensor = half(conditions)
         return raw.float()
@@ -96,7 +96,7 @@ def _in_bfloat16(decoders: nn.Module) -> Decode:
 class _OfTensors(nn.Module):
     """The decoders as a function of tensors alone, so that they can be traced."""
 
-    def __init__(self, decoders: Decoders, conditions: Conditions) -> None:
+    def __init__(self, decoders: Decoders, conditions: FrameInputs) -> None:
         super().__init__()
         self.decoders, self.conditions = decoders, conditions
 
@@ -105,12 +105,12 @@ class _OfTensors(nn.Module):
         return raw
 
 
-def _in_openvino(decoders: Decoders, conditions: Conditions) -> Decode:
+def _in_openvino(decoders: Decoders, conditions: FrameInputs) -> Decode:
     """The decoders compiled by OpenVINO, in the precision that it takes for this processor's best."""
     from openvino.frontend import FrontEndManager
     from openvino.frontend.pytorch.ts_decoder import TorchScriptPythonDecoder
 
-    def inputs(seen: Conditions) -> tuple[Tensor, Tensor]:
+    def inputs(seen: FrameInputs) -> tuple[Tensor, Tensor]:
         return seen.textures.contiguous(), seen.root_translation
 
     # Not by `openvino.convert_model`, which reports its use over the network.
@@ -121,7 +121,7 @@ def _in_openvino(decoders: Decoders, conditions: Conditions) -> Decode:
     options = {"INFERENCE_NUM_THREADS": torch.get_num_threads(), "PERFORMANCE_HINT": "LATENCY"}
     compiled = _openvino().compile_model(frontend.convert(frontend.load(source)), "CPU", options)
 
-    def decode(seen: Conditions) -> Tensor:
+    def decode(seen: FrameInputs) -> Tensor:
         return torch.from_numpy(compiled([tensor.numpy() for tensor in inputs(seen)])[0])
 
     return decode
@@ -140,7 +140,7 @@ def _openvino() -> Any:
     return openvino.Core()
 
 
-def _fastest_ms(decode: Callable[[Conditions], Tensor], conditions: Conditions) -> float:
+def _fastest_ms(decode: Callable[[FrameInputs], Tensor], conditions: FrameInputs) -> float:
     best = math.inf
     for _ in range(ROUNDS):
         start = time.perf_counter()

@@ -18,7 +18,7 @@ from ash.files import InputError, link_or_copy
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted, splat
 from ash.inference import Player
-from ash.model import image_of, mixed, views_of
+from ash.model import blend_renders, image_of, views_of
 from ash.protocol import Avatar, PosedGeometry, PosesGaussians, StageClock
 from benchmarks.analysis.style import style_of
 from benchmarks.cell.cells import CHECKPOINT, Cell, is_trained, read_cell
@@ -27,7 +27,7 @@ from benchmarks.cell.process import load_avatar
 from benchmarks.play.cameras import first_camera
 from benchmarks.suites.runs import RUN_FILE, read_run
 
-Shared = list[tuple[float, Gaussians]]  # sets of Gaussians of which a picture is mixed, and their shares
+Shared = list[tuple[float, Gaussians]]  # sets of Gaussians whose renders are blended, and their shares
 
 KEPT_POSES = 48  # Playing a short motion again, or turning the camera, decodes nothing anew.
 NOT_FINITE = "the rendered image holds NaN or infinity"
@@ -111,7 +111,7 @@ class Actor:
     def _splat(self, shared: Shared, camera: Camera, behind: torch.Tensor | None) -> Splatted:
         assert isinstance(self.avatar, PosesGaussians)
         how = {**views_of([camera]), "dilation": self.avatar.dilation, "threads": torch.get_num_threads()}
-        return mixed([(share, splat(gaussians, background=behind, **how)) for share, gaussians in shared])
+        return blend_renders([(share, splat(gaussians, background=behind, **how)) for share, gaussians in shared])
 
 
 def on_colour(premultiplied: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
@@ -123,8 +123,8 @@ def on_colour(premultiplied: np.ndarray, colour: tuple[int, int, int]) -> np.nda
     if not np.isfinite(premultiplied).all():
         raise FloatingPointError(NOT_FINITE)
     behind = np.array(colour, dtype=np.float32)
-    mixed = 255 * premultiplied[..., :3] + (1 - premultiplied[..., 3:]) * behind
-    return np.clip(mixed + 0.5, 0, 255).astype(np.uint8)
+    blended = 255 * premultiplied[..., :3] + (1 - premultiplied[..., 3:]) * behind
+    return np.clip(blended + 0.5, 0, 255).astype(np.uint8)
 
 
 class Cast:

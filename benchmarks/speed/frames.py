@@ -19,9 +19,9 @@ from ash.config import AshConfig
 from ash.devices import CPU, finish, moved
 from ash.files import write_json
 from ash.gaussians.splatting import Splatted, splat_naive
-from ash.gaussians.texels import place_naive, pose_naive
+from ash.gaussians.texels import pose_naive, sample_surface_naive
 from ash.inference import Player, psnr
-from ash.model import AshModel, image_of, mixed, views_of
+from ash.model import AshModel, blend_renders, image_of, views_of
 from ash.presets import named
 from ash.protocol import StageClock
 from ash.training.adam import Adam
@@ -156,11 +156,11 @@ def frame_by_definition(model: AshModel, pose: Pose, camera: Camera) -> np.ndarr
     """The image of a frame by the definitions alone, on one thread: premultiplied RGBA, float32 `[h, w, 4]`."""
     torch.set_num_threads(1)
     posed = model.template.pose(pose)
-    canonical, normals, transforms = place_naive(model.lattice, posed, model.config.anchor)
-    conditions = replace(model.conditions(pose), canonical=canonical, normals=normals, transforms=transforms)
-    shares = model.shares(model.decode(conditions), conditions)
+    canonical, normals, transforms = sample_surface_naive(model.lattice, posed, model.config.anchor)
+    conditions = replace(model.frame_inputs(pose), canonical=canonical, normals=normals, transforms=transforms)
+    shares = model.blend_components(model.decode(conditions), conditions)
     drawn = [(share, _splatted_by_definition(model, raw, conditions, [camera], None)) for share, raw in shares]
-    return image_of(mixed(drawn))
+    return image_of(blend_renders(drawn))
 
 
 def _splatted_by_definition(
@@ -242,7 +242,7 @@ def _time_steps(avatar: AshAvatar, preset: str, capture: Capture, *, rounds: int
     for number in range(1 + max(1, rounds // 5)):
         for name in ("naive", *["native"] * 5):
             batch = draw_batch(images, avatar.config.training, 0, number)
-            avatar._conditions_of(batch.frame)
+            avatar._inputs_of(batch.frame)
             finish(avatar.device)
             start = time.perf_counter()
             _step(avatar, batch, optimisers[name], naive=name == "naive")
@@ -269,7 +269,7 @@ def _time_steps(avatar: AshAvatar, preset: str, capture: Capture, *, rounds: int
 
 def _step(avatar: AshAvatar, batch: Batch, optimiser: Adam, *, naive: bool) -> None:
     training = avatar.config.training
-    conditions = avatar._conditions_of(batch.frame)
+    conditions = avatar._inputs_of(batch.frame)
     if naive:
         raw = avatar.module.decode(conditions)
         drawn = _splatted_by_definition(avatar.module, raw, conditions, batch.cameras, batch.background).rgb

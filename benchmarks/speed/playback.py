@@ -82,7 +82,7 @@ def held_out_clips(model: AshModel, capture: Capture, title: str) -> list[TimedC
         if split not in capture.splits:
             continue
         poses = tuple(Pose(capture.motion, frame) for frame in sorted(capture.splits[split].frames))
-        trust = tuple(model.conditions(pose).trust for pose in poses)
+        trust = tuple(model.frame_inputs(pose).decoder_weight for pose in poses)
         own = capture.cameras[capture.splits[split].cameras[0]]
         for width, height in dict.fromkeys((SIZE, (own.width, own.height))):
             camera = scaled_camera(own, width, height)
@@ -145,7 +145,7 @@ def _compared(avatar: AshAvatar, players: dict[int, Player], clip: TimedClip) ->
 
 def _arrive(model: AshModel, pose: Pose) -> None:
     """Leave with the template what playback leaves there: the frames before this one, and not this one."""
-    model.template.forget()
+    model.template.clear_cache()
     for past in pose.window(model.config.window):
         if past != pose.frame:
             model.template.pose(pose.at(int(past)))

@@ -117,7 +117,9 @@ def test_a_frame_of_ash_stays_on_cuda_and_goes_to_its_splatter(preset: str, tube
     with mode, to_cuda, torch.no_grad():
         drawn = on_cuda(avatar)(Pose(tube.motion, 3), tube.cameras["cam0"])
     assert drawn.rgb.device == CUDA and drawn.rgb.shape == (1, 48, 48, 3)
-    assert len(splatted) == (1 if avatar.module.static is None else 2), "a static avatar has its share of the picture"
+    assert len(splatted) == (1 if avatar.module.fallback_texels is None else 2), (
+        "a static avatar has its share of the picture"
+    )
     for gaussians in splatted:
         assert {tensor.device for tensor in (gaussians.means, gaussians.quats, gaussians.sh)} == {CUDA}
         assert len(gaussians.means) == len(avatar.lattice.texels)
@@ -125,7 +127,7 @@ def test_a_frame_of_ash_stays_on_cuda_and_goes_to_its_splatter(preset: str, tube
 
 @pytest.mark.parametrize("changes", [{}, {"refine": "motion"}], ids=["ddc", "moving"])
 def test_a_frame_of_the_mesh_stays_on_cuda(changes: dict[str, str], tube: Capture, fake_cuda: Any) -> None:
-    recipe = ddc.but(changes)
+    recipe = ddc.with_overrides(changes)
     avatar = recipe.build(tiny(recipe.config("ci")), tube)
     mode, to_cuda, _ = fake_cuda
     with mode, to_cuda, torch.no_grad():

@@ -60,7 +60,7 @@ def test_decoders_matter_to_the_picture(capture):
 
 def test_an_engine_whose_picture_differs_is_dropped_however_fast(capture, monkeypatch):
     avatar, camera = woken(capture), capture.cameras["cam0"]
-    outputs = avatar.module.base.shape
+    outputs = avatar.module.base_texels.shape
     monkeypatch.setattr(inference, "_in_bfloat16", lambda decoders: lambda conditions: torch.zeros(outputs))
     monkeypatch.setattr(inference, "find_spec", lambda name: None)
     player = Player(avatar, capture.motion, camera)
@@ -75,7 +75,7 @@ def test_every_engine_follows_the_motion_on_any_number_of_threads(capture):
             torch.set_num_threads(count)
             player = Player(avatar, capture.motion, camera)
             for frame in (0, 3, 5):
-                conditions = avatar.module.conditions(Pose(capture.motion, frame))
+                conditions = avatar.module.frame_inputs(Pose(capture.motion, frame))
                 with torch.no_grad():
                     expected = avatar.module.decoders(conditions)
                     for engine in player.engines:

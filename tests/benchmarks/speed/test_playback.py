@@ -116,7 +116,7 @@ def test_a_timed_frame_poses_its_own_template_and_not_that_of_the_frames_before(
 ) -> None:
     avatar, capture = trained
     template, posed, timed = avatar.module.template, [], []
-    anew, time_it = template.pose_anew, playback.timed_frame
+    anew, time_it = template.pose_uncached, playback.timed_frame
 
     def timed_frame(player: Player, frame: int, *rest: object) -> dict[str, float]:
         posed.clear()
@@ -124,7 +124,7 @@ def test_a_timed_frame_poses_its_own_template_and_not_that_of_the_frames_before(
         timed.append((frame, *posed))
         return ms
 
-    monkeypatch.setattr(template, "pose_anew", lambda pose: posed.append(pose.frame) or anew(pose))
+    monkeypatch.setattr(template, "pose_uncached", lambda pose: posed.append(pose.frame) or anew(pose))
     monkeypatch.setattr(playback, "timed_frame", timed_frame)
     agreements(avatar, capture, threads=(1, 2))
     assert avatar.config.model.window > 1
