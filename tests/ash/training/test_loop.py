@@ -95,7 +95,7 @@ def test_a_run_stopped_at_ten_random_steps_ends_with_the_same_bits(frames, captu
         assert torch.equal(weights(again)[name], value), name
     once_more = AshAvatar(settings, capture)
     once_more.fit(capture, folder=tmp_path / "stopped")
-    assert torch.equal(weights(once_more)["base"], weights(undisturbed)["base"])
+    assert torch.equal(weights(once_more)["base_texels"], weights(undisturbed)["base_texels"])
 
 
 def test_a_run_stopped_before_and_in_its_decay_decides_nothing_anew(capture, tmp_path, monkeypatch):
@@ -194,7 +194,7 @@ def test_far_from_training_a_static_avatar_has_its_share_of_the_picture(capture,
             for decoder_weight, larger in ((1.0, 0), (0.75, 0), (0.25, 1)):
                 with monkeypatch.context() as patched:
                     patched.setattr(
-                        avatar.texture_drawer(),
+                        avatar.module.textures,
                         "decoder_weight",
                         lambda textures, decoder_weight=decoder_weight: decoder_weight,
                     )
@@ -258,7 +258,7 @@ def test_equal_seeds_give_equal_bits_and_other_seeds_do_not(capture, tmp_path):
     for run, seed in enumerate((0, 0, 1)):
         avatar = AshAvatar(replace(config(), seed=seed), capture)
         avatar.fit(capture, folder=tmp_path / str(run))
-        results.append(weights(avatar)["base"])
+        results.append(weights(avatar)["base_texels"])
     assert torch.equal(results[0], results[1])
     assert not torch.equal(results[0], results[2])
 
