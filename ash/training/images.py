@@ -60,7 +60,7 @@ class ImageCrop:
 
 @runtime_checkable
 class Views(Protocol):
-    """Cutouts by view: all of a capture, or those of a step."""
+    """Crops by view: all of a capture, or those of a step."""
 
     def __getitem__(self, view: View) -> ImageCrop:
         """Of a view."""
@@ -170,7 +170,7 @@ def _room_on(device: torch.device) -> int:
 
 
 class ReadAhead:
-    """Cutouts of the coming steps, read by threads while a step is made; what is kept already is not read.
+    """Crops of the coming steps, read by threads while a step is made; what is kept already is not read.
 
     At most those of `STEPS_AHEAD` steps wait, besides what is kept. Without `readers` a step reads its own.
     """

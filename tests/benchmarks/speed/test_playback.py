@@ -146,7 +146,9 @@ def test_what_is_told_has_the_least_share_that_is_decoded(
     trained: tuple[AshAvatar, Capture], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     avatar, capture = trained
-    monkeypatch.setattr(TextureDrawer, "decoder_weight", lambda self, textures: 0.7 if self.novelty(textures) > 1e-3 else 1.0)
+    monkeypatch.setattr(
+        TextureDrawer, "decoder_weight", lambda self, textures: 0.7 if self.novelty(textures) > 1e-3 else 1.0
+    )
     found = agreements(avatar, capture)
     assert found["new"].least_trust == 0.7
     assert f"of {len(NEW)} frames, decoded by shares of 0.70 or more" in found["new"].told()
