@@ -21,7 +21,7 @@ from benchmarks.cell.cells import CellConfig, read_cell, read_result, write_conf
 from benchmarks.cell.process import placed_on
 from benchmarks.commands import doctor
 from benchmarks.commands.devices import chosen_device, on_device
-from benchmarks.play.actors import open_cast
+from benchmarks.play.avatars import open_avatars
 from benchmarks.provenance import gpu_name
 from benchmarks.report.sentences import doubts
 from benchmarks.speed import pace, rows
@@ -149,11 +149,11 @@ def test_a_cell_that_learned_on_a_gpu_is_scored_here_where_the_cpu_is_named(
 
 @without_cuda
 def test_every_avatar_that_is_played_goes_to_the_device(tube_run: Path) -> None:
-    with open_cast(tube_run, device="cuda") as cast:
-        assert len(cast.titles) == 2
-        for title in cast.titles:
+    with open_avatars(tube_run, device="cuda") as avatars:
+        assert len(avatars.titles) == 2
+        for title in avatars.titles:
             with pytest.raises(InputError, match=r"^device cuda: "):
-                cast.actor(title)
+                avatars[title]
 
 
 def test_a_report_says_which_milliseconds_are_those_of_a_gpu() -> None:

@@ -17,7 +17,7 @@ from ash.inference import LEAST_AGREEMENT_DB, Player
 from ash.presets import named
 from ash.textures import TextureDrawer
 from benchmarks import cli
-from benchmarks.play.actors import open_cast
+from benchmarks.play.avatars import open_avatars
 from benchmarks.speed import playback
 from benchmarks.speed.playback import PlaybackAgreement, held_out_clips, speed_playback
 
@@ -32,10 +32,10 @@ def with_near_motion(capture: Capture) -> Capture:
 @pytest.fixture(scope="module")
 def trained(tube_cells: dict[str, Path]) -> Iterator[tuple[AshAvatar, Capture]]:
     """The tube as ash, and its capture with near motion."""
-    with open_cast(tube_cells["ash"]) as cast:
-        avatar = cast.only().avatar
+    with open_avatars(tube_cells["ash"]) as avatars:
+        avatar = avatars.only().avatar
         assert isinstance(avatar, AshAvatar)
-        yield avatar, with_near_motion(cast.capture)
+        yield avatar, with_near_motion(avatars.capture)
 
 
 @pytest.fixture(autouse=True)
