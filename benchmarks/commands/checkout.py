@@ -14,7 +14,7 @@ from tyro.conf import FlagCreatePairsOff, Positional
 
 from ash.files import InputError
 from benchmarks.commands.arguments import DONE, FAILED, File, Folder, Trust
-from benchmarks.commands.devices import CPU, DeviceName, DeviceNameIfAny, chosen_device
+from benchmarks.commands.devices import CPU, DeviceName, chosen_device
 
 PUBLIC = (
     "ash.capture",
@@ -84,13 +84,11 @@ class SpeedCommand:
 class DoctorCommand:
     """What this machine has, and what follows from it."""
 
-    device: DeviceNameIfAny = None  # where training steps are timed, for five seconds; default: on a GPU that works
-
     def __call__(self) -> int:
         """Look and print."""
         from benchmarks.commands.doctor import examine, table
 
-        findings = examine(Path(), None if self.device is None else chosen_device(self.device))
+        findings = examine(Path())
         print(table(findings))
         return DONE if all(finding.good for finding in findings) else FAILED
 

@@ -1,7 +1,6 @@
 """How long a frame takes, stage by stage, and a step of training, beside their definitions: `ash-bench speed frame`."""
 
 import math
-import statistics
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
@@ -30,10 +29,9 @@ from ash.training.batches import Batch, draw_batch
 from ash.training.images import load_training_images
 from ash.training.loop import draw_training_step
 from ash.training.losses import l1_ssim_loss, l1_ssim_loss_naive, ssim_target
-from benchmarks.speed.energy import EnergyMeter, energy_meter
 from benchmarks.speed.rows import SpeedRow, as_json, row_of
 
-# By what was measured and threads: milliseconds of a stage or of the "frame", and its "joules", where they can be read.
+# Milliseconds of a stage, or of the whole "frame", by threads.
 Samples = dict[tuple[str, int], list[float]]
 
 STAGES = ("stg1", "stg2", "stg3", "stg4")
@@ -58,7 +56,7 @@ class TimedAvatar:
 
 
 def subjects() -> tuple[TimedAvatar, ...]:
-    """`cpu` at four resolutions of the texel lattice, `frugal`, and the paper's."""
+    """`cpu` at four resolutions of the texel lattice, and the paper's."""
     cpu = named("cpu")
     lattices = {texels: replace(cpu, model=replace(cpu.model, texels=texels)) for texels in (64, 128, 256, 512)}
     small = [
@@ -67,8 +65,7 @@ def subjects() -> tuple[TimedAvatar, ...]:
         )
         for texels, config in lattices.items()
     ]
-    frugal = TimedAvatar(name="frugal", config=named("frugal"), width=512, height=512, trains=True)
-    return (*small, frugal, TimedAvatar(name="paper", config=named("paper"), width=1285, height=940))
+    return (*small, TimedAvatar(name="paper", config=named("paper"), width=1285, height=940))
 
 
 @runtime_checkable
@@ -188,17 +185,13 @@ def agreement_db(drawn: np.ndarray, defined: np.ndarray) -> float:
     return psnr(drawn[..., :3], defined[..., :3], defined[..., 3])
 
 
-def timed_frame(
-    player: Player, frame: int, camera: Camera, threads: int, meter: EnergyMeter | None
-) -> dict[str, float]:
-    """Milliseconds of a frame's stages and of the whole, played on so many threads, and its joules by the meter."""
+def timed_frame(player: Player, frame: int, camera: Camera, threads: int) -> dict[str, float]:
+    """Milliseconds of a frame's stages and of the whole, played on so many threads."""
     torch.set_num_threads(threads)
-    before = meter.joules() if meter else math.nan
     clock, start = StageClock(), time.perf_counter()
     player.draw(frame, camera, clock=clock)
     elapsed = (time.perf_counter() - start) * 1e3
-    spent = {"joules": meter.joules() - before} if meter else {}
-    return {stage: clock.ms[stage] for stage in STAGES} | {"frame": elapsed} | spent
+    return {stage: clock.ms[stage] for stage in STAGES} | {"frame": elapsed}
 
 
 def frame_rows(
@@ -213,12 +206,8 @@ def frame_rows(
     reference = min(defined_ms)
     rows = [row_of("frame", size, "forward", 1, f"{name}-naive", defined_ms, reference, device)]
     for (what, count), taken in samples.items():
-        if what == "frame":
-            row = row_of(what, size, "forward", count, name, taken, reference, device)
-            spent = samples.get(("joules", count))
-            rows.append(replace(row, joules=statistics.fmean(spent)) if spent else row)
-        elif what in STAGES:
-            rows.append(row_of(what, size, "forward", count, name, taken, math.nan, device))
+        over = reference if what == "frame" else math.nan
+        rows.append(row_of(what, size, "forward", count, name, taken, over, device))
     return rows
 
 
@@ -232,12 +221,11 @@ def _time_frames(
     frame_by_definition(avatar.module, Pose(capture.motion, frames[0]), camera)
     defined_ms = [(time.perf_counter() - start) * 1e3]
     samples: Samples = defaultdict(list)
-    meter = energy_meter(avatar.device)
     for number in range(rounds + 1):
         for count in threads:
             # Another motion frame every time, and the history of each posed already, as in playback.
             frame = frames[(1 + number * len(threads) + threads.index(count)) % len(frames)]
-            measured = timed_frame(players[count], frame, camera, count, meter)
+            measured = timed_frame(players[count], frame, camera, count)
             if number:
                 for what, value in measured.items():
                     samples[what, count].append(value)
@@ -317,10 +305,7 @@ def main(json_path: Path | None, folder: Path | None = None, device: torch.devic
 def print_table(results: Iterable[list[SpeedRow] | AgreementLine], json_path: Path | None, device: torch.device) -> int:
     """Print rows and agreements as they come, and write them to `json_path`; returns the exit code."""
     print(f"device {device}")
-    print(
-        f"{'what':10} {'size':9} {'pass':17} th {'by':18}"
-        f" {'min ms':>9} {'median ms':>9} {'naive/min':>9} {'1/s':>6} {'joules':>7}"
-    )
+    print(f"{'what':10} {'size':9} {'pass':17} th {'by':18} {'min ms':>9} {'median ms':>9} {'naive/min':>9} {'1/s':>6}")
     rows: list[SpeedRow] = []
     agreements: list[AgreementLine] = []
     for result in results:
@@ -332,10 +317,9 @@ def print_table(results: Iterable[list[SpeedRow] | AgreementLine], json_path: Pa
         for row in result:
             ratio = "" if math.isnan(row.ratio) else f"{row.ratio:9.1f}"
             rate = f"{1e3 / row.median_ms:6.1f}" if row.what in ("frame", "train_step") else ""
-            joules = "" if row.what != "frame" else "n/a" if math.isnan(row.joules) else f"{row.joules:.3f}"
             print(
                 f"{row.what:10} {row.size:9} {row.pass_:17} {row.threads:2} {row.candidate:18}"
-                f" {row.min_ms:9.2f} {row.median_ms:9.2f} {ratio:>9} {rate:>6} {joules:>7}",
+                f" {row.min_ms:9.2f} {row.median_ms:9.2f} {ratio:>9} {rate:>6}",
                 flush=True,
             )
     print("the paper, on an A100 with its learned template at 1285x940:")

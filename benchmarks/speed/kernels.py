@@ -17,7 +17,6 @@ from ash.mesh.rasterizing import rasterize_mesh, rasterize_mesh_naive
 from ash.native.library import fma_peak, instruction_set, stage_ms
 from ash.training.losses import l1_ssim_loss, l1_ssim_loss_naive, ssim_target
 from benchmarks.cell.timing import peak_memory_mb
-from benchmarks.speed.mixture import Mixture, print_mixtures, time_mixture
 from benchmarks.speed.rows import SpeedRow, as_json, in_turns, print_rows, rows_of, time_interleaved
 from benchmarks.speed.scenes import SplatScene, body_mesh, splat_scene
 
@@ -45,7 +44,7 @@ class SplatDetail:
 
 def speed_kernels(
     *, rounds: int = 3, threads: tuple[int, ...] = (1, 2), device: torch.device = CPU
-) -> Iterator[list[SpeedRow] | SplatDetail | Mixture]:
+) -> Iterator[list[SpeedRow] | SplatDetail]:
     """Time splatting, loss and rasteriser, naive and native by turns; yields results as they come.
 
     On a GPU threads are of no account, and the loss is the definition.
@@ -57,8 +56,6 @@ def speed_kernels(
         yield _time_loss(size, height, width, rounds=rounds, threads=threads, device=device)
     for size, pixels in (("256", 256), ("512", 512)):
         yield _time_rasterizer(size, pixels, rounds=rounds, threads=threads, device=device)
-    if device == CPU:
-        yield from time_mixture(rounds=5 * rounds)
 
 
 def time_splat(scene: SplatScene, *, rounds: int, threads: tuple[int, ...]) -> Iterator[list[SpeedRow] | SplatDetail]:
@@ -179,18 +176,13 @@ def main(json_path: Path | None, device: torch.device = CPU) -> int:
     print(f"{'what':15} {'size':9} {'pass':17} th {'by':7} {'min ms':>10} {'median ms':>10} {'ratio':>8}")
     rows: list[SpeedRow] = []
     details: list[SplatDetail] = []
-    mixtures: list[Mixture] = []
     for result in speed_kernels(device=device):
         if isinstance(result, SplatDetail):
             details.append(result)
             _print_detail(result)
-        elif isinstance(result, Mixture):
-            mixtures.append(result)
         else:
             rows += result
             print_rows(result)
-    if mixtures:
-        print_mixtures(mixtures)
     peak_mb = peak_memory_mb()
     print(f"peak memory of this process, torch and the definitions included: {peak_mb:.0f} MB")
     if json_path is not None:
@@ -199,7 +191,6 @@ def main(json_path: Path | None, device: torch.device = CPU) -> int:
             {
                 "rows": [as_json(row) for row in rows],
                 "splat_details": [vars(detail) for detail in details],
-                "mixtures": [vars(mixture) | {"ratio": mixture.ratio} for mixture in mixtures],
                 "peak_rss_mb": peak_mb,
                 "instruction_set": instruction_set(),
                 "device": str(device),

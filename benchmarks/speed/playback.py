@@ -22,7 +22,6 @@ from ash.files import InputError
 from ash.inference import Player
 from ash.model import AshModel
 from ash.protocol import Avatar
-from benchmarks.speed.energy import energy_meter
 from benchmarks.speed.frames import (
     Samples,
     agreement_db,
@@ -111,13 +110,12 @@ def speed_playback(
 
 
 def _timed(avatar: AshAvatar, players: dict[int, Player], clip: TimedClip, rounds: int) -> Samples:
-    """What each frame took in milliseconds (stages, whole) and in joules, drawn by all players in turns."""
+    """Milliseconds of the stages and of the whole, by all players in turns."""
     samples: Samples = defaultdict(list)
-    meter = energy_meter(avatar.device)
     for pose in clip.poses * rounds:
         for count, player in players.items():
             _arrive(avatar.module, pose)
-            for what, value in timed_frame(player, pose.frame, clip.camera, count, meter).items():
+            for what, value in timed_frame(player, pose.frame, clip.camera, count).items():
                 samples[what, count].append(value)
     return samples
 

@@ -25,7 +25,6 @@ class SpeedRow:
     min_ms: float
     median_ms: float
     ratio: float  # the naive minimum over this one's, both from this run
-    joules: float = math.nan  # a call in the mean, see `benchmarks.speed.energy`; nan: not known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +104,7 @@ def row_of(
 
 
 def as_json(row: SpeedRow) -> dict[str, object]:
-    """The row under its public names; null for a ratio to nothing, and for joules that nobody counted."""
+    """The row under its public names; null for a ratio to nothing."""
     known = {name.rstrip("_"): value for name, value in vars(row).items()}
     return {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in known.items()}
 

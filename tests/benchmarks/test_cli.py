@@ -1,4 +1,5 @@
 import json
+import os
 import re
 import shutil
 import signal
@@ -373,3 +374,38 @@ def test_a_variant_of_a_scene_has_a_capture_of_its_own(tmp_path: Path, monkeypat
     assert folders == {tmp_path / "mannequin-ci-0", tmp_path / "seen-ci-0"}
     assert (captures.described(seen).rig.cameras, captures.described(seen).name) == (9, "seen")
     assert captures.described(seen).identity != captures.described(plain).identity
+
+
+OPENMP = ("OMP_NUM_THREADS", "GOMP_SPINCOUNT", "OMP_WAIT_POLICY")
+
+
+@pytest.mark.parametrize(
+    ("given", "spins"), [({}, "1000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "passive"}, "0")]
+)
+def test_commands_set_how_idle_threads_wait_unless_the_user_did(given: dict[str, str], spins: str) -> None:
+    settings = {name: value for name, value in os.environ.items() if name not in OPENMP}
+    done = subprocess.run(
+        [sys.executable, "-c", "from benchmarks import cli; cli.main(['suites', 'ci']); import torch"],
+        env=settings | given | {"OMP_DISPLAY_ENV": "verbose"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    reported = {name: re.findall(rf"{name} ?= ?'(\w+)'", done.stderr) for name in OPENMP}
+    if not reported["GOMP_SPINCOUNT"]:
+        pytest.skip("torch's OpenMP runtime is not GNU's")
+    assert (reported["GOMP_SPINCOUNT"], reported["OMP_NUM_THREADS"]) == ([spins], ["1"])
+
+
+def test_commands_give_blas_one_thread_as_in_cells() -> None:
+    """`eval` and `train` take times in this process: a second thread that waits busily falsifies them."""
+    code = """
+import os
+from benchmarks import cli
+import numpy as np
+np.ones((500, 500)) @ np.ones((500, 500))
+print(len(os.listdir("/proc/self/task")))
+"""
+    settings = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    done = subprocess.run([sys.executable, "-c", code], env=settings, capture_output=True, text=True, check=True)
+    assert done.stdout == "1\n"

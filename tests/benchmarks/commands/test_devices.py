@@ -5,7 +5,6 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -24,7 +23,7 @@ from benchmarks.commands.devices import chosen_device, on_device
 from benchmarks.play.avatars import open_avatars
 from benchmarks.provenance import gpu_name
 from benchmarks.report.sentences import doubts
-from benchmarks.speed import pace, rows
+from benchmarks.speed import rows
 from benchmarks.suites.files import find_suite
 
 without_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
@@ -62,7 +61,7 @@ def test_rows_that_have_a_device_are_moved_and_others_stay() -> None:
     assert there["ash"] != here["ash"] and there["nearest"] == here["nearest"]
 
 
-def test_doctor_says_what_the_gpu_can_do(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_doctor_says_what_the_gpu_can_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor.provenance, "gpu_name", lambda: "a GPU")
     monkeypatch.setattr(ash.devices, "obstacle", lambda name="cuda": "torch is built without CUDA")
     finding = doctor._gpu()
@@ -72,32 +71,9 @@ def test_doctor_says_what_the_gpu_can_do(monkeypatch: pytest.MonkeyPatch, tmp_pa
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: properties)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda: True)
     assert doctor._gpu().found == "a GPU, 24 GB, compute capability 8.9, with bfloat16"
-    timed = []
-    monkeypatch.setattr(pace, "steps_per_second", lambda preset, device, seconds: timed.append((preset, device)) or 8.0)
-    training = next(finding for finding in doctor.examine(tmp_path) if finding.what == "training on cuda")
-    assert [(preset.name, str(device)) for preset, device in timed] == [("cpu", "cuda"), ("paper", "cuda")]
-    assert "paper at 1285x940 makes 8 steps per second" in training.found
-    assert training.consequence == (
-        "cpu trains for at most 4,000 steps, 0.14 hours; paper trains for at most 2,000,000 steps, 69 hours"
-    )
     monkeypatch.setattr(doctor.provenance, "gpu_name", gpu_name)
     if gpu_name() is None:
         assert doctor._gpu().found == "none"
-
-
-def test_steps_are_timed_by_the_function_that_a_gpu_is_timed_by(monkeypatch: pytest.MonkeyPatch) -> None:
-    now, advance = [100.0], pace.ash.training.loop._Run.advance
-
-    def counted(run: Any, batches: Any) -> None:
-        assert float(batches[0].foreground.mean()) > 0.1, "somebody is seen"
-        advance(run, batches)
-        now[0] += 5.0 if run.step <= pace.FIRST_STEPS else 0.25  # The first steps compile.
-
-    monkeypatch.setattr(pace, "time", SimpleNamespace(perf_counter=lambda: now[0]))
-    monkeypatch.setattr(pace.ash.training.loop._Run, "advance", counted)
-    small = pace.PacedPreset(name="ci", width=64, height=48)
-    assert pace.steps_per_second(small, torch.device("cpu"), seconds=1.0) == pytest.approx(4.0)
-    assert now[0] == pytest.approx(100 + 3 * 5 + 4 * 0.25)
 
 
 def learned_on_cuda(method: str) -> CellConfig:

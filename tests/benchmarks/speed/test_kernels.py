@@ -36,7 +36,6 @@ def test_a_ratio_is_the_first_candidates_minimum_over_the_rows_own() -> None:
         "min_ms",
         "median_ms",
         "ratio",
-        "joules",
     ]
 
 
