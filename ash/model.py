@@ -46,7 +46,7 @@ class AshModel(MovingModule):
         self.template = template
         self.lattice = lattice
         self.textures: TextureDrawer | None = None
-        if decoders is not None and config.head == "unet":
+        if decoders is not None:
             self.textures = TextureDrawer(
                 lattice if config.shuffle == 1 else build_lattice(template.mesh, config.decoded_texels),
                 window=config.window,

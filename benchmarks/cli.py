@@ -48,7 +48,6 @@ COMMANDS = {
     "motions": "captures:MotionsCommand",
     "sheets": "captures:SheetsCommand",
     "check-method": "methods:CheckMethodCommand",
-    "search": "methods:SearchCommand",
     "retarget": "methods:RetargetCommand",
     "display": "methods:DisplayCommand",
     "play": "avatars:PlayCommand",

@@ -82,7 +82,7 @@ class KnownDeformation:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PlantedError:
-    """A template error of known size and kind. `ash.template_learning.errors` measures the same of a real one."""
+    """A template error of known size and kind."""
 
     rms_mm: float  # in every frame, over the vertices
     static: float  # share of its square that is the same in all frames

@@ -162,7 +162,7 @@ def curves_of(results: Sequence[CellResult]) -> pd.DataFrame:
 
 def outcomes_of(results: Sequence[CellResult]) -> pd.DataFrame:
     """One row per cell that tells how its training ended: `scene`, `method`, whether it `finished` learning, whether
-    its decoders carry nothing (are `dead`), the `choice` of a search, and what its `template` was learned from.
+    its decoders carry nothing (are `dead`), and what its `template` was learned from.
     """
     rows = [
         (
@@ -170,13 +170,12 @@ def outcomes_of(results: Sequence[CellResult]) -> pd.DataFrame:
             result.config.method,
             end.ended_by == "plateau",
             end.carries_nothing,
-            end.choice or "",
             end.template or "",
         )
         for result in results
         if not result.config.axis and (end := result.training) is not None
     ]
-    return pd.DataFrame(rows, columns=["scene", "method", "finished", "dead", "choice", "template"])
+    return pd.DataFrame(rows, columns=["scene", "method", "finished", "dead", "template"])
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

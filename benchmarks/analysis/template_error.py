@@ -18,7 +18,7 @@ PAPER_DB = {"novel_view": {"tight": 4.6, "loose": 7.4}, "novel_pose": {"tight": 
 # Templates that both methods learned: from what, and the rows that stand on it.
 LEARNED = {"images": ("ash", "ddc"), "scans": ("by_scans", "ddc_by_scans")}
 # Rows of ASH that differ from each other in the template alone.
-PLACED = ("ash", "by_scans", "by_surface", "by_vertices", "by_graph", "unlearned")
+PLACED = ("ash", "by_scans", "by_graph", "unlearned")
 LEVEL_TITLES = dict(zip(ON_EXACT, ("ASH", "DDC", "fixed mesh, best texture"), strict=True))
 
 
@@ -56,7 +56,7 @@ class MarginCurve:
     """A scene and split: margins on templates of planted error, least error first, and on learned templates.
 
     Planted errors are of the kind that learned templates have: `ash.config.TemplateConfig` says how static and how
-    lasting, as measured by `ash.template_learning.errors`. So a learned template has its place on the curve.
+    lasting, as measured in canonical space. So a learned template has its place on the curve.
     """
 
     scene: str

@@ -55,11 +55,6 @@ def remarks(scores: Scores, scene: str) -> list[str]:
     """What else must be known to read the numbers: the exact surface, cost, template, noise, seeds, failures."""
     found = [CHOOSING] if scores.for_choosing(scene) else []
     found += [_exact(scores, scene), _cost(scores, scene), _template(scores, scene), _noise(scores, scene)]
-    choices = scores.outcomes.query("scene == @scene and choice != ''").drop_duplicates(["method", "choice"])
-    said = [
-        f"{style_of(method).title}: {choice}" for method, choice in zip(choices.method, choices.choice, strict=True)
-    ]
-    found.append(f"What a search found to suffice: {'; '.join(said)}." if said else "")
     found.append(_supervision(scores, scene))
     dead = _told(scores, scene, "dead")
     found.append(_sentence(f"Decoders carry nothing, the same output in every frame: {dead}") if dead else "")

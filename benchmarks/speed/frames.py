@@ -56,7 +56,7 @@ class TimedAvatar:
 
 
 def subjects() -> tuple[TimedAvatar, ...]:
-    """`cpu` at four resolutions of the texel lattice, `frugal`, and the paper's."""
+    """`cpu` at four resolutions of the texel lattice, and the paper's."""
     cpu = named("cpu")
     lattices = {texels: replace(cpu, model=replace(cpu.model, texels=texels)) for texels in (64, 128, 256, 512)}
     small = [
@@ -65,8 +65,7 @@ def subjects() -> tuple[TimedAvatar, ...]:
         )
         for texels, config in lattices.items()
     ]
-    frugal = TimedAvatar(name="frugal", config=named("frugal"), width=512, height=512, trains=True)
-    return (*small, frugal, TimedAvatar(name="paper", config=named("paper"), width=1285, height=940))
+    return (*small, TimedAvatar(name="paper", config=named("paper"), width=1285, height=940))
 
 
 @runtime_checkable

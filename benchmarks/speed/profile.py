@@ -45,7 +45,6 @@ STEPS = 80
 SUBJECTS = (
     ("ash", "cpu", "float32"),
     ("ash", "cpu", "bfloat16"),
-    ("ash", "frugal", "float32"),
     ("ddc", "cpu", "float32"),
     ("ddc", "cpu", "bfloat16"),
 )

@@ -73,7 +73,6 @@ LEARNERS = {
     "noise": lambda capture: AshAvatar(of_frames(noise=0.5, window=3), capture),
     "instance": lambda capture: AshAvatar(of_frames(norm="instance"), capture),
     "refining": lambda capture: AshAvatar(of_frames(refine=True), capture),
-    "blendshapes": lambda capture: AshAvatar(of_frames(head="blendshapes", fade=0.0), capture),
     "motionless": lambda capture: AshAvatar(of_frames(motion=False), capture),
     "mesh": lambda capture: DdcAvatar(mesh_of_frames(noise=0.5, global_features=True), capture),
     "moving mesh": lambda capture: DdcAvatar(replace(mesh_of_frames(), refine="motion"), capture),

@@ -66,7 +66,7 @@ def test_a_scaled_camera_sees_the_same_window_in_the_middle(capture):
 
 def test_the_papers_resolutions_are_timed():
     texels = {subject.name: subject.config.model.texels for subject in subjects()}
-    assert texels == {"cpu@64": 64, "cpu@128": 128, "cpu": 256, "cpu@512": 512, "frugal": 128, "paper": 256}
+    assert texels == {"cpu@64": 64, "cpu@128": 128, "cpu": 256, "cpu@512": 512, "paper": 256}
     assert set(frames.PAPER_MS) <= set(texels.values())
 
 
