@@ -231,7 +231,7 @@ def vertex_normals(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) ->
 
     By a native kernel where no gradient is needed.
     """
-    if ash.native.skinning.takes(vertices):
+    if ash.native.skinning.can_use_native(vertices):
         return ash.native.skinning.vertex_normals(vertices, faces)
     a, b, c = vertices[faces].unbind(1)
     doubled_area = torch.linalg.cross(b - a, c - a)

@@ -200,14 +200,6 @@ def test_an_avatar_without_decoders_agrees_too(tmp_path: Path) -> None:
         assert found.engines == () and "no decoders" in found.told()
 
 
-def test_a_gpu_is_fed_by_one_thread(trained: tuple[AshAvatar, Capture], monkeypatch: pytest.MonkeyPatch) -> None:
-    avatar, capture = trained
-    monkeypatch.setattr(avatar, "device", torch.device("cuda"))
-    (clip, *_) = held_out_clips(avatar.module, capture, "it")
-    _, rows = speed_playback(avatar, [clip], rounds=1)
-    assert {(row.device, row.threads) for row in rows} == {("cuda", 1)}
-
-
 def test_torch_has_as_many_threads_afterwards_as_before(trained: tuple[AshAvatar, Capture]) -> None:
     avatar, capture = trained
     before = torch.get_num_threads()
