@@ -72,12 +72,12 @@ class SpeedCommand:
 
     def _measure_avatar(self, folder: Path) -> int:
         from benchmarks.play.avatars import open_avatars
-        from benchmarks.speed.playback import main as measure_playback
+        from benchmarks.speed.frames import main_of_avatar
 
         with open_avatars(folder, device=chosen_device(self.device), trust=self.trust) as avatars:
             loaded = avatars.only()
             config = loaded.cell.config
-            return measure_playback(loaded.avatar, avatars.capture, f"{config.method}:{config.preset}", self.json)
+            return main_of_avatar(loaded.avatar, avatars.capture, f"{config.method}:{config.preset}", self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
