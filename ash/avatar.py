@@ -19,7 +19,7 @@ from ash.devices import device_named
 from ash.files import InputError, write_atomic
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.initialising import blank_gaussians, initial_gaussians, released_gaussians, texel_pitch
-from ash.model import AshModel, Decode, image_of
+from ash.model import AshModel, image_of
 from ash.protocol import StageClock, TrainingOutcome
 from ash.template.template import Template
 from ash.template_learning.learning import template_of, with_template
@@ -239,11 +239,9 @@ class AshAvatar:
         return max(self.shared_gaussians(pose), key=lambda found: found[0])[1]
 
     @torch.no_grad()
-    def shared_gaussians(
-        self, pose: Pose, *, clock: StageClock | None = None, decoders: Decode | None = None
-    ) -> list[tuple[float, Gaussians]]:
+    def shared_gaussians(self, pose: Pose, *, clock: StageClock | None = None) -> list[tuple[float, Gaussians]]:
         """All sets of posed Gaussians whose renders are blended, and their weights (`ash.model.blend_renders`)."""
-        return self.module.gaussians(pose, clock, decoders=decoders)
+        return self.module.gaussians(pose, clock)
 
     @property
     def dilation(self) -> float:

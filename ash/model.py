@@ -1,6 +1,6 @@
 """The ASH avatar, in the paper's order: template, textures, decoders, skinning, splatting. START READING HERE."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from typing import Any
@@ -22,8 +22,6 @@ from ash.template.motion import normalised_motion
 from ash.template.template import Template
 from ash.template_learning.refining import MotionRefinement, RefinedDeformation
 from ash.textures import FrameInputs, TexelLattice, TextureDrawer, build_lattice
-
-Decode = Callable[[FrameInputs], Tensor]  # to raw parameters [n, o]
 
 
 class AshModel(MovingModule):
@@ -91,17 +89,19 @@ class AshModel(MovingModule):
     def _textures(self, pose: Pose) -> Float[Tensor, "c r r"]:
         return self.base_texels.new_zeros(0, 1, 1) if self.textures is None else self.textures(self.template, pose)
 
-    def decode(self, conditions: FrameInputs, *, decoders: Decode | None = None) -> Float[Tensor, "n o"]:
-        """Stg.3: raw Gaussian parameters per texel; by other `decoders` than the model's own where they are given."""
-        decoders = decoders or self.decoders
-        return self.base_texels if decoders is None else self.base_texels + self.mask_offsets(decoders(conditions))
+    def decode(self, conditions: FrameInputs) -> Float[Tensor, "n o"]:
+        """Stg.3: raw Gaussian parameters per texel."""
+        return (
+            self.base_texels
+            if self.decoders is None
+            else self.base_texels + self.mask_offsets(self.decoders(conditions))
+        )
 
     def decode_together(self, frames: Sequence[FrameInputs]) -> list[Float[Tensor, "n o"]]:
         """`decode` of several frames, by U-Nets in one batch; by what decodes in another way frame by frame."""
         if len(frames) == 1 or not isinstance(self.decoders, Decoders):
             return [self.decode(seen) for seen in frames]
-        decoded = zip(frames, self.decoders.together(frames), strict=True)
-        return [self.decode(seen, decoders=lambda _, of_frame=of_frame: of_frame) for seen, of_frame in decoded]
+        return [self.base_texels + self.mask_offsets(decoded) for decoded in self.decoders.together(frames)]
 
     def mask_offsets(self, decoded: Float[Tensor, "n o"]) -> Float[Tensor, "n o"]:
         """What of the decoders' output counts: all of it, or all but the offsets."""
@@ -121,30 +121,21 @@ class AshModel(MovingModule):
             gaussians, **views_of(cameras), background=background, dilation=self.config.dilation, threads=threads
         )
 
-    def forward(
-        self,
-        pose: Pose,
-        camera: Camera,
-        clock: StageClock | None = None,
-        *,
-        decoders: Decode | None = None,
-    ) -> Splatted:
+    def forward(self, pose: Pose, camera: Camera, clock: StageClock | None = None) -> Splatted:
         """Motion and camera to image: the whole of ASH, over black, on as many threads as torch is given."""
-        shared = self.gaussians(pose, clock, decoders=decoders)
+        shared = self.gaussians(pose, clock)
         with stage(clock, "stg4", self.base_texels.device):
             threads = torch.get_num_threads()
             return blend_renders(
                 [(share, self.draw(gaussians, [camera], None, threads)) for share, gaussians in shared]
             )
 
-    def gaussians(
-        self, pose: Pose, clock: StageClock | None = None, *, decoders: Decode | None = None
-    ) -> list[tuple[float, Gaussians]]:
+    def gaussians(self, pose: Pose, clock: StageClock | None = None) -> list[tuple[float, Gaussians]]:
         """Motion to posed Gaussians: all that does not depend on the camera; one set per `blend_components`."""
         threads = torch.get_num_threads()
         conditions = self.frame_inputs(pose, clock, threads)  # Stg.1, Stg.2
         with stage(clock, "stg3", self.base_texels.device):
-            shares = self.blend_components(self.decode(conditions, decoders=decoders), conditions)
+            shares = self.blend_components(self.decode(conditions), conditions)
         with stage(clock, "stg4", self.base_texels.device):
             return [(share, self.pose(raw, conditions, threads)) for share, raw in shares]
 

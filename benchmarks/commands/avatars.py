@@ -2,6 +2,7 @@
 
 import contextlib
 import sys
+import threading
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,8 +15,8 @@ from benchmarks.commands.arguments import DONE, Count, CountIfAny, File, Names, 
 from benchmarks.commands.devices import CPU, DeviceName, chosen_device
 
 if TYPE_CHECKING:
-    from benchmarks.play.actors import Cast
-    from benchmarks.play.motions import Act
+    from benchmarks.play.avatars import AvatarSet
+    from benchmarks.play.motions import MotionClip
 
 Stretch = Annotated[str | None, arg(metavar="A:B")]
 
@@ -38,23 +39,23 @@ class PlayCommand:
 
     def __call__(self) -> int:
         """Serve until Ctrl-C."""
-        from benchmarks.play.doors import DoorOptions, require_safe
-        from benchmarks.play.player import playing, wait_for_interrupt
+        from benchmarks.play.auth import AuthOptions, require_safe
+        from benchmarks.play.player import playing
 
-        doors = DoorOptions(
+        options = AuthOptions(
             host=self.host,
             port=self.port,
             clients=self.clients,
             allow_origins=self.allow_origin,
             expose=self.expose,
         )
-        require_safe(doors)
+        require_safe(options)
         with playing(
             self.run,
             motions=self.motion,
             scene=self.scene,
             methods=self.methods,
-            doors=doors,
+            options=options,
             device=chosen_device(self.device),
             trust=self.trust,
         ) as player:
@@ -62,7 +63,7 @@ class PlayCommand:
             if self.expose:
                 print(f"{self.host} is open to other machines, and nothing is encrypted", file=sys.stderr)
             with contextlib.suppress(KeyboardInterrupt):  # How it is meant to end.
-                wait_for_interrupt()
+                threading.Event().wait()
         return DONE
 
 
@@ -144,48 +145,48 @@ class ExportCommand:
 
     def _export_avatar(self, out: Path, suffix: str) -> int:
         from benchmarks.export.formats import FRAMES
-        from benchmarks.play.actors import open_cast
-        from benchmarks.play.motions import act_named, frames_in
+        from benchmarks.play.avatars import open_avatars
+        from benchmarks.play.motions import frames_in, motion_clip
 
-        with open_cast(self.source, scene=self.scene, methods=self.methods, trust=self.trust) as cast:
-            act = act_named(cast.capture, self.motion)
-            frames = frames_in(act, self.frames or ("0" if self.form in FRAMES else None))
-            if self.form == "mp4":
-                said = self._write_video(cast, act, frames, out)
-            elif self.form in FRAMES:
-                said = self._write_frames(cast, act, frames, out, suffix)
-            else:
-                said = self._write_clip(cast, act, frames, out)
-        print(f"{out}{said}")
+        write = {"bvh": self._write_bvh, "mp4": self._write_video, "html": self._write_page}.get(self.form)
+        with open_avatars(self.source, scene=self.scene, methods=self.methods, trust=self.trust) as avatars:
+            clip = motion_clip(avatars.capture, self.motion)
+            if self.form in FRAMES:
+                self._write_frames(avatars, clip, frames_in(clip, self.frames or "0"), out, suffix)
+                print(out)
+            elif write is not None:
+                frames = frames_in(clip, self.frames)
+                write(avatars, clip, frames, out)
+                print(f"{out}: {len(frames)} frames, {out.stat().st_size / 1e6:.1f} MB")
         return DONE
 
-    def _write_frames(self, cast: "Cast", act: "Act", frames: tuple[int, ...], out: Path, suffix: str) -> str:
+    def _write_frames(
+        self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], out: Path, suffix: str
+    ) -> None:
         """One frame into a file, or several into a folder, each named by its number in the capture or the file."""
         from benchmarks.export.formats import frame_bytes
 
-        actor = cast.only()
+        loaded = avatars.only()
         for frame in frames:
             path = out if len(frames) == 1 else out / f"{frame:06d}{suffix}"
-            write_atomic(path, frame_bytes(actor.avatar, Pose(act.motion, frame), suffix=suffix, title=actor.title))
-        return ""
+            pose = Pose(clip.motion, frame)
+            write_atomic(path, frame_bytes(loaded.avatar, pose, suffix=suffix, title=loaded.title))
 
-    def _write_clip(self, cast: "Cast", act: "Act", frames: tuple[int, ...], out: Path) -> str:
+    def _write_bvh(self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], out: Path) -> None:
         from benchmarks.export.bvh import bvh_bytes
-        from benchmarks.play.share import clip_of, share_page
 
-        if self.form == "bvh":
-            chosen = list(frames)
-            played = replace(act.motion, dofs=act.motion.dofs[chosen], sequence=act.motion.sequence[chosen])
-            write_atomic(out, bvh_bytes(cast.capture.skeleton, played))
-            return ""
-        write_atomic(out, share_page(clip_of(cast, act, frames)))
-        return f": {len(frames)} frames, {out.stat().st_size / 1e6:.1f} MB"
+        motion, chosen = clip.motion, list(frames)
+        played = replace(motion, dofs=motion.dofs[chosen], sequence=motion.sequence[chosen])
+        write_atomic(out, bvh_bytes(avatars.capture.skeleton, played))
 
-    def _write_video(self, cast: "Cast", act: "Act", frames: tuple[int, ...], out: Path) -> str:
-        from benchmarks.play.film import Script, cameras_of, shoot, write_film
+    def _write_video(self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], out: Path) -> None:
+        from benchmarks.play.video import VideoSpec, render_video, write_video
 
-        rate = float(self.fps or act.motion.fps)
-        script = Script(act=act, frames=frames, camera=self.camera, height=self.height, fps=rate, truth=self.truth)
-        cameras_of(cast.capture, script, 0)  # An unknown camera is refused before avatars are loaded.
-        count = write_film(out, shoot(cast, script, lambda text: print(text, file=sys.stderr)), fps=rate)
-        return f": {count} frames, {out.stat().st_size / 1e6:.1f} MB"
+        spec = VideoSpec(clip=clip, frames=frames, camera=self.camera, height=self.height, truth=self.truth)
+        pictures = render_video(avatars, spec, lambda text: print(text, file=sys.stderr))
+        write_video(out, pictures, fps=float(self.fps or clip.motion.fps))
+
+    def _write_page(self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], out: Path) -> None:
+        from benchmarks.play.share import shared_page
+
+        write_atomic(out, shared_page(avatars.only(), clip, frames))

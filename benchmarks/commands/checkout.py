@@ -71,13 +71,13 @@ class SpeedCommand:
             raise InputError("speed: --trust goes with --avatar")
 
     def _measure_avatar(self, folder: Path) -> int:
-        from benchmarks.play.actors import open_cast
-        from benchmarks.speed.playback import main as measure_playback
+        from benchmarks.play.avatars import open_avatars
+        from benchmarks.speed.frames import main_of_avatar
 
-        with open_cast(folder, device=chosen_device(self.device), trust=self.trust) as cast:
-            actor = cast.only()
-            config = actor.cell.config
-            return measure_playback(actor.avatar, cast.capture, f"{config.method}:{config.preset}", self.json)
+        with open_avatars(folder, device=chosen_device(self.device), trust=self.trust) as avatars:
+            loaded = avatars.only()
+            config = loaded.cell.config
+            return main_of_avatar(loaded.avatar, avatars.capture, f"{config.method}:{config.preset}", self.json)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -81,15 +81,15 @@ def _gpu() -> Finding:
             found="none",
             consequence="everything runs on the processor; absolute ms are not comparable with the paper's",
         )
-    from ash.devices import ability, obstacle
+    from ash.devices import cuda_error, describe_gpu
 
-    if why := obstacle():
+    if why := cuda_error():
         return Finding(
             what="GPU",
             found=f"{name}, but {why}",
             consequence="everything runs on the processor (--device cuda is refused)",
         )
-    return Finding(what="GPU", found=f"{name}, {ability()}", consequence="--device cuda learns and draws there")
+    return Finding(what="GPU", found=f"{name}, {describe_gpu()}", consequence="--device cuda learns and draws there")
 
 
 def _lpips() -> Finding:

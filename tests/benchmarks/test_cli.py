@@ -213,7 +213,7 @@ def test_the_reference_holds_the_public_names(tmp_path: Path) -> None:
         "ash/capture/dataset.html": ("Skeleton.heads", "Motion.dofs", "require_pose"),
         "ash/capture/manifest.html": ("Split.views",),
         "ash/protocol.html": ("Avatar.fit", "Configurable.config"),
-        "benchmarks/play/avatars.html": ("load_avatar", "TrainedAvatar.draw"),
+        "benchmarks/play/avatars.html": ("load_avatar", "LoadedAvatar.draw"),
     }
     for page, names in wanted.items():
         text = (tmp_path / page).read_text()

@@ -85,7 +85,7 @@ def test_the_gradient_of_a_step_is_the_mean_of_its_frames(
     learner: str, natively: bool, capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not natively:  # As on a GPU: the frames are one batch of the U-Nets.
-        monkeypatch.setattr(UNet, "_takes_natively", lambda net, texture: False)
+        monkeypatch.setattr(UNet, "_can_use_native", lambda net, texture: False)
     avatar = LEARNERS[learner](capture)
     for net in avatar.module.modules():
         if isinstance(net, UNet):

@@ -9,16 +9,16 @@ import torch
 import trimesh
 from helpers.figures import tube_motion, tube_skeleton
 from helpers.gaussian_files import read_gltf, read_ply
+from helpers.scoring import psnr
 
 from ash.capture.dataset import Pose
 from ash.gaussians.splatting import splat
-from ash.inference import psnr
 from ash.mesh.drawing import draw_mesh, textured, topology_of
 from ash.model import image_of, views_of
 from ash.protocol import StageClock
 from benchmarks import cli
 from benchmarks.export.bvh import bvh_bytes
-from benchmarks.play.actors import open_cast
+from benchmarks.play.avatars import open_avatars
 from synth.posing import bone_frames, rotvec_to_rotmat
 
 
@@ -34,8 +34,8 @@ def test_exported_gaussians_draw_the_frame_that_the_avatar_renders(form, suffix,
     assert exported(tube_cells["ash"], form, out, "--motion", "train", "--frames", "1") == cli.DONE
     assert out.read_bytes().startswith(start)
     read = (read_ply if form == "ply" else read_gltf)(out.read_bytes())
-    with open_cast(tube_cells["ash"]) as cast:
-        capture, avatar = cast.capture, cast.actor(cast.titles[0]).avatar
+    with open_avatars(tube_cells["ash"]) as avatars:
+        capture, avatar = avatars.capture, avatars[avatars.titles[0]].avatar
         frame = capture.splits["train"].frames[1]
         for camera in capture.cameras.values():
             ours = avatar.render(Pose(capture.motion, frame), camera, clock=StageClock())
@@ -58,8 +58,8 @@ def test_the_exported_mesh_is_the_mesh_that_is_drawn(tube_cells, tmp_path: Path)
     assert exported(tube_cells["ddc"], "gltf", out, "--frames", "0") == cli.DONE
     (mesh,) = trimesh.load(io.BytesIO(out.read_bytes()), file_type="glb", process=False).geometry.values()
     texture = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"))
-    with open_cast(tube_cells["ddc"]) as cast:
-        capture, avatar = cast.capture, cast.actor(cast.titles[0]).avatar
+    with open_avatars(tube_cells["ddc"]) as avatars:
+        capture, avatar = avatars.capture, avatars[avatars.titles[0]].avatar
         frame = capture.splits["novel_pose"].frames[0]
         camera = capture.cameras["cam0"]
         ours = avatar.render(Pose(capture.motion, frame), camera, clock=StageClock())
