@@ -10,7 +10,6 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from ash.blendshapes import LocalBlendshapes
 from ash.capture.dataset import Camera, Capture, Pose
 from ash.checkpoints import contiguous_state, load_module, read_safetensors
 from ash.config import AshConfig, ModelConfig
@@ -20,14 +19,12 @@ from ash.files import InputError, write_atomic
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.initialising import blank_gaussians, initial_gaussians, released_gaussians, texel_pitch
 from ash.kept import Kept
-from ash.model import AshModel, Decode, image_of
+from ash.model import AshModel, image_of
 from ash.protocol import StageClock, TrainingOutcome
-from ash.searching import Build, Candidate, Choice, at_size, brief_training, sufficient, with_choice, write_choice
-from ash.template.motion import normalised_motion
 from ash.template.template import Template
 from ash.template_learning.learning import template_of, with_template
 from ash.template_learning.refining import refined_template
-from ash.textures import Conditions, TexelLattice, TextureDrawer, build_lattice, unsettled_frames
+from ash.textures import Conditions, TexelLattice, build_lattice, unsettled_frames
 from ash.training.adam import Adam
 from ash.training.batches import draw_batch, over
 from ash.training.images import TrainingImages, load_training_images, training_part
@@ -55,10 +52,6 @@ class AshAvatar:
         capture = training_part(capture, config.training)
         self.device = device_named(config.device)
         self.template = template or template_of(config.template, capture, seed=config.seed, device=self.device)
-        self.choice: Choice | None = None
-        if config.search and config.model.motion and config.model.head == "unet" and make_decoders is None:
-            self.choice = sufficient(self._brief(config), config, capture)
-            config = at_size(config, self.choice.candidate, self.choice.fade)
         torch.manual_seed(config.seed)
         self.config = config
         if config.model.refine:
@@ -67,37 +60,16 @@ class AshAvatar:
         self.analytic = initial_gaussians(config.model, capture, self.template, self.lattice)
         decoders = None
         if config.model.motion:
-            decoders = make_decoders(config.model, self.lattice) if make_decoders else self._decoders()
+            decoders = (make_decoders or Decoders)(config.model, self.lattice)
         self.module = AshModel(config.model, self.template, self.lattice, self._start(capture), decoders)
         if self.module.textures is not None:
             self.module.textures.observe(self.template, capture.motion, capture.splits["train"].frames)
-        if isinstance(decoders, LocalBlendshapes):
-            window, frames = config.model.window, capture.splits["train"].frames
-            decoders.observe([normalised_motion(Pose(capture.motion, frame), window=window) for frame in frames])
         self.module.to(self.device)
         self.template, self.lattice = self.module.template, self.module.lattice
         self.analytic = self.analytic.to(self.device)
         self._conditions = Kept(self._make_conditions)  # A template that images do not move is frozen.
         self._motion = capture.motion
         self._outcome: TrainingOutcome | None = None
-
-    def _brief(self, config: AshConfig) -> Build:
-        """How the search builds its candidates: on this template."""
-
-        def build(candidate: Candidate, capture: Capture) -> AshAvatar:
-            sized = at_size(config, candidate, config.model.fade)
-            return AshAvatar(replace(sized, training=brief_training(sized.training)), capture, template=self.template)
-
-        return build
-
-    def texture_drawer(self) -> TextureDrawer | None:
-        """Stg.2 of the decoders; None without any."""
-        return self.module.textures
-
-    def _decoders(self) -> torch.nn.Module:
-        if self.config.model.head == "blendshapes":
-            return LocalBlendshapes(self.config.model, self.lattice, self.template)
-        return Decoders(self.config.model, self.lattice)
 
     def _start(self, capture: Capture) -> Tensor:
         if self.config.model.base:
@@ -109,8 +81,6 @@ class AshAvatar:
     def fit(self, capture: Capture, *, folder: Path) -> None:
         """Warm up and train; see `ash.training.loop.fit`."""
         images = load_training_images(training_part(capture, self.config.training), self.device)
-        if self.choice is not None:
-            write_choice(self.choice, folder / "log.jsonl")
         outcome = fit(
             self,
             images,
@@ -252,7 +222,7 @@ class AshAvatar:
 
     def outcome(self) -> TrainingOutcome | None:
         """How training ended; None before it did."""
-        return with_template(with_choice(self._outcome, self.choice), self.template)
+        return with_template(self._outcome, self.template)
 
     def template_seconds(self) -> float | None:
         """What learning the template took, once for all methods that stand on it; None where it was not learned."""
@@ -269,11 +239,9 @@ class AshAvatar:
         return max(self.shared_gaussians(pose), key=lambda found: found[0])[1]
 
     @torch.no_grad()
-    def shared_gaussians(
-        self, pose: Pose, *, clock: StageClock | None = None, decoders: Decode | None = None
-    ) -> list[tuple[float, Gaussians]]:
+    def shared_gaussians(self, pose: Pose, *, clock: StageClock | None = None) -> list[tuple[float, Gaussians]]:
         """All sets of posed Gaussians of which the picture is mixed, and their shares (`ash.model.mixed`)."""
-        return self.module.gaussians(pose, clock, decoders=decoders)
+        return self.module.gaussians(pose, clock)
 
     @property
     def dilation(self) -> float:

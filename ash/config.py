@@ -72,8 +72,6 @@ class ModelConfig(AtlasConfig):
     motion: bool = True  # False: one static set of Gaussians, skinned only (w/o mot.)
     offset: bool = True  # False: no learned canonical offset d at all
     motion_offset: bool = True  # False: d is the same in all frames, that of the static texels (w/o disp.)
-    head: str = "unet"  # "unet": the paper's decoders; "blendshapes": local low-rank correctives, not in the paper
-    rank: int = 6  # correctives per body region of the head "blendshapes"
     shared_trunk: bool = False  # one U-Net for E_geo and E_app together; not in the paper
     sh_degree: int = 3
     offset_unit_m: float = 0.01  # metres per unit of a decoded offset; the release decodes metres
@@ -85,15 +83,12 @@ class ModelConfig(AtlasConfig):
     def __post_init__(self) -> None:
         """Refuse what cannot be built."""
         AtlasConfig.__post_init__(self)  # `super()` does not know a class that slots made anew.
-        one_of("head", self.head, ("unet", "blendshapes"))
         one_of("anchor", self.anchor, ("blended", "surface"))
         one_of("quat_frame", self.quat_frame, ("canonical", "world"))
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
-        if self.rank < 1 or self.dilation < 0 or self.offset_unit_m <= 0:
-            raise InputError("rank must be at least 1, dilation at least 0, offset_unit_m positive")
-        if self.fade and self.head != "unet":
-            raise InputError("fade compares what U-Nets see: it needs head='unet'")
+        if self.dilation < 0 or self.offset_unit_m <= 0:
+            raise InputError("dilation must be at least 0, offset_unit_m positive")
         if not (self.motion or self.base):
             raise InputError("without motion the Gaussians are the static base: motion=False needs base=True")
 
@@ -164,7 +159,7 @@ class TrainingConfig:
             raise InputError(f"frames_per_step: norm {norm!r} mixes what is decoded together; expected 1")
 
 
-SUPERVISIONS = ("images", "scans", "surface", "vertices")
+SUPERVISIONS = ("images", "scans")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -175,7 +170,7 @@ class TemplateConfig:
     error_mm: float = 0.0  # rms of a smooth error that is planted in the exact surface
     error_static: float = 0.25  # share of its square that is the same in all frames; learned: 0.15 loose, 0.39 tight
     error_lag: float = 0.5  # correlation of the rest from frame to frame; learned from images: 0.35 loose, 0.70 tight
-    supervision: str = "images"  # nothing but the videos; "scans": of a scanner; "surface", "vertices": for oracles
+    supervision: str = "images"  # nothing but the videos; "scans": of a scanner
     passes: int = 4  # over all training images, where they supervise
     network: str = "linear"  # a map per node of the embedded graph; "graph": the paper's graph convolutions
     skinning: str = "direct"  # "graph": the nodes' transforms, blended, as released
@@ -214,7 +209,6 @@ class AshConfig:
     model: ModelConfig
     training: TrainingConfig
     template: TemplateConfig = TemplateConfig()
-    search: bool = False  # choose the size of the decoders on a training sequence left out; not in the paper
     seed: int = 0
     device: str = "cpu"  # or "cuda", "cuda:1": where it learns and draws, its template included
 
@@ -227,5 +221,5 @@ class AshConfig:
             raise InputError(f"warmup={self.training.warmup!r} trains the decoders and needs motion=True")
         model = self.model
         self.training.check_norm(model.norm)
-        if self.training.texture_noise > 0 and not (model.motion and model.standardise and model.head == "unet"):
+        if self.training.texture_noise > 0 and not (model.motion and model.standardise):
             raise InputError("texture_noise is for U-Nets that see standardised textures (standardise=True)")

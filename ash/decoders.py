@@ -69,7 +69,7 @@ class UNet(nn.Module):
         `forward_naive` is the definition; float32 images on the CPU go one by one through native kernels. Under torch's
         autocast these round the factors of their 3x3 convolutions to bfloat16, where the machine has tiles for it.
         """
-        if not self._takes_natively(texture):
+        if not self._can_use_native(texture):
             return self.forward_naive(texture, features)
         return self._native(texture, features, None)
 
@@ -78,7 +78,7 @@ class UNet(nn.Module):
     ) -> Float[Tensor, "b n o"]:
         """Of `forward`'s result the texels' rows: nothing is shuffled or kept that will not be used."""
         width = self.head.out_channels // rows.of_pixel
-        if self._takes_natively(texture):
+        if self._can_use_native(texture):
             return self._native(texture, features, ash.native.unet.Picks(rows.places, rows.lines, width))
         # In the network's own memory order a pixel's channels are its texels', one after the other.
         pixels = self.forward_naive(texture, features).permute(0, 2, 3, 1)
@@ -106,16 +106,16 @@ class UNet(nn.Module):
         run, layers, threads = ash.native.unet.unet, self._layers(), torch.get_num_threads()
         return as_batch([run(shape, *one, layers, threads, picks) for one in zip(texture, each, strict=True)])
 
-    def _takes_natively(self, texture: Tensor) -> bool:
+    def _can_use_native(self, texture: Tensor) -> bool:
         levels = len(self.down)
         whole = levels > 0 and not any(size % 2**levels for size in texture.shape[2:])
         small = self.head.in_channels * 2**levels <= NATIVE_CHANNELS
         of_its_kind = texture.dtype == self.head.weight.dtype == torch.float32 and texture.device.type == "cpu"
         as_it_is = not (texture.requires_grad or torch.jit.is_tracing())
-        known = not torch.is_autocast_enabled("cpu") or self._takes_tiles()
+        known = not torch.is_autocast_enabled("cpu") or self._can_use_tiles()
         return self.plain and whole and small and of_its_kind and as_it_is and known
 
-    def _takes_tiles(self) -> bool:
+    def _can_use_tiles(self) -> bool:
         return self.head.in_channels % TILED_CHANNELS == 0 and ash.native.library.has_tiles()
 
     def _layers(self) -> list[tuple[Tensor, Tensor]]:

@@ -18,7 +18,7 @@ CPU = torch.device("cpu")
 Moved = TypeVar("Moved")
 
 
-def obstacle(name: str = "cuda") -> str:
+def cuda_error(name: str = "cuda") -> str:
     """Why nothing can run on a CUDA device here, in one line; empty where it can."""
     if torch.version.cuda is None:
         return f"torch {torch.__version__} is built without CUDA"
@@ -41,12 +41,12 @@ def device_named(name: str) -> torch.device:
         InputError: no such device is there, or it cannot be used; says why.
     """
     check_device(name)
-    if name != "cpu" and (why := obstacle(name)):
+    if name != "cpu" and (why := cuda_error(name)):
         raise InputError(f"device {name}: {why}")
     return torch.device(name)
 
 
-def ability(name: str = "cuda") -> str:
+def describe_gpu(name: str = "cuda") -> str:
     """What a CUDA device has that a training needs, in a few words."""
     found = torch.cuda.get_device_properties(torch.device(name))
     half = "with" if torch.cuda.is_bf16_supported() else "without"

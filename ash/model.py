@@ -1,6 +1,6 @@
 """The ASH avatar, in the paper's order: template, textures, decoders, skinning, splatting. START READING HERE."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from typing import Any
@@ -23,8 +23,6 @@ from ash.template.template import Template
 from ash.template_learning.refining import MotionRefinement, RefinedDeformation
 from ash.textures import Conditions, TexelLattice, TextureDrawer, build_lattice
 
-Decode = Callable[[Conditions], Tensor]  # to raw parameters [n, o]
-
 
 class AshModel(MovingModule):
     """The learned part of ASH, and how the stages are joined. `base` and `light` are not in the paper."""
@@ -46,7 +44,7 @@ class AshModel(MovingModule):
         self.template = template
         self.lattice = lattice
         self.textures: TextureDrawer | None = None
-        if decoders is not None and config.head == "unet":
+        if decoders is not None:
             self.textures = TextureDrawer(
                 lattice if config.shuffle == 1 else build_lattice(template.mesh, config.decoded_texels),
                 window=config.window,
@@ -86,17 +84,15 @@ class AshModel(MovingModule):
     def _textures(self, pose: Pose) -> Float[Tensor, "c r r"]:
         return self.base.new_zeros(0, 1, 1) if self.textures is None else self.textures(self.template, pose)
 
-    def decode(self, conditions: Conditions, *, decoders: Decode | None = None) -> Float[Tensor, "n o"]:
-        """Stg.3: raw Gaussian parameters per texel; by other `decoders` than the model's own where they are given."""
-        decoders = decoders or self.decoders
-        return self.base if decoders is None else self.base + self.corrections(decoders(conditions))
+    def decode(self, conditions: Conditions) -> Float[Tensor, "n o"]:
+        """Stg.3: raw Gaussian parameters per texel."""
+        return self.base if self.decoders is None else self.base + self.corrections(self.decoders(conditions))
 
     def decode_together(self, frames: Sequence[Conditions]) -> list[Float[Tensor, "n o"]]:
         """`decode` of several frames, by U-Nets in one batch; by what decodes in another way frame by frame."""
         if len(frames) == 1 or not isinstance(self.decoders, Decoders):
             return [self.decode(seen) for seen in frames]
-        decoded = zip(frames, self.decoders.together(frames), strict=True)
-        return [self.decode(seen, decoders=lambda _, of_frame=of_frame: of_frame) for seen, of_frame in decoded]
+        return [self.base + self.corrections(decoded) for decoded in self.decoders.together(frames)]
 
     def corrections(self, decoded: Float[Tensor, "n o"]) -> Float[Tensor, "n o"]:
         """What of the decoders' output counts: all of it, or all but the offsets."""
@@ -116,28 +112,19 @@ class AshModel(MovingModule):
             gaussians, **views_of(cameras), background=background, dilation=self.config.dilation, threads=threads
         )
 
-    def forward(
-        self,
-        pose: Pose,
-        camera: Camera,
-        clock: StageClock | None = None,
-        *,
-        decoders: Decode | None = None,
-    ) -> Splatted:
+    def forward(self, pose: Pose, camera: Camera, clock: StageClock | None = None) -> Splatted:
         """Motion and camera to image: the whole of ASH, over black, on as many threads as torch is given."""
-        shared = self.gaussians(pose, clock, decoders=decoders)
+        shared = self.gaussians(pose, clock)
         with stage(clock, "stg4", self.base.device):
             threads = torch.get_num_threads()
             return mixed([(share, self.draw(gaussians, [camera], None, threads)) for share, gaussians in shared])
 
-    def gaussians(
-        self, pose: Pose, clock: StageClock | None = None, *, decoders: Decode | None = None
-    ) -> list[tuple[float, Gaussians]]:
+    def gaussians(self, pose: Pose, clock: StageClock | None = None) -> list[tuple[float, Gaussians]]:
         """Motion to posed Gaussians: everything that does not depend on the camera; sets as `shares` has them."""
         threads = torch.get_num_threads()
         conditions = self.conditions(pose, clock, threads)  # Stg.1, Stg.2
         with stage(clock, "stg3", self.base.device):
-            shares = self.shares(self.decode(conditions, decoders=decoders), conditions)
+            shares = self.shares(self.decode(conditions), conditions)
         with stage(clock, "stg4", self.base.device):
             return [(share, self.pose(raw, conditions, threads)) for share, raw in shares]
 

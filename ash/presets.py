@@ -73,24 +73,10 @@ def budget() -> AshConfig:
     return replace(base, training=replace(base.training, snapshots=True))
 
 
-def fit() -> AshConfig:
-    """`cpu` with decoders no larger than the scene needs, found in a short search before: see `ash.searching`."""
-    return replace(cpu(), search=True)
-
-
 def brief() -> AshConfig:
     """`cpu` for 400 steps, far from its plateau: tables with three seeds within an hour on two cores."""
     base = cpu()
     return replace(base, training=replace(base.training, steps=400, warmup_steps=80))
-
-
-def frugal() -> AshConfig:
-    """Twice the frames per second of `cpu`: half its texels per side, and blendshapes in place of the U-Net."""
-    base = cpu()
-    return replace(
-        base,
-        model=replace(base.model, texels=128, shuffle=1, head="blendshapes", rank=6, global_features=False, fade=0.0),
-    )
 
 
 def paper() -> AshConfig:
@@ -147,10 +133,8 @@ PRESETS = {
     "ci": ci,
     "brief": brief,
     "cpu": cpu,
-    "fit": fit,
     "thorough": thorough,
     "budget": budget,
-    "frugal": frugal,
     "paper": paper,
     "official": official,
 }
@@ -159,7 +143,7 @@ PRESETS = {
 VALIDATION = "tight and loose, capture seed 100; the weights of the loss on a capture of the tables"
 # On which captures a preset's numbers were chosen. From now on: on none that a suite runs on (docs/tuning.md).
 CHOSEN_ON = {
-    **dict.fromkeys(("ci", "brief", "cpu", "fit", "thorough", "budget", "frugal"), VALIDATION),
+    **dict.fromkeys(("ci", "brief", "cpu", "thorough", "budget"), VALIDATION),
     "paper": "the paper's text",
     "official": "the release's code",
 }

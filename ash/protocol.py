@@ -145,8 +145,6 @@ class TrainingOutcome:
     ended_by: str  # "steps", "seconds": a limit was met; "plateau": the last third had gained less than 0.1 dB by then
     gained: float | None = None  # over the last third of the steps, dB; None: too short to tell
     reserved_psnr: float | None = None  # at the end; None: the capture is too small to reserve views
-    choice: str = ""  # of a search for what the scene needs, and the CPU seconds that it took when it was made
-    search_seconds: float = 0.0
     template: str = ""  # what the template was learned from, and what that settled on; empty where it was not learned
     correction_spread: float | None = None  # of what decoders add, between frames, rms; None: there are no decoders
     cameras: int = 0  # that training saw; 0: unknown

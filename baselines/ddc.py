@@ -32,7 +32,6 @@ from ash.model import stage
 from ash.presets import Recipe, named
 from ash.protocol import Display, DressedMesh, StageClock, TrainingOutcome
 from ash.rotations import RigidTransforms
-from ash.searching import Build, Candidate, Choice, at_size, brief_training, sufficient, with_choice, write_choice
 from ash.template.template import PosedTemplate, Template
 from ash.template_learning.learning import template_of, with_template
 from ash.template_learning.refining import MotionRefinement, Refinement
@@ -55,7 +54,6 @@ class DdcConfig:
 
     texture: int  # pixels per side
     model: AtlasConfig
-    search: bool
     training: TrainingConfig
     template: TemplateConfig
     refine: str  # images move the vertices: "static", alike in all frames; "motion", as a frame moves, too; "none"
@@ -84,7 +82,6 @@ def ddc_config(ash: AshConfig, *, seed: int, template: TemplateConfig) -> DdcCon
     return DdcConfig(
         texture=TEXTURE_FACTOR * ash.model.texels,
         model=AtlasConfig(**{field.name: getattr(ash.model, field.name) for field in fields(AtlasConfig)}),
-        search=ash.search,
         training=ash.training,
         template=template,
         refine="static" if template.kind != "exact" or template.error_mm > 0 else "none",
@@ -190,10 +187,6 @@ class DdcAvatar:
         capture = training_part(capture, config.training)
         self.device = device_named(config.device)
         self.template = template or template_of(config.template, capture, seed=config.seed, device=self.device)
-        self.choice: Choice | None = None
-        if config.search:
-            self.choice = sufficient(self._brief(config), config, capture)
-            config = at_size(config, self.choice.candidate, self.choice.fade)
         torch.manual_seed(config.seed)
         self.config = config
         initial = torch.full((3, config.texture, config.texture), GREY)
@@ -219,24 +212,9 @@ class DdcAvatar:
         )
         self._posed: Kept[int, PosedTemplate] = Kept(lambda frame: self.template.pose(Pose(capture.motion, frame)))
 
-    def _brief(self, config: DdcConfig) -> Build:
-        """How the search builds its candidates: on this template."""
-
-        def build(candidate: Candidate, capture: Capture) -> DdcAvatar:
-            sized = at_size(config, candidate, config.model.fade)
-            return DdcAvatar(replace(sized, training=brief_training(sized.training)), capture, template=self.template)
-
-        return build
-
-    def texture_drawer(self) -> TextureDrawer:
-        """Stg.2 of the network."""
-        return self.module.textures
-
     def fit(self, capture: Capture, *, folder: Path) -> None:
         """Train texture and network on the training images; see `ash.training.loop.fit`."""
         images = load_training_images(training_part(capture, self.config.training), self.device)
-        if self.choice is not None:
-            write_choice(self.choice, folder / "log.jsonl")
         outcome = fit(self, images, self.config.training, seed=self.config.seed, folder=folder)
         self._outcome = replace(outcome, precision=self._precision)
 
@@ -356,7 +334,7 @@ class DdcAvatar:
 
     def outcome(self) -> TrainingOutcome | None:
         """How training ended; None before it did."""
-        return with_template(with_choice(self._outcome, self.choice), self.template)
+        return with_template(self._outcome, self.template)
 
     def template_seconds(self) -> float | None:
         """What learning the template took, once for all methods that stand on it; None where it was not learned."""

@@ -60,7 +60,7 @@ def _on_exact(preset: str) -> DdcConfig:
     config = named(preset)
     mesh = ddc_config(config, seed=0, template=TemplateConfig(kind="exact"))
     model = replace(mesh.model, fade=0.0, global_features=False)
-    return replace(mesh, texture=TEXTURE_FACTOR * config.model.texels, model=model, search=False)
+    return replace(mesh, texture=TEXTURE_FACTOR * config.model.texels, model=model)
 
 
 oracle_texture = Recipe(config=_on_exact, build=OracleTexture)  # One texture, at the preset's budget.

@@ -12,7 +12,7 @@ from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture, Pose
 from ash.capture.formats import read_body
 from ash.config import AshConfig, TemplateConfig
-from ash.presets import ash, ash_truth, frugal
+from ash.presets import ash, ash_truth
 from baselines.ddc import ddc, ddc_truth
 from baselines.oracle_texture import oracle_texture
 
@@ -52,13 +52,6 @@ smpl = replace(ash, build=_on_bare_body).but({"template": TemplateConfig(kind="s
 # Without learned texels, as the paper has its method: all that is drawn comes out of the decoders.
 ash_wo_base = ash.but({**WITHOUT_BASE, "training.warmup": "fitted"})
 ddc_wo_base = ddc.but({**WITHOUT_BASE, "training.warmup": "none", "training.warmup_steps": 0})
-
-# What lightness costs: the model of the preset `frugal` in any other.
-ash_frugal = ash.but({"model": lambda _: frugal().model})
-
-# Oracles: how good a template may become that is learned from the true surface, and from true vertices.
-by_surface = ash.but({"template.kind": "learned", "template.supervision": "surface"})
-by_vertices = ash.but({"template.kind": "learned", "template.supervision": "vertices"})
 
 # Oracles on a surface that is wrong by so much. A mesh may be moved by the images; an exact one has nothing to gain.
 ash_2mm = ash_truth.but({"template.error_mm": 2.0})

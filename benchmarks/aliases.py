@@ -1,6 +1,11 @@
-"""Old names that still work for one release: commands, and what each is called now."""
+"""Old names that still work for one release: commands and formats, and what each is called now."""
 
 OLD_COMMANDS: dict[str, tuple[str, ...]] = {  # old command -> what is typed in its place; arguments follow unchanged
     "merge": ("report",),
     "rescore": ("eval", "--scores-only"),
+    "export-avatar": ("export",),
+    "share": ("export", "--format", "html"),
+    "video": ("export", "--format", "mp4"),
 }
+
+OLD_FORMATS = {"glb": "gltf"}  # of `export`, for avatars

@@ -48,7 +48,9 @@ def _anchored(
 def place(lattice: TexelLattice, posed: PosedTemplate, anchor: str = "blended", *, threads: int = 1) -> Placed:
     """`place_naive`, by native kernels where nothing needs a gradient."""
     transforms = posed.transforms
-    if not ash.native.skinning.takes(posed.canonical, posed.normals, transforms.quats, transforms.translations):
+    if not ash.native.skinning.can_use_native(
+        posed.canonical, posed.normals, transforms.quats, transforms.translations
+    ):
         return place_naive(lattice, posed, anchor)
     dual = dual_parts(transforms)
     blank = dual.new_zeros(len(dual), 2)
@@ -95,7 +97,7 @@ def pose(
     """`pose_naive`, by native kernels where only `raw` and `light` need gradients."""
     transforms = conditions.transforms
     constants = (conditions.canonical, conditions.normals, transforms.quats, transforms.translations)
-    if raw.dtype != torch.float32 or not ash.native.skinning.takes(*constants):
+    if raw.dtype != torch.float32 or not ash.native.skinning.can_use_native(*constants):
         return pose_naive(raw, conditions, config, light)
     canonical_frame = config.quat_frame == "canonical"
     options = ash.native.texels.PoseOptions(

@@ -6,7 +6,7 @@ from torch import Tensor
 from ash.native.library import address, load
 
 
-def takes(*tensors: Tensor) -> bool:
+def can_use_native(*tensors: Tensor) -> bool:
     """Whether the kernels may be used: float32 on the CPU, and nobody asks for a gradient."""
     return all(
         t.dtype == torch.float32 and t.device.type == "cpu" and not (t.requires_grad and torch.is_grad_enabled())

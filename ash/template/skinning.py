@@ -68,7 +68,7 @@ def sparse_skin_weights(dense: Float[Tensor, "v j"]) -> SkinWeights:
 
 def dual_quaternion_skinning(joints: RigidTransforms, skin: SkinWeights) -> RigidTransforms:
     """`dual_quaternion_skinning_naive`, by a native kernel where no gradient is needed."""
-    if not ash.native.skinning.takes(joints.quats, joints.translations, skin.weights):
+    if not ash.native.skinning.can_use_native(joints.quats, joints.translations, skin.weights):
         return dual_quaternion_skinning_naive(joints, skin)
     joined = torch.cat([joints.quats, dual_parts(joints)], -1)
     quats, translations = ash.native.skinning.skin_vertices(joined, skin.joints, skin.weights)

@@ -82,7 +82,7 @@ class KnownDeformation:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PlantedError:
-    """A template error of known size and kind. `ash.template_learning.errors` measures the same of a real one."""
+    """A template error of known size and kind."""
 
     rms_mm: float  # in every frame, over the vertices
     static: float  # share of its square that is the same in all frames
@@ -231,7 +231,7 @@ def vertex_normals(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) ->
 
     By a native kernel where no gradient is needed.
     """
-    if ash.native.skinning.takes(vertices):
+    if ash.native.skinning.can_use_native(vertices):
         return ash.native.skinning.vertex_normals(vertices, faces)
     a, b, c = vertices[faces].unbind(1)
     doubled_area = torch.linalg.cross(b - a, c - a)

@@ -28,14 +28,13 @@ from ash.template_learning.deforming import LinearDeformation
 from ash.template_learning.graph_nets import GraphDeformation
 from ash.template_learning.image_tracking import track_images
 from ash.template_learning.regressing import fit_graph, fit_linear
-from ash.template_learning.tracking import Tracked, track_scans, track_surface, track_vertices
+from ash.template_learning.tracking import Tracked, track_scans
 
 Deformer = LinearDeformation | GraphDeformation
 
 
 def template_of(config: TemplateConfig, capture: Capture, *, seed: int, device: torch.device = CPU) -> Template:
-    """The template that a configuration names, on the CPU; "exact", and supervision "surface" and "vertices", are for
-    oracles. One that is to be learned is learned on `device`."""
+    """The template that a configuration names, on the CPU; "exact" is for oracles. Learning happens on `device`."""
     if config.kind == "skinned":
         return skinned_template(capture)
     if config.kind == "exact":
@@ -118,9 +117,7 @@ def _learn(
 def _track(config: TemplateConfig, capture: Capture, at_rest: Template, graph: EmbeddedGraph) -> Tracked:
     if config.supervision == "images":
         return track_images(capture, at_rest, graph, passes=config.passes)
-    return {"scans": track_scans, "surface": track_surface, "vertices": track_vertices}[config.supervision](
-        capture, at_rest
-    )
+    return track_scans(capture, at_rest)
 
 
 def _state(deformation: Deformer) -> dict[str, torch.Tensor]:

@@ -1,8 +1,7 @@
 """Where the template's vertices lie in every training frame: what Stg.1 learns from, before and apart from the avatar.
 
-Supervision is nothing but the videos ("images", in `ash.template_learning.image_tracking`), what a studio has ("scans":
-a surface per frame with noise and holes, no correspondences; UMA, the successor of ASH, states this loss), or, for
-oracles, the truth: "surface", the same loss on the exact surface, and "vertices", with correspondences.
+Supervision is nothing but the videos ("images", in `ash.template_learning.image_tracking`) or what a studio has
+("scans": a surface per frame with noise and holes, no correspondences; UMA, the successor of ASH, states this loss).
 """
 
 from collections.abc import Callable
@@ -14,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ash.capture.dataset import Capture, Pose
-from ash.capture.formats import read_scan, read_surface_mesh_truth, read_template_truth
+from ash.capture.formats import read_scan, read_template_truth
 from ash.rotations import RigidTransforms
 from ash.template.graph import NeighbourMean, vertex_neighbours
 from ash.template.template import Template, vertex_normals
@@ -48,29 +47,10 @@ class Tracked:
 
 
 Correction = Callable[[int, Tensor], tuple[Tensor, Tensor]]  # Frame, posed vertices -> shift [v, 3], weight [v].
-ReadMesh = Callable[[Capture, int], tuple[np.ndarray, np.ndarray]]  # Frame -> vertices [s, 3] in metres, faces [f, 3].
-
-
-def track_vertices(capture: Capture, template: Template) -> Tracked:
-    """The oracle: the true vertices, brought back to canonical space."""
-    frames = capture.splits["train"].frames
-    truth = torch.from_numpy(read_template_truth(capture)).float().to(template.device)
-    canonical = [template.pose(Pose(capture.motion, f)).transforms.apply_inverse(truth[f]) for f in frames]
-    return Tracked(frames=frames, canonical=torch.stack(canonical))
 
 
 def track_scans(capture: Capture, template: Template) -> Tracked:
-    """Register the template to the scans of the training frames, whose rims are not believed."""
-    return track_chamfer(capture, template, read_scan, rim=SCAN_RIM)
-
-
-def track_surface(capture: Capture, template: Template) -> Tracked:
-    """An oracle: register the template to the true surface. Its rims are hems, and as true as the rest of it."""
-    return track_chamfer(capture, template, read_surface_mesh_truth, rim=0)
-
-
-def track_chamfer(capture: Capture, template: Template, read: ReadMesh, *, rim: int) -> Tracked:
-    """Non-rigid registration to a mesh per frame, which `read` gives: both ways to the nearest point, along its normal.
+    """Non-rigid registration to the scans of the training frames: both ways to the nearest point, along its normal.
 
     Moving along the mesh's normals alone leaves the vertices free to stay where skinning put them along it, which is
     what nobody without correspondences can know. First one correction is found for all frames, then each frame's own;
@@ -78,7 +58,7 @@ def track_chamfer(capture: Capture, template: Template, read: ReadMesh, *, rim: 
     point that is far off all others around it is noise: the template follows its neighbours there.
     """
     device = template.device
-    meshes = {frame: _Mesh(*read(capture, frame), rim=rim, device=device) for frame in capture.splits["train"].frames}
+    meshes = {frame: _Mesh(*read_scan(capture, frame), device=device) for frame in capture.splits["train"].frames}
     neighbours = vertex_neighbours(template.mesh).to(device)
 
     def towards_mesh(frame: int, posed: Tensor) -> tuple[Tensor, Tensor]:
@@ -138,13 +118,12 @@ class _Mesh:
     """A surface of one frame on a device, to look up the nearest points of."""
 
     def __init__(
-        self, vertices: Float[np.ndarray, "s 3"], faces: Int[np.ndarray, "f 3"], *, rim: int, device: torch.device
+        self, vertices: Float[np.ndarray, "s 3"], faces: Int[np.ndarray, "f 3"], *, device: torch.device
     ) -> None:
-        """`rim`: how many vertices deep the rim of holes is that is not believed."""
         places = torch.from_numpy(vertices).double().to(device)
         self.nearest, self.points = NearestPoint(places), places.float()
         self.normals = _smooth_normals(self.points, torch.from_numpy(faces).to(device))
-        self.believed = ~torch.from_numpy(_rim(faces, len(vertices), rings=rim)).to(device)
+        self.believed = ~torch.from_numpy(_rim(faces, len(vertices))).to(device)
         self.few = torch.arange(0, len(vertices), max(1, len(vertices) // POINTS), device=device)
 
     def correction(self, posed: Tensor, normals: Tensor, neighbours: NeighbourMean) -> tuple[Tensor, Tensor]:
@@ -182,14 +161,13 @@ class _Mesh:
         return off, (apart - normal * off[:, None]).norm(dim=1)
 
 
-def _rim(faces: Int[np.ndarray, "f 3"], count: int, *, rings: int) -> Bool[np.ndarray, " s"]:
-    """Vertices on open edges, and those around them, so many deep: seen from aside, a scanner is at its worst there."""
+def _rim(faces: Int[np.ndarray, "f 3"], count: int) -> Bool[np.ndarray, " s"]:
+    """Vertices on open edges, and those around them, SCAN_RIM deep: a scanner sees them at grazing angles."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
     _, name, uses = np.unique(edges[:, 0] * count + edges[:, 1], return_inverse=True, return_counts=True)
     rim = np.zeros(count, bool)
-    if rings:
-        rim[edges[uses[name] == 1].ravel()] = True
-    for _ in range(rings - 1):
+    rim[edges[uses[name] == 1].ravel()] = SCAN_RIM > 0
+    for _ in range(SCAN_RIM - 1):
         rim[faces[rim[faces].any(1)].ravel()] = True
     return rim
 

@@ -166,20 +166,19 @@ def load_snapshots(results: Sequence[CellResult]) -> pd.DataFrame:
 
 def load_outcomes(results: Sequence[CellResult]) -> pd.DataFrame:
     """One row per cell that says how its training ended: at a `plateau` or not, with `dead` decoders (the same output
-    in every frame), the `choice` of a search, and what its `template` was learned from.
+    in every frame), and what its `template` was learned from.
     """
     rows = [
         {
             **_cell(result),
             "plateau": end.ended_by == "plateau",
             "dead": end.carries_nothing,
-            "choice": end.choice or "",
             "template": end.template or "",
         }
         for result in results
         if not result.config.axis and (end := result.training) is not None
     ]
-    names = ["scene", "method", "capture", "seed", "plateau", "dead", "choice", "template"]
+    names = ["scene", "method", "capture", "seed", "plateau", "dead", "template"]
     return pd.DataFrame(rows, columns=names)
 
 

@@ -12,6 +12,7 @@ A cell lives in a folder of its own, named by the hash of what went in:
     result.json     what came out; written last, atomically: where it exists, the cell is finished
 """
 
+import contextlib
 from collections.abc import Collection
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -32,6 +33,7 @@ DrawnBy = Literal["method", "display", "trainer"]  # a timed frame; "trainer": t
 Status = Literal["done", "crashed", "diverged", "timeout", "out of memory"]
 VARIED = ("factory", "changes", "subject")
 PRINTED = ("reason", "training", "provenance", "drawn_on", "evaluated_code")  # texts of a result, for people to read
+RETIRED = ("choice", "search_seconds")
 STATUSES = ("done", "crashed", "diverged", "timeout", "out of memory")
 
 
@@ -228,12 +230,12 @@ def _find_capture(recorded: Path, cell_folder: Path, *, identity: str) -> Path:
 
     That is searched in `data/` and beside it, of the current folder and of those around the cell.
     """
-    if (recorded / MANIFEST).exists():
-        return recorded
-    for parent in (Path(), *cell_folder.resolve().parents[:5]):
-        for place in (parent / "data" / recorded.name, parent / recorded.name):
-            if (place / MANIFEST).is_file() and sha256_of(place / MANIFEST) == identity:
-                return place
+    parents = (Path(), *cell_folder.resolve().parents[:5])
+    with contextlib.suppress(OSError, ValueError):  # A damaged path; whoever reads the capture says so.
+        if not (recorded / MANIFEST).exists():
+            for place in (parent / part for parent in parents for part in (f"data/{recorded.name}", recorded.name)):
+                if (place / MANIFEST).is_file() and sha256_of(place / MANIFEST) == identity:
+                    return place
     return recorded
 
 
@@ -290,6 +292,8 @@ def result_of(cell: Cell) -> CellResult | None:
 
 
 def _result_from(content: Any) -> CellResult:
+    if isinstance(content.get("training"), dict):  # Results of version 0.3 and earlier have two keys more.
+        content["training"] = {key: value for key, value in content["training"].items() if key not in RETIRED}
     content = content | {name: _printable(content[name]) for name in PRINTED if name in content}
     views = [dict(view) for view in content["views"]]
     scores = [

@@ -249,8 +249,6 @@ def _training_summary(training: TrainingOutcome | None, curve: tuple[CurvePoint,
     rows = {"steps": float(training.steps), "plateau": float(reached)}
     seen = {"train_cameras": training.cameras, "train_frames": training.frames}
     rows |= {name: float(count) for name, count in seen.items() if count}
-    if training.search_seconds:
-        rows["search_s"] = training.search_seconds
     if reached and settled is not None:
         rows["settled_s"] = settled
     return tuple(Summary(split="speed", region="", metric=name, value=value) for name, value in rows.items())

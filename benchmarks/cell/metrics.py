@@ -85,7 +85,6 @@ METRICS = {
         Metric(key="train_frames", title="frames seen", unit="", direction="none", worst=0.0, decimals=0, abs_tol=0.0),
         Metric(key="plateau", title="plateau", unit="", direction="none", worst=0.0, decimals=0, abs_tol=0.0),
         Metric(key="settled_s", title="within 0.3 dB", unit="s", direction="down", worst=1e6, decimals=0, abs_tol=0.0),
-        Metric(key="search_s", title="search", unit="s", direction="down", worst=1e6, decimals=0, abs_tol=0.0),
         Metric(key="template_s", title="template", unit="s", direction="down", worst=1e6, decimals=0, abs_tol=0.0),
         Metric(key="params", title="parameters", unit="", direction="down", worst=1e12, decimals=0, abs_tol=0.0),
         Metric(key="gaussians", title="Gaussians", unit="", direction="down", worst=1e12, decimals=0, abs_tol=0.0),

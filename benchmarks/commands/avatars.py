@@ -1,10 +1,11 @@
-"""Commands that show a trained avatar or take it along: play, video, export-avatar, share."""
+"""Commands that show a trained avatar, or write it or a capture for other programs: play, export."""
 
 import contextlib
 import sys
-from dataclasses import dataclass
+import threading
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
@@ -12,6 +13,10 @@ from ash.capture.dataset import Pose
 from ash.files import InputError, write_atomic
 from benchmarks.commands.arguments import DONE, Count, CountIfAny, File, Names, Natural, Trust
 from benchmarks.commands.devices import CPU, DeviceName, chosen_device
+
+if TYPE_CHECKING:
+    from benchmarks.play.avatars import AvatarSet
+    from benchmarks.play.motions import MotionClip
 
 Stretch = Annotated[str | None, arg(metavar="A:B")]
 
@@ -34,23 +39,23 @@ class PlayCommand:
 
     def __call__(self) -> int:
         """Serve until Ctrl-C."""
-        from benchmarks.play.doors import DoorOptions, require_safe
-        from benchmarks.play.player import playing, wait_for_interrupt
+        from benchmarks.play.auth import AuthOptions, require_safe
+        from benchmarks.play.player import playing
 
-        doors = DoorOptions(
+        options = AuthOptions(
             host=self.host,
             port=self.port,
             clients=self.clients,
             allow_origins=self.allow_origin,
             expose=self.expose,
         )
-        require_safe(doors)
+        require_safe(options)
         with playing(
             self.run,
             motions=self.motion,
             scene=self.scene,
             methods=self.methods,
-            doors=doors,
+            options=options,
             device=chosen_device(self.device),
             trust=self.trust,
         ) as player:
@@ -58,111 +63,130 @@ class PlayCommand:
             if self.expose:
                 print(f"{self.host} is open to other machines, and nothing is encrypted", file=sys.stderr)
             with contextlib.suppress(KeyboardInterrupt):  # How it is meant to end.
-                wait_for_interrupt()
+                threading.Event().wait()
         return DONE
 
 
 @dataclass(frozen=True, kw_only=True)
-class VideoCommand:
-    """Film a run's avatars: a motion from a camera, a spiral or a rig, beside the truth."""
+class ExportCommand:
+    """Write a capture or a trained avatar for other programs.
 
-    run: Positional[Path]  # a run's folder or a cell's
-    out: File  # ends with .mp4 or .webp
-    motion: str = "test"  # test, train, walk, dance and so on, or a BVH or AMASS file
-    frames: Stretch = None  # of the motion, from 0, B not included; default: all
-    camera: str = "spiral"  # spiral, rig, or a camera of the capture
-    methods: Names = ()  # only these; default: all of the run
-    scene: str | None = None  # of a run with several; default: its first
-    truth: FlagCreatePairsOff[bool] = False  # the truth beside them; rendered where it never was
-    height: Count = 256  # of a picture, pixels
-    fps: CountIfAny = None  # frames per second; default: the motion's
-    trust: Trust = False  # load methods that are not ours too: their code runs here, without isolation
+    Captures: ash (the release's files), nerfstudio, colmap, plain (images, cameras and poses of the training part),
+    test-views (what is scored: cameras and poses, no images).
+
+    Avatars: ply, spz, gltf (one frame, or several in a folder; ends with .glb or .gltf), bvh (the skeleton in motion),
+    mp4 (or .webp: a video, avatars and truth side by side), html (one page that plays a clip without a server).
+    """
+
+    source: Positional[Path]  # the folder of a capture, a cell or a run
+    form: Annotated[str, arg(name="format", metavar="FORMAT")]  # see above: captures and avatars have different ones
+    out: File | None = None  # default: SOURCE-FORMAT beside a capture, SOURCE.SUFFIX here of an avatar
+    split: str | None = None  # nerfstudio, colmap: train (default), novel_view, near_pose, novel_pose or far_pose
+    frame: int | None = None  # nerfstudio, colmap: only this frame of the split
+    motion: str = "test"  # avatars: test, train, walk, dance and so on, or a BVH or AMASS file
+    frames: Stretch = (
+        None  # avatars: A:B of the motion, from 0, B not included; default: all, of ply, spz, gltf the first
+    )
+    methods: Names = ()  # avatars: only these of a run
+    scene: str | None = None  # avatars: of a run with several; default: its first
+    trust: Trust = False  # avatars: load methods that are not ours too: their code runs here, without isolation
+    camera: str = "spiral"  # mp4: spiral, rig, or a camera of the capture
+    truth: FlagCreatePairsOff[bool] = False  # mp4: the truth beside them; rendered where it never was
+    height: Count = 256  # mp4: of a picture, pixels
+    fps: CountIfAny = None  # mp4: frames per second; default: the motion's
 
     def __call__(self) -> int:
-        """Film it."""
-        from benchmarks.play.actors import open_cast
-        from benchmarks.play.film import Script, cameras_of, shoot, write_film
-        from benchmarks.play.motions import act_named, frames_in
+        """Write it."""
+        from ash.capture.manifest import is_capture
+        from benchmarks.aliases import OLD_FORMATS
+        from benchmarks.export.formats import FORMATS as OF_AVATARS
+        from benchmarks.export.formats import suffix_of
+        from synth.readers.export import FORMATS as OF_CAPTURES
 
-        if self.out.suffix not in (".mp4", ".webp"):
-            raise InputError(f"{self.out}: expected a film that ends with .mp4 or .webp")
-        with open_cast(self.run, scene=self.scene, methods=self.methods, trust=self.trust) as cast:
-            act = act_named(cast.capture, self.motion)
-            rate = float(self.fps or act.motion.fps)
-            script = Script(
-                act=act,
-                frames=frames_in(act, self.frames),
-                camera=self.camera,
-                height=self.height,
-                fps=rate,
-                truth=self.truth,
-            )
-            cameras_of(cast.capture, script, 0)  # An unknown camera is refused before avatars are loaded.
-            shot = write_film(self.out, shoot(cast, script, lambda text: print(text, file=sys.stderr)), fps=rate)
-        print(f"{self.out}: {shot} frames, {self.out.stat().st_size / 1e6:.1f} MB")
+        capture = is_capture(self.source)
+        if not capture and self.form in OLD_FORMATS:
+            return replace(self, form=OLD_FORMATS[self.form])()
+        allowed, kind = (OF_CAPTURES, "a capture") if capture else (OF_AVATARS, "a trained avatar")
+        if self.form not in allowed:
+            expected = f"expected one of {', '.join(allowed)} for {kind}"
+            raise InputError(f"format: {expected} ({self.source}), got {self.form!r}")
+        self._require_options_of_format()
+        if capture:
+            return self._export_capture(self.out or self.source.with_name(f"{self.source.name}-{self.form}"))
+        suffix = suffix_of(self.form, self.out or Path())
+        return self._export_avatar(self.out or Path(f"{self.source.resolve().name}{suffix}"), suffix)
+
+    def _require_options_of_format(self) -> None:
+        """An option that the format does not know is refused, and not ignored."""
+        from benchmarks.export.formats import FORMATS as OF_AVATARS
+
+        avatars, video = tuple(OF_AVATARS), ("mp4",)
+        known: dict[str, tuple[str, ...]] = dict.fromkeys(("split", "frame"), ("nerfstudio", "colmap"))
+        known |= dict.fromkeys(("motion", "frames", "methods", "scene", "trust"), avatars)
+        known |= dict.fromkeys(("camera", "truth", "height", "fps"), video)
+        for option in fields(self):
+            forms = known.get(option.name, (self.form,))
+            if self.form not in forms and getattr(self, option.name) != option.default:
+                raise InputError(f"--{option.name}: goes with the format {', '.join(forms)}, got {self.form}")
+
+    def _export_capture(self, folder: Path) -> int:
+        from ash.capture.formats import load_capture
+        from benchmarks.cell.views import evaluated_views
+        from synth.readers.export import export
+
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise InputError(f"{folder}: expected an empty folder")
+        capture = load_capture(self.source)
+        views = [(view.split, view.camera, view.frame) for view in evaluated_views(capture)]
+        print(export(capture, folder, form=self.form, split=self.split, frame=self.frame, views=views))
+        if (folder / "ABOUT.txt").exists():
+            print((folder / "ABOUT.txt").read_text(), end="", file=sys.stderr)
         return DONE
 
+    def _export_avatar(self, out: Path, suffix: str) -> int:
+        from benchmarks.export.formats import FRAMES
+        from benchmarks.play.avatars import open_avatars
+        from benchmarks.play.motions import frames_in, motion_clip
 
-@dataclass(frozen=True, kw_only=True)
-class ExportAvatarCommand:
-    """Write an avatar's Gaussians, mesh or skeleton for other programs."""
+        write = {"bvh": self._write_bvh, "mp4": self._write_video, "html": self._write_page}.get(self.form)
+        with open_avatars(self.source, scene=self.scene, methods=self.methods, trust=self.trust) as avatars:
+            clip = motion_clip(avatars.capture, self.motion)
+            if self.form in FRAMES:
+                self._write_frames(avatars, clip, frames_in(clip, self.frames or "0"), out, suffix)
+                print(out)
+            elif write is not None:
+                frames = frames_in(clip, self.frames)
+                write(avatars, clip, frames, out)
+                print(f"{out}: {len(frames)} frames, {out.stat().st_size / 1e6:.1f} MB")
+        return DONE
 
-    cell: Positional[Path]  # a cell's folder, or a run's with one avatar
-    form: Annotated[str, arg(name="format", metavar="F")]  # ply, splat, spz, gltf, glb or bvh
-    out: File  # a folder, where --frames means several
-    motion: str = "test"  # test, train, walk, dance and so on, or a BVH or AMASS file
-    frames: Stretch = None  # of the motion, from 0, B not included; default: 0, of a skeleton all
-    trust: Trust = False  # load methods that are not ours too: their code runs here, without isolation
+    def _write_frames(
+        self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], out: Path, suffix: str
+    ) -> None:
+        """One frame into a file, or several into a folder, each named by its number in the capture or the file."""
+        from benchmarks.export.formats import frame_bytes
 
-    def __call__(self) -> int:
-        """Write one frame into a file, or several into a folder; of a skeleton, the motion."""
-        from dataclasses import replace
+        loaded = avatars.only()
+        for frame in frames:
+            path = out if len(frames) == 1 else out / f"{frame:06d}{suffix}"
+            pose = Pose(clip.motion, frame)
+            write_atomic(path, frame_bytes(loaded.avatar, pose, suffix=suffix, title=loaded.title))
 
+    def _write_bvh(self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], out: Path) -> None:
         from benchmarks.export.bvh import bvh_bytes
-        from benchmarks.export.formats import SKELETON, frame_bytes, suffix_of
-        from benchmarks.play.actors import open_cast
-        from benchmarks.play.motions import act_named, frames_in
 
-        suffix = suffix_of(self.form)
-        with open_cast(self.cell, trust=self.trust) as cast:
-            actor, act = cast.only(), act_named(cast.capture, self.motion)
-            if self.form == SKELETON:
-                chosen = list(frames_in(act, self.frames))
-                played = replace(act.motion, dofs=act.motion.dofs[chosen], sequence=act.motion.sequence[chosen])
-                write_atomic(self.out, bvh_bytes(cast.capture.skeleton, played))
-                print(self.out)
-                return DONE
-            chosen = list(frames_in(act, self.frames or "0"))
-            for index, frame in enumerate(chosen):
-                path = self.out if len(chosen) == 1 else self.out / f"{index:06d}{suffix}"
-                write_atomic(
-                    path, frame_bytes(actor.avatar, Pose(act.motion, frame), form=self.form, title=actor.title)
-                )
-        print(self.out)
-        return DONE
+        motion, chosen = clip.motion, list(frames)
+        played = replace(motion, dofs=motion.dofs[chosen], sequence=motion.sequence[chosen])
+        write_atomic(out, bvh_bytes(avatars.capture.skeleton, played))
 
+    def _write_video(self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], out: Path) -> None:
+        from benchmarks.play.video import VideoSpec, render_video, write_video
 
-@dataclass(frozen=True, kw_only=True)
-class ShareCommand:
-    """Write one page that plays a clip of an avatar without a server."""
+        spec = VideoSpec(clip=clip, frames=frames, camera=self.camera, height=self.height, truth=self.truth)
+        pictures = render_video(avatars, spec, lambda text: print(text, file=sys.stderr))
+        write_video(out, pictures, fps=float(self.fps or clip.motion.fps))
 
-    cell: Positional[Path]  # a cell's folder, or a run's with one avatar
-    out: File  # ends with .html
-    motion: str = "test"  # test, train, walk, dance and so on, or a BVH or AMASS file
-    frames: Stretch = None  # of the motion, from 0, B not included; default: all
-    trust: Trust = False  # load methods that are not ours too: their code runs here, without isolation
+    def _write_page(self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], out: Path) -> None:
+        from benchmarks.play.share import shared_page
 
-    def __call__(self) -> int:
-        """Write the page."""
-        from benchmarks.play.actors import open_cast
-        from benchmarks.play.motions import act_named, frames_in
-        from benchmarks.play.share import clip_of, share_page
-
-        if self.out.suffix != ".html":
-            raise InputError(f"{self.out}: expected a page that ends with .html")
-        with open_cast(self.cell, trust=self.trust) as cast:
-            act = act_named(cast.capture, self.motion)
-            clip = clip_of(cast, act, frames_in(act, self.frames))
-        write_atomic(self.out, share_page(clip))
-        print(f"{self.out}: {len(clip.frames)} frames, {self.out.stat().st_size / 1e6:.1f} MB")
-        return DONE
+        write_atomic(out, shared_page(avatars.only(), clip, frames))

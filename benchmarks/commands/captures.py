@@ -1,4 +1,4 @@
-"""Commands that make, check and convert captures: synth, verify, undistort, export, motions, sheets."""
+"""Commands that make and check captures: synth, verify, undistort, motions, sheets."""
 
 import contextlib
 import sys
@@ -198,33 +198,6 @@ class UndistortCommand:
         from synth.readers.undistorting import undistort as resample
 
         print(resample(self.folder, self.out))
-        return DONE
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportCommand:
-    """Write a capture in another format: ash (the release's), nerfstudio, colmap, glb."""
-
-    folder: Positional[Path]  # of the capture
-    form: Annotated[str, arg(name="format", metavar="FORMAT")]  # ash, nerfstudio, colmap or glb
-    out: Folder | None = None  # default: DIR-FORMAT
-    split: str | None = None  # of nerfstudio and colmap: train (default), novel_view, near_pose, novel_pose or far_pose
-    frame: int | None = None  # of nerfstudio and colmap: only this frame of the split
-
-    def __call__(self) -> int:
-        """Write it."""
-        from ash.capture.formats import load_capture
-        from synth.readers.export import FORMATS
-        from synth.readers.export import export as write
-
-        if self.form not in FORMATS:
-            raise InputError(f"unknown format {self.form!r}, expected one of {', '.join(FORMATS)}")
-        folder = self.out or self.folder.with_name(f"{self.folder.name}-{self.form}")
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise InputError(f"{folder}: expected an empty folder")
-        print(write(load_capture(self.folder), folder, form=self.form, split=self.split, frame=self.frame))
-        if (folder / "ABOUT.txt").exists():
-            print((folder / "ABOUT.txt").read_text(), end="", file=sys.stderr)
         return DONE
 
 

@@ -14,7 +14,7 @@ from tyro.conf import FlagCreatePairsOff, Positional
 
 from ash.files import InputError
 from benchmarks.commands.arguments import DONE, FAILED, File, Folder, Trust
-from benchmarks.commands.devices import CPU, DeviceName, DeviceNameIfAny, chosen_device
+from benchmarks.commands.devices import CPU, DeviceName, chosen_device
 
 PUBLIC = (
     "ash.capture",
@@ -71,26 +71,24 @@ class SpeedCommand:
             raise InputError("speed: --trust goes with --avatar")
 
     def _measure_avatar(self, folder: Path) -> int:
-        from benchmarks.play.actors import open_cast
-        from benchmarks.speed.playback import main as measure_playback
+        from benchmarks.play.avatars import open_avatars
+        from benchmarks.speed.frames import main_of_avatar
 
-        with open_cast(folder, device=chosen_device(self.device), trust=self.trust) as cast:
-            actor = cast.only()
-            config = actor.cell.config
-            return measure_playback(actor.avatar, cast.capture, f"{config.method}:{config.preset}", self.json)
+        with open_avatars(folder, device=chosen_device(self.device), trust=self.trust) as avatars:
+            loaded = avatars.only()
+            config = loaded.cell.config
+            return main_of_avatar(loaded.avatar, avatars.capture, f"{config.method}:{config.preset}", self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorCommand:
     """What this machine has, and what follows from it."""
 
-    device: DeviceNameIfAny = None  # where training steps are timed, for five seconds; default: on a GPU that works
-
     def __call__(self) -> int:
         """Look and print."""
         from benchmarks.commands.doctor import examine, table
 
-        findings = examine(Path(), None if self.device is None else chosen_device(self.device))
+        findings = examine(Path())
         print(table(findings))
         return DONE if all(finding.good for finding in findings) else FAILED
 

@@ -23,12 +23,12 @@ def chosen_device(wanted: str, *, here: bool = True) -> str:
         InputError: there is no such device; says why.
     """
     from ash.config import check_device
-    from ash.devices import device_named, obstacle
+    from ash.devices import cuda_error, device_named
 
     if wanted != "auto":
         device_named(wanted) if here else check_device(wanted)
         return wanted
-    why = obstacle()
+    why = cuda_error()
     if why:
         print(f"device: {CPU}, because {why}", file=sys.stderr)
     return CPU if why else "cuda"

@@ -13,7 +13,6 @@ from ash.files import InputError
 from benchmarks import provenance
 
 QUICK_RUN_GB = 2.0
-PACE_S = 5.0  # for timing steps of all presets
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -26,16 +25,10 @@ class Finding:
     good: bool = True
 
 
-def examine(folder: Path, device: str | None = None) -> list[Finding]:
-    """Look at everything that a run in `folder` depends on.
-
-    `device`: where steps of training are timed; None: on a GPU, if one can be used.
-    """
-    if device is None and _has_usable_gpu():
-        device = "cuda"
-    timed = [] if device is None else [_training(device)]
+def examine(folder: Path) -> list[Finding]:
+    """Look at everything that a run in `folder` depends on."""
     rest = [_isolation(), _lpips(), _threads(), _memory(), _disk(folder)]
-    return [_renderer(), _compiler(), _kernels(), _gpu(), *timed, *rest]
+    return [_renderer(), _compiler(), _kernels(), _gpu(), *rest]
 
 
 def _renderer() -> Finding:
@@ -88,38 +81,15 @@ def _gpu() -> Finding:
             found="none",
             consequence="everything runs on the processor; absolute ms are not comparable with the paper's",
         )
-    from ash.devices import ability, obstacle
+    from ash.devices import cuda_error, describe_gpu
 
-    if why := obstacle():
+    if why := cuda_error():
         return Finding(
             what="GPU",
             found=f"{name}, but {why}",
             consequence="everything runs on the processor (--device cuda is refused)",
         )
-    return Finding(what="GPU", found=f"{name}, {ability()}", consequence="--device cuda learns and draws there")
-
-
-def _has_usable_gpu() -> bool:
-    from ash.devices import obstacle
-
-    return provenance.gpu_name() is not None and not obstacle()
-
-
-def _training(device: str) -> Finding:
-    """What the presets cost: steps per second, of `paper` on a GPU only. A processor would take minutes for a step."""
-    import torch
-
-    from ash.presets import named
-    from benchmarks.speed.pace import PACED, steps_per_second
-
-    presets = [preset for preset in PACED if device != "cpu" or preset.name == "cpu"]
-    found, follows = [], []
-    for preset in presets:
-        rate = steps_per_second(preset, torch.device(device), seconds=PACE_S / len(presets))
-        found.append(f"{preset.name} at {preset.width}x{preset.height} makes {rate:.3g} steps per second")
-        steps = min(named(preset.name).training.steps, rate * named(preset.name).training.seconds)
-        follows.append(f"{preset.name} trains for at most {steps:,.0f} steps, {steps / rate / 3600:.2g} hours")
-    return Finding(what=f"training on {device}", found="; ".join(found), consequence="; ".join(follows))
+    return Finding(what="GPU", found=f"{name}, {describe_gpu()}", consequence="--device cuda learns and draws there")
 
 
 def _lpips() -> Finding:

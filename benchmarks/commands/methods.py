@@ -1,4 +1,4 @@
-"""Commands that look at single methods: check-method, search, display, retarget."""
+"""Commands that look at single methods: check-method, display, retarget."""
 
 import sys
 import tempfile
@@ -8,7 +8,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from ash.files import InputError
-from benchmarks.commands.arguments import DONE, FAILED, Count, CountIfAny, File, Folder, Trust, typed
+from benchmarks.commands.arguments import DONE, FAILED, Count, CountIfAny, File, Folder, Trust
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,35 +108,4 @@ class RetargetCommand:
             own = "" if row.own_psnr is None else f" ({row.own_psnr:.2f} dB on its own test motion)"
             print(f"{row.title}: {row.psnr:.2f} dB{own}, IoU {row.iou:.3f}, foreground PSNR on {motion.name}")
         print(out)
-        return DONE
-
-
-@dataclass(frozen=True, kw_only=True)
-class SearchCommand:
-    """Train ash or ddc with one setting of its preset changed at a time."""
-
-    method: Positional[str]  # ash or ddc
-    capture: Positional[Path]  # what is trained on
-    preset: str = "ci"  # where the search starts
-    seeds: Count = 1  # per setting
-    workers: CountIfAny = None  # trainings side by side; default: all cores
-    out: Folder = Path("runs/search")  # where trainings and table go
-
-    def __call__(self) -> int:
-        """What each setting of a preset is worth, on a camera that is kept apart."""
-        from benchmarks.provenance import cores
-        from benchmarks.studies.search import search as find
-        from benchmarks.studies.search import table
-
-        method, preset, workers = self.method, self.preset, self.workers or cores()
-        found = find(
-            method,
-            self.capture,
-            self.out,
-            preset=preset,
-            seeds=self.seeds,
-            workers=workers,
-            command=typed(),
-        )
-        print(table(method, preset, found))
         return DONE

@@ -1,58 +1,46 @@
-"""The formats by name, and one frame of an avatar in one of them."""
+"""The formats of a trained avatar by name, and one frame of it as a file."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from pathlib import Path
 
 from ash.capture.dataset import Pose
 from ash.devices import CPU, moved
 from ash.files import InputError
-from ash.gaussians.gaussians import Gaussians
 from ash.protocol import Avatar, DressesMesh, PosesGaussians
-from benchmarks.export.gltf import gaussians_glb, mesh_glb
-from benchmarks.export.ply import ply_bytes
-from benchmarks.export.splat import splat_bytes
-from benchmarks.export.spz import spz_bytes
+from benchmarks.export.gaussians import ply_bytes, spz_bytes
+from benchmarks.export.gltf import gaussians_gltf, mesh_gltf
+
+# The suffixes of each format's files, its own first.
+FRAMES = {"ply": (".ply",), "spz": (".spz",), "gltf": (".glb", ".gltf")}
+MOTIONS = {"bvh": (".bvh",), "mp4": (".mp4", ".webp"), "html": (".html",)}
+FORMATS = FRAMES | MOTIONS
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Format:
-    """How Gaussians are written."""
-
-    suffix: str
-    write: Callable[[Gaussians], bytes]
-
-
-GAUSSIAN_FORMATS = {
-    "ply": Format(suffix=".ply", write=ply_bytes),  # as 3D Gaussian splatting writes them
-    "splat": Format(suffix=".splat", write=splat_bytes),  # 32 bytes each, one colour from all sides
-    "spz": Format(suffix=".spz", write=spz_bytes),  # compressed
-    "gltf": Format(suffix=".glb", write=gaussians_glb),  # KHR_gaussian_splatting
-}
-MESH, SKELETON = "glb", "bvh"
-FORMATS = (*GAUSSIAN_FORMATS, MESH, SKELETON)
-
-
-def suffix_of(form: str) -> str:
-    """How a file of the format ends.
+def suffix_of(form: str, path: Path) -> str:
+    """The suffix of the format's files: that of `path`, or the format's own where `path` has none.
 
     Raises:
-        InputError: an unknown format; lists the known ones.
+        InputError: an unknown format, or a path with the suffix of another one.
     """
     if form not in FORMATS:
         raise InputError(f"format: expected one of {', '.join(FORMATS)}, got {form!r}")
-    return GAUSSIAN_FORMATS[form].suffix if form in GAUSSIAN_FORMATS else f".{form}"
+    if path.suffix and path.suffix not in FORMATS[form]:
+        raise InputError(f"{path}: expected a name that ends with {' or '.join(FORMATS[form])} for the format {form}")
+    return path.suffix or FORMATS[form][0]
 
 
-def frame_bytes(avatar: Avatar, pose: Pose, *, form: str, title: str) -> bytes:
-    """One frame of the avatar as a file.
+def frame_bytes(avatar: Avatar, pose: Pose, *, suffix: str, title: str) -> bytes:
+    """One frame of the avatar as a file with one of the suffixes of `FRAMES`; glTF of a mesh avatar holds the mesh.
 
     Raises:
-        InputError: the avatar is made of something else than the format holds; names it by `title`.
+        InputError: the avatar has no Gaussians; names it by `title`.
     """
-    if form == MESH:
-        if not isinstance(avatar, DressesMesh):
-            raise InputError(f"{title}: has no textured mesh; expected a mesh avatar (ddc) for the format {MESH}")
-        return mesh_glb(avatar.dressed_mesh(pose))
+    if suffix in FRAMES["gltf"] and isinstance(avatar, DressesMesh):
+        return mesh_gltf(avatar.dressed_mesh(pose), binary=suffix == ".glb")
     if not isinstance(avatar, PosesGaussians):
-        raise InputError(f"{title}: has no Gaussians; expected an avatar made of them for the format {form}")
-    return GAUSSIAN_FORMATS[form].write(moved(avatar.gaussians(pose), CPU))
+        raise InputError(
+            f"{title}: has no Gaussians, expected an avatar that has; of meshes, gltf, bvh and mp4 are made"
+        )
+    gaussians = moved(avatar.gaussians(pose), CPU)
+    if suffix in FRAMES["gltf"]:
+        return gaussians_gltf(gaussians, binary=suffix == ".glb")
+    return ply_bytes(gaussians) if suffix == ".ply" else spz_bytes(gaussians)

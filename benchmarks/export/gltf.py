@@ -1,6 +1,12 @@
-"""Binary glTF 2.0: Gaussians by the extension KHR_gaussian_splatting, and the dressed mesh; y up, metres."""
+"""glTF 2.0: Gaussians by the extension KHR_gaussian_splatting, and the textured mesh; y up, metres.
 
+A file is binary (.glb), or JSON that holds its numbers in base64 (.gltf).
+"""
+
+import base64
 import io
+import json
+import struct
 
 import numpy as np
 from PIL import Image
@@ -8,8 +14,7 @@ from PIL import Image
 from ash.gaussians.gaussians import Gaussians
 from ash.harmonics import SH_C0
 from ash.protocol import DressedMesh
-from benchmarks.export.axes import unit_quats
-from synth.readers.export import GlbBuffer
+from benchmarks.export.gaussians import unit_quats
 
 EXTENSION = "KHR_gaussian_splatting"
 POINTS = 0
@@ -17,12 +22,12 @@ CLAMP_TO_EDGE = 33071
 UNLIT = "KHR_materials_unlit"  # The light is in the texture.
 
 
-def gaussians_glb(gaussians: Gaussians) -> bytes:
+def gaussians_gltf(gaussians: Gaussians, *, binary: bool) -> bytes:
     """Points with the attributes of the ellipse kernel: rotation xyzw, scale in metres, opacity in 0..1, SH in sRGB.
 
     Viewers that do not know the extension see coloured points.
     """
-    buffer, sh = GlbBuffer(), gaussians.sh.numpy()
+    buffer, sh = GltfBuffer(), gaussians.sh.numpy()
     attributes = {
         "POSITION": buffer.add(gaussians.means.numpy(), "VEC3", bounds=True),
         "COLOR_0": buffer.add(_point_colours(gaussians), "VEC4"),
@@ -41,7 +46,7 @@ def gaussians_glb(gaussians: Gaussians) -> bytes:
         "sortingMethod": "cameraDistance",
     }
     primitive = {"attributes": attributes, "mode": POINTS, "extensions": {EXTENSION: kernel}}
-    return buffer.pack(_document(primitive) | {"extensionsUsed": [EXTENSION]})
+    return buffer.pack(_document(primitive) | {"extensionsUsed": [EXTENSION]}, binary=binary)
 
 
 def _point_colours(gaussians: Gaussians) -> np.ndarray:
@@ -49,12 +54,12 @@ def _point_colours(gaussians: Gaussians) -> np.ndarray:
     return np.concatenate([colours, gaussians.opacities.numpy()[:, None]], axis=1).astype(np.float32)
 
 
-def mesh_glb(mesh: DressedMesh) -> bytes:
+def mesh_gltf(mesh: DressedMesh, *, binary: bool) -> bytes:
     """The mesh with its texture, shown as it is, without lamps. glTF's v runs down, as rows do."""
     pairs, corners = np.unique(
         np.stack([mesh.faces.ravel(), mesh.uv_faces.ravel()], axis=1), axis=0, return_inverse=True
     )
-    buffer, png = GlbBuffer(), io.BytesIO()
+    buffer, png = GltfBuffer(), io.BytesIO()
     Image.fromarray(mesh.texture).save(png, format="PNG")
     attributes = {
         "POSITION": buffer.add(mesh.vertices[pairs[:, 0]].astype(np.float32), "VEC3", bounds=True),
@@ -70,7 +75,7 @@ def mesh_glb(mesh: DressedMesh) -> bytes:
         "samplers": [{"wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}],
         "images": [{"bufferView": buffer.raw(png.getvalue()), "mimeType": "image/png"}],
     }
-    return buffer.pack(document)
+    return buffer.pack(document, binary=binary)
 
 
 def _document(primitive: dict) -> dict:
@@ -81,3 +86,51 @@ def _document(primitive: dict) -> dict:
         "nodes": [{"mesh": 0, "name": "avatar"}],
         "meshes": [{"primitives": [primitive]}],
     }
+
+
+COMPONENT_TYPES = {"float32": 5126, "uint32": 5125, "uint16": 5123}
+
+
+class GltfBuffer:
+    """The numbers of a glTF file and the accessors into them."""
+
+    def __init__(self) -> None:
+        self.content = bytearray()
+        self.views: list[dict] = []
+        self.accessors: list[dict] = []
+
+    def raw(self, content: bytes) -> int:
+        """Append bytes as a buffer view of their own, and return its index."""
+        self.content += b"\0" * (-len(self.content) % 4)
+        self.views.append({"buffer": 0, "byteOffset": len(self.content), "byteLength": len(content)})
+        self.content += content
+        return len(self.views) - 1
+
+    def add(self, array: np.ndarray, kind: str, *, bounds: bool = False) -> int:
+        """Append an array as an accessor of glTF type `kind`, with its bounds where glTF asks for them; its index."""
+        accessor = {
+            "bufferView": self.raw(np.ascontiguousarray(array).tobytes()),
+            "componentType": COMPONENT_TYPES[str(array.dtype)],
+            "count": len(array),
+            "type": kind,
+        }
+        if bounds:
+            flat = array.reshape(len(array), -1)
+            accessor |= {"min": flat.min(axis=0).tolist(), "max": flat.max(axis=0).tolist()}
+        self.accessors.append(accessor)
+        return len(self.accessors) - 1
+
+    def pack(self, document: dict, *, binary: bool) -> bytes:
+        """The whole file: the document, completed by what was added, and the numbers."""
+        self.content += b"\0" * (-len(self.content) % 4)
+        whole: dict = {"byteLength": len(self.content)}
+        if not binary:
+            whole["uri"] = f"data:application/octet-stream;base64,{base64.b64encode(self.content).decode()}"
+        document = {**document, "buffers": [whole], "bufferViews": self.views, "accessors": self.accessors}
+        text = json.dumps(document, separators=(",", ":")).encode()
+        if not binary:
+            return text
+        text += b" " * (-len(text) % 4)
+        size = 12 + 8 + len(text) + 8 + len(self.content)
+        head = struct.pack("<4sII", b"glTF", 2, size) + struct.pack("<I4s", len(text), b"JSON")
+        return head + text + struct.pack("<I4s", len(self.content), b"BIN\0") + bytes(self.content)

@@ -1,6 +1,6 @@
-"""Cameras that nobody set up: the paper's spiral around the person, and any camera at another size."""
+"""Cameras beside a capture's own: a browser's viewpoint, the paper's spiral around the person, other image sizes."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -9,15 +9,36 @@ from ash.capture.dataset import Camera, Capture
 from ash.files import InputError
 from synth.camera.rig import look_at
 
-SPIRAL, RIG = "spiral", "rig"
-RISE = 0.35  # of its distance: how far the spiral's camera goes up and down
-TURN_FRAMES = 96  # frames of one turn
-START = (0.25, 0.12, 0.96)  # from the person's middle, nearly of length 1
-STEPS_PER_SECOND = 12.0  # where the spiral is played
+FREE, SPIRAL, RIG = "free", "spiral", "rig"
+SPIRAL_RISE = 0.35  # of its distance: how far the spiral's camera goes up and down
+SPIRAL_STEPS = 96  # of one turn
+SPIRAL_STEPS_PER_SECOND = 12.0  # in the player
+START = (0.25, 0.12, 0.96)  # direction from the person's middle to a new viewer, nearly of length 1
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Viewpoint:
+    """The camera of a browser, and the size of its window."""
+
+    viewmat: np.ndarray  # [4, 4] world to camera, OpenCV axes
+    fov: float  # radians, from bottom to top
+    width: int  # pixels
+    height: int
+
+    @property
+    def position(self) -> np.ndarray:
+        """Optical centre, `[3]` metres."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def camera(self, *, width: int, height: int) -> Camera:
+        """The same view in other pixels of the same shape."""
+        focal = height / 2 / np.tan(self.fov / 2)
+        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+        return Camera(name=FREE, width=width, height=height, K=K, viewmat=self.viewmat)
 
 
 def resized(camera: Camera, *, width: int, height: int) -> Camera:
-    """The same view in other pixels; a changed aspect ratio adds room at two sides and cuts nothing off."""
+    """The same view in other pixels; another aspect ratio adds pixels at two sides and cuts none off."""
     scale = min(width / camera.width, height / camera.height)
     K = camera.K * np.array([[scale], [scale], [1.0]])
     K[:2, 2] += np.array([width - scale * camera.width, height - scale * camera.height]) / 2
@@ -30,12 +51,12 @@ def fov_of(camera: Camera) -> float:
 
 
 def first_camera(capture: Capture) -> Camera:
-    """The capture's first camera: viewers begin with its field of view, and as far away."""
+    """The capture's first camera: viewers begin with its field of view and its distance."""
     return next(iter(capture.cameras.values()))
 
 
-def apart(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
-    """How far two cameras `[4, 4]` stand from each other, metres, and are turned, radians."""
+def distance_between(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
+    """Metres between two cameras `[4, 4]`, and radians between their directions."""
     moved = one[:3, :3].T @ one[:3, 3] - other[:3, :3].T @ other[:3, 3]
     turned = Rotation.from_matrix(one[:3, :3] @ other[:3, :3].T).magnitude()
     return float(np.linalg.norm(moved)), float(turned)
@@ -47,25 +68,24 @@ def middle_of(capture: Capture) -> np.ndarray:
     return (vertices.min(axis=0) + vertices.max(axis=0)) / 2
 
 
-def reach_of(capture: Capture) -> float:
-    """How far the first camera stands from the person's middle, metres."""
+def camera_distance(capture: Capture) -> float:
+    """Metres from the person's middle to the first camera."""
     return float(np.linalg.norm(first_camera(capture).position - middle_of(capture)))
 
 
-def starting_place(capture: Capture) -> np.ndarray:
-    """Where a new viewer stands, `[3]` metres: before the person, as far away as the capture's first camera."""
-    return middle_of(capture) + reach_of(capture) * np.array(START)
+def start_position(capture: Capture) -> np.ndarray:
+    """Where a new viewer stands, `[3]` metres: in front of the person, as far away as the first camera."""
+    return middle_of(capture) + camera_distance(capture) * np.array(START)
 
 
 def spiral_camera(capture: Capture, step: float, *, width: int, height: int) -> Camera:
-    """Camera number `step` of a spiral: once around the person in `TURN_FRAMES`, up and down at half that rate.
+    """Camera number `step` of the spiral: once around the person in `SPIRAL_STEPS`, up and down at half that rate.
 
-    It stands as far away as the capture's first camera, with its field of view.
+    It has the distance and the field of view of the capture's first camera.
     """
-    middle = middle_of(capture)
-    angle = 2 * np.pi * step / TURN_FRAMES
-    side = np.array([np.sin(angle), 0.15 + RISE * np.sin(angle / 2), np.cos(angle)])
-    viewmat = look_at(middle + reach_of(capture) * side / np.linalg.norm(side), middle)
+    middle, angle = middle_of(capture), 2 * np.pi * step / SPIRAL_STEPS
+    side = np.array([np.sin(angle), 0.15 + SPIRAL_RISE * np.sin(angle / 2), np.cos(angle)])
+    viewmat = look_at(middle + camera_distance(capture) * side / np.linalg.norm(side), middle)
     return resized(replace(first_camera(capture), name=SPIRAL, viewmat=viewmat), width=width, height=height)
 
 

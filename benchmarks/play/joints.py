@@ -9,12 +9,13 @@ it is from there.
 Ranges are those of the American Academy of Orthopaedic Surgeons (Joint Motion: Method of Measuring and Recording,
 1965), which Norkin and White tabulate (Measurement of Joint Motion, appendix A). It measures the trunk and the neck as
 a whole, so each of the two joints that we have of either gets one half. The collar bone's are those of the
-sternoclavicular joint (AccessPhysiotherapy, Range of Motion for Diarthrodial Joints of the Body). A joint without a
-name that is known turns by `UNKNOWN`, from its rest pose, about the world's axes.
+sternoclavicular joint (AccessPhysiotherapy, Range of Motion for Diarthrodial Joints of the Body). A joint with another
+name turns by `FREE_DEG`, from its rest pose, about the world's axes.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,22 +25,17 @@ from synth.posing import rotation_between
 
 Angles = tuple[float, float, float]  # degrees: forward or back, sideways, twist
 ORDER = "XZY"
-UNKNOWN = 90.0  # degrees either way
+FREE_DEG = 90.0  # either way
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class JointRange:
-    """One of a joint's three turns. `sign` is that of the axis, of a left joint: a positive angle is `more`."""
+class JointRange(NamedTuple):
+    """One of a joint's three turns, in degrees. With the axis times `sign`, of a left joint, positive is `more`."""
 
     more: str  # what a positive angle is called
-    less: str
-    low: float  # degrees
     high: float
+    less: str
+    low: float
     sign: int
-
-
-def _range(more: str, high: float | int, less: str, low: float | int, *, sign: int) -> JointRange:
-    return JointRange(more=more, less=less, low=-float(low), high=float(high), sign=sign)
 
 
 Ranges = tuple[JointRange | None, JointRange | None, JointRange | None]
@@ -47,9 +43,9 @@ Ranges = tuple[JointRange | None, JointRange | None, JointRange | None]
 
 def _half(*, forward: int, back: int, aside: int, twist: int) -> Ranges:
     return (
-        _range("bent forward", forward / 2, "bent back", back / 2, sign=1),
-        _range("to the left", aside / 2, "to the right", aside / 2, sign=-1),
-        _range("turned left", twist / 2, "turned right", twist / 2, sign=1),
+        JointRange("bent forward", forward / 2, "bent back", -back / 2, 1),
+        JointRange("to the left", aside / 2, "to the right", -aside / 2, -1),
+        JointRange("turned left", twist / 2, "turned right", -twist / 2, 1),
     )
 
 
@@ -60,48 +56,34 @@ RANGES: Mapping[str, Ranges] = {  # None: the joint does not turn that way
     "chest": TRUNK,
     "neck": NECK,
     "head": NECK,
-    "clavicle": (
-        None,
-        _range("raised", 45, "lowered", 5, sign=1),
-        _range("forward", 15, "back", 15, sign=-1),
-    ),
+    "clavicle": (None, JointRange("raised", 45, "lowered", -5, 1), JointRange("forward", 15, "back", -15, -1)),
     "upper_arm": (
-        _range("raised forward", 180, "stretched back", 60, sign=-1),
-        _range("raised sideways", 180, "across the body", 75, sign=1),
-        _range("turned in", 70, "turned out", 90, sign=-1),
+        JointRange("raised forward", 180, "stretched back", -60, -1),
+        JointRange("raised sideways", 180, "across the body", -75, 1),
+        JointRange("turned in", 70, "turned out", -90, -1),
     ),
-    "forearm": (
-        _range("bent", 150, "straight", 0, sign=-1),
-        None,
-        _range("palm back", 80, "palm forward", 80, sign=-1),
-    ),
+    "forearm": (JointRange("bent", 150, "straight", 0, -1), None, JointRange("palm back", 80, "palm forward", -80, -1)),
     "hand": (
-        _range("towards the thumb", 20, "towards the little finger", 30, sign=-1),
-        _range("towards the back of the hand", 70, "towards the palm", 80, sign=1),
+        JointRange("towards the thumb", 20, "towards the little finger", -30, -1),
+        JointRange("towards the back of the hand", 70, "towards the palm", -80, 1),
         None,
     ),
     "thigh": (
-        _range("raised forward", 120, "stretched back", 30, sign=-1),
-        _range("spread", 45, "across the other", 30, sign=1),
-        _range("turned in", 45, "turned out", 45, sign=-1),
+        JointRange("raised forward", 120, "stretched back", -30, -1),
+        JointRange("spread", 45, "across the other", -30, 1),
+        JointRange("turned in", 45, "turned out", -45, -1),
     ),
-    "shin": (_range("bent", 135, "straight", 0, sign=1), None, None),
-    "foot": (
-        _range("toes up", 20, "toes down", 50, sign=-1),
-        _range("sole out", 15, "sole in", 35, sign=1),
-        None,
-    ),
-    "toe": (_range("up", 70, "down", 45, sign=-1), None, None),
+    "shin": (JointRange("bent", 135, "straight", 0, 1), None, None),
+    "foot": (JointRange("toes up", 20, "toes down", -50, -1), JointRange("sole out", 15, "sole in", -35, 1), None),
+    "toe": (JointRange("up", 70, "down", -45, -1), None, None),
 }
-FREELY: Ranges = tuple(  # type: ignore[assignment]
-    _range(f"about {axis}", UNKNOWN, "the other way", UNKNOWN, sign=1) for axis in ORDER.lower()
-)
+FREE_X, FREE_Z, FREE_Y = (JointRange(f"about {axis}", FREE_DEG, "the other way", -FREE_DEG, 1) for axis in "xzy")
 HANGING = {"upper_arm": "forearm", "forearm": "hand", "thigh": "shin", "shin": "foot"}  # straight down in neutral
 
 
 def ranges_of(name: str) -> Ranges:
-    """How far the joint of that name turns; by `UNKNOWN` about each of the world's axes where the name says nothing."""
-    return RANGES.get(_part(name)[0], FREELY)
+    """How far the joint of that name turns; by `FREE_DEG` about each of the world's axes where the name is unknown."""
+    return RANGES.get(_without_side(name)[0], (FREE_X, FREE_Z, FREE_Y))
 
 
 def angles_of(skeleton: Skeleton, joint: int, rotvec: np.ndarray) -> Angles:
@@ -112,8 +94,8 @@ def angles_of(skeleton: Skeleton, joint: int, rotvec: np.ndarray) -> Angles:
     return x, z, y
 
 
-def held(motion: Motion, skeleton: Skeleton, angles: Mapping[int, Angles]) -> Motion:
-    """The motion with joints held at angles (joint -> as `angles_of` gives them) in all frames."""
+def with_angles(motion: Motion, skeleton: Skeleton, angles: Mapping[int, Angles]) -> Motion:
+    """The motion with joints fixed at angles (joint -> as `angles_of` gives them) in all frames."""
     dofs = motion.dofs.copy()
     for joint, degrees in angles.items():
         parent, own, signs = _neutral(skeleton, joint)
@@ -122,31 +104,29 @@ def held(motion: Motion, skeleton: Skeleton, angles: Mapping[int, Angles]) -> Mo
     return replace(motion, dofs=dofs)
 
 
-def _part(name: str) -> tuple[str, int]:
+def _without_side(name: str) -> tuple[str, int]:
     """The name without its side, and the sign of that side."""
-    part, _, side = name.rpartition("_")
-    return (part, 1 if side == "left" else -1) if side in ("left", "right") else (name, 1)
+    stem, _, side = name.rpartition("_")
+    return (stem, 1 if side == "left" else -1) if side in ("left", "right") else (name, 1)
 
 
 def _neutral(skeleton: Skeleton, joint: int) -> tuple[Rotation, Rotation, np.ndarray]:
     """What turns the parent and the joint from neutral to rest, and the signs of the joint's axes, `[3]`."""
-    part, side = _part(skeleton.names[joint])
-    mirrored = np.array([1, side, side]) if part in RANGES else np.ones(3)
+    stem, side = _without_side(skeleton.names[joint])
+    mirrored = np.array([1, side, side]) if stem in RANGES else np.ones(3)
     signs = np.array([1 if each is None else each.sign for each in ranges_of(skeleton.names[joint])])
     parent = int(skeleton.parents[joint])
-    return _to_rest(skeleton, parent), _to_rest(skeleton, joint), mirrored * signs
+    return _neutral_to_rest(skeleton, parent), _neutral_to_rest(skeleton, joint), mirrored * signs
 
 
-def _to_rest(skeleton: Skeleton, joint: int) -> Rotation:
+def _neutral_to_rest(skeleton: Skeleton, joint: int) -> Rotation:
     """What turns a joint from neutral to rest, by the smallest turn beyond its parent's that does."""
-    part = _part(skeleton.names[joint])[0] if joint >= 0 else ""
-    if part == "hand":
-        return _to_rest(skeleton, int(skeleton.parents[joint]))
-    if part not in HANGING:
-        return Rotation.identity()  # Trunk and feet rest as they are measured.
-    end = skeleton.names[joint].replace(part, HANGING[part])
+    stem = _without_side(skeleton.names[joint])[0] if joint >= 0 else ""
+    if stem == "hand":
+        return _neutral_to_rest(skeleton, int(skeleton.parents[joint]))
+    end = skeleton.names[joint].replace(stem, HANGING[stem]) if stem in HANGING else ""
     if end not in skeleton.names:
-        return Rotation.identity()
-    parent = _to_rest(skeleton, int(skeleton.parents[joint]))
+        return Rotation.identity()  # Trunk and feet rest as they are measured.
+    parent = _neutral_to_rest(skeleton, int(skeleton.parents[joint]))
     bone = parent.inv().apply(skeleton.heads[skeleton.names.index(end)] - skeleton.heads[joint])
     return parent * Rotation.from_matrix(rotation_between(np.array([0.0, -1.0, 0.0]), bone))

@@ -1,4 +1,4 @@
-"""Motions that an avatar can be played through: those of its capture, and those of files."""
+"""Motions that an avatar can be played through: its capture's, generated ones, and those of files."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,23 +6,27 @@ from pathlib import Path
 
 import numpy as np
 
-from ash.capture.dataset import Capture, Motion, Pose
+from ash.capture.dataset import Capture, Motion
 from ash.files import InputError
 from synth.motion.clips import make_motion
 from synth.motion.generators import GENERATORS
 from synth.motion.importing import import_motion
 from synth.scene import Clip
 
-TRAIN, TEST, NEAR, FAR = "train", "test", "near", "far"
-TITLES = {TRAIN: "Training motion", TEST: "Held-out motion", NEAR: "Held-out motion, near", FAR: "Held-out motion, far"}
-SPLIT_OF = {TRAIN: "train", TEST: "novel_pose", NEAR: "near_pose", FAR: "far_pose"}
-MADE_SECONDS, MADE_SEED = 5.0, 7  # Another walk than that of any capture.
-MOST_FRAMES = 20_000  # of a file: half an hour
+# Motions of a capture: name -> split, title.
+CAPTURED = {
+    "train": ("train", "Training motion"),
+    "test": ("novel_pose", "Held-out motion"),
+    "near": ("near_pose", "Held-out motion, near"),
+    "far": ("far_pose", "Held-out motion, far"),
+}
+GENERATED_SECONDS, GENERATED_SEED = 5.0, 7  # another walk than that of any capture
+MAX_FRAMES = 20_000  # of a file: half an hour
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Act:
-    """A motion to play. `frames` are indices into `motion`; a captured one shares its motion with the capture."""
+class MotionClip:
+    """A motion to play. `frames` are indices into `motion`; a captured clip shares its motion with the capture."""
 
     name: str
     title: str
@@ -34,22 +38,58 @@ class Act:
         return len(self.frames)
 
 
-def acts_of(capture: Capture, more: Sequence[str] = ()) -> tuple[Act, ...]:
-    """The capture's motions, then others as `act_named` knows them.
+def motion_clips(capture: Capture, more: Sequence[str] = ()) -> tuple[MotionClip, ...]:
+    """The capture's motions, then others as `motion_clip` takes them.
 
     Raises:
         InputError: an unknown motion, or a file that cannot be read.
     """
     own = [
-        Act(name=name, title=TITLES[name], motion=capture.motion, frames=_frames(capture, split), captured=True)
-        for name, split in SPLIT_OF.items()
+        MotionClip(name=name, title=title, motion=capture.motion, frames=_frames(capture, split), captured=True)
+        for name, (split, title) in CAPTURED.items()
         if split in capture.splits
     ]
-    return (*own, *(act_named(capture, name) for name in more))
+    names = dict.fromkeys(name for name in more if name not in [clip.name for clip in own])
+    return (*own, *(motion_clip(capture, name) for name in names))
+
+
+def first_clip(clips: Sequence[MotionClip], asked: Sequence[str]) -> int:
+    """The clip on which a player opens: the first that was asked for, else one that was not trained on."""
+    return [clip.name for clip in clips].index(asked[0]) if asked else min(1, len(clips) - 1)
+
+
+def motion_clip(capture: Capture, name: str) -> MotionClip:
+    """`train`, `test`, `near`, `far`, a generated motion (`walk`, `dance`, ...), or the path of a motion file.
+
+    Raises:
+        InputError: none of these; or a file that cannot be read.
+    """
+    own = {clip.name: clip for clip in motion_clips(capture)}
+    if name in own:
+        return own[name]
+    if name in GENERATORS:
+        if "pelvis" not in capture.skeleton.names:
+            raise InputError(f"motion: {name} expects a person's skeleton, which {capture.folder} does not have")
+        clip = Clip(generator=name, frames=round(GENERATED_SECONDS * capture.motion.fps))
+        motion = make_motion(capture.skeleton, (clip,), fps=capture.motion.fps, seed=GENERATED_SEED)
+        return _other(name, name.replace("_", " ").capitalize(), motion)
+    if Path(name).suffix.lower() not in (".bvh", ".npz"):
+        known = ", ".join((*own, *GENERATORS))
+        raise InputError(f"motion: expected {known}, a .bvh or an AMASS .npz file, got {name!r}")
+    motion = import_motion(Path(name), capture.skeleton, fps=capture.motion.fps)
+    dofs = motion.dofs[:MAX_FRAMES].copy()
+    root = dofs[:, [0, 2]] + capture.skeleton.heads[0, [0, 2]]
+    dofs[:, [0, 2]] -= (root.min(axis=0) + root.max(axis=0)) / 2  # The cameras look at the middle of the floor.
+    return _other(name, Path(name).name, replace(motion, dofs=dofs, sequence=motion.sequence[: len(dofs)]))
+
+
+def _other(name: str, title: str, motion: Motion) -> MotionClip:
+    frames = tuple(range(len(motion.dofs)))
+    return MotionClip(name=name, title=title, motion=motion, frames=frames, captured=False)
 
 
 def _frames(capture: Capture, split: str) -> tuple[int, ...]:
-    """The frames of a split; of near and far motion, some of which have images, the whole clips."""
+    """The frames of a split; of near and far motion, some of whose frames have images, the whole sequences."""
     frames = capture.splits[split].frames
     if split not in ("near_pose", "far_pose"):
         return frames
@@ -57,63 +97,20 @@ def _frames(capture: Capture, split: str) -> tuple[int, ...]:
     return tuple(np.flatnonzero(np.isin(sequence, sequence[list(frames)])).tolist())
 
 
-def _from_file(capture: Capture, path: Path) -> Act:
-    motion = import_motion(path, capture.skeleton, fps=capture.motion.fps)
-    dofs = motion.dofs[:MOST_FRAMES].copy()
-    root = dofs[:, [0, 2]] + capture.skeleton.heads[0, [0, 2]]
-    dofs[:, [0, 2]] -= (root.min(axis=0) + root.max(axis=0)) / 2  # Our cameras look at the middle of the floor.
-    motion = replace(motion, dofs=dofs, sequence=motion.sequence[: len(dofs)])
-    return Act(name=path.stem, title=path.name, motion=motion, frames=tuple(range(len(dofs))), captured=False)
-
-
-def act_named(capture: Capture, name: str) -> Act:
-    """`train`, `test`, a motion that is made for the occasion (`walk`, `dance`, ...), or the path of a motion file.
-
-    Raises:
-        InputError: none of these; or a file that cannot be read.
-    """
-    own = {act.name: act for act in acts_of(capture)}
-    if name in own:
-        return own[name]
-    if name in GENERATORS:
-        return _made(capture, name)
-    if Path(name).suffix.lower() not in (".bvh", ".npz"):
-        known = ", ".join((*own, *GENERATORS))
-        raise InputError(f"motion: expected {known}, a .bvh or an AMASS .npz file, got {name!r}")
-    return _from_file(capture, Path(name))
-
-
-def _made(capture: Capture, name: str) -> Act:
-    frames = round(MADE_SECONDS * capture.motion.fps)
-    if "pelvis" not in capture.skeleton.names:
-        raise InputError(f"motion: {name} is made for a person's skeleton, which {capture.folder} has not")
-    clip = Clip(generator=name, frames=frames)
-    motion = make_motion(capture.skeleton, (clip,), fps=capture.motion.fps, seed=MADE_SEED)
-    title = name.replace("_", " ").capitalize()
-    return Act(name=name, title=title, motion=motion, frames=tuple(range(frames)), captured=False)
-
-
-def frames_in(act: Act, text: str | None) -> tuple[int, ...]:
-    """The frames of an act that `A:B` means (B not included), counted from its start; None: all.
+def frames_in(clip: MotionClip, text: str | None) -> tuple[int, ...]:
+    """The frames of a clip that `A:B` means (B not included), counted from its start; None: all.
 
     Raises:
         InputError: no such frames.
     """
     if text is None:
-        return act.frames
+        return clip.frames
     first, colon, last = text.partition(":")
     try:
         start = int(first or 0)
-        stop = int(last or len(act)) if colon else start + 1
+        stop = int(last or len(clip)) if colon else start + 1
     except ValueError:
         raise InputError(f"frames: expected A:B or one number, got {text!r}") from None
-    if not 0 <= start < stop <= len(act):
-        raise InputError(f"frames: expected A:B within 0:{len(act)}, got {text}")
-    return act.frames[start:stop]
-
-
-def joint_heads(capture: Capture, pose: Pose) -> np.ndarray:
-    """Where the joints are in a frame, `[j, 3]` metres."""
-    from synth.posing import bone_frames
-
-    return np.asarray(bone_frames(capture.skeleton, pose.motion.dofs[pose.frame : pose.frame + 1])[0, :, :3, 3])
+    if not 0 <= start < stop <= len(clip):
+        raise InputError(f"frames: expected A:B within 0:{len(clip)}, got {text}")
+    return clip.frames[start:stop]

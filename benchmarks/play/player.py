@@ -4,101 +4,91 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 import viser
 
-from benchmarks.play.actors import Cast, open_cast
-from benchmarks.play.cameras import first_camera, fov_of, middle_of, starting_place
-from benchmarks.play.doors import DoorOptions, close_server, open_server
-from benchmarks.play.motions import acts_of
+from benchmarks.cell import metrics
+from benchmarks.play.auth import AuthOptions, close_server, open_server
+from benchmarks.play.avatars import AvatarSet, open_avatars
+from benchmarks.play.cameras import first_camera, fov_of, middle_of, start_position
+from benchmarks.play.motions import first_clip, motion_clips
 from benchmarks.play.page import LABEL, Page
-from benchmarks.play.picture import Painter
-from benchmarks.play.shelf import TruthShelf, truth_from
-from benchmarks.play.state import ViewState
-from benchmarks.play.truth import TruthStudio, Wanted
-from benchmarks.play.viewer import Stream, Viewer
+from benchmarks.play.rendering import ViewRenderer, ViewState
+from benchmarks.play.truth import TruthCache, TruthPicture, TruthRenderer, TruthRequest
+from benchmarks.play.viewer import DrawingThread, Viewer
 from benchmarks.provenance import cores
 
 TRUTH_PIXELS = 384 * 384  # of a rendered truth: some seconds on two cores
-STAGE_SHARE = {"starting the renderer": 0.1, "posing the body and its clothes": 0.3, "tracing light": 0.6}
+PROGRESS = {"starting the renderer": 0.1, "posing the body and its clothes": 0.3, "tracing light": 0.6}
 
 
 class PlayServer:
     """Everything that runs while people watch."""
 
-    def __init__(self, cast: Cast, motions: Sequence[str], doors: DoorOptions) -> None:
-        self.cast, self.acts = cast, acts_of(cast.capture, motions)
-        self.shelf = TruthShelf(cast.capture)
-        self.painter = Painter(cast, self.acts, self.shelf)
-        self.studio = TruthStudio(cast.capture.folder)
-        self.stream = Stream(self.painter)
-        self._pages: dict[int, Page] = {}
+    def __init__(self, avatars: AvatarSet, motions: Sequence[str], options: AuthOptions) -> None:
+        self.avatars, self.clips = avatars, motion_clips(avatars.capture, motions)
+        self.truths, self._truth_renderer = TruthCache(avatars.capture), TruthRenderer(avatars.capture.folder)
+        self.renderer = ViewRenderer(avatars, self.clips, self.truths)
+        self._first = ViewState(left=avatars.titles[0], clip=first_clip(self.clips, motions))
+        self.pages: dict[int, Page] = {}
         self._lock = threading.Lock()
-        self.server, self.url, self.doors = open_server(doors, label=LABEL)
-        self._set_stage()
-        self.server.on_client_connect(self._arrive)
-        self.server.on_client_disconnect(self._leave)
-        self.stream.start()
+        self.server, self.url, self.auth = open_server(options, label=LABEL)
+        start = self.server.initial_camera
+        start.position, start.look_at = start_position(avatars.capture), middle_of(avatars.capture)
+        start.up, start.fov = np.array([0.0, 1.0, 0.0]), fov_of(first_camera(avatars.capture))
+        self.server.scene.set_up_direction("+y")
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.drawing = DrawingThread(self.renderer)
+        self.server.on_client_connect(self._connected)
+        self.server.on_client_disconnect(self._disconnected)
 
     def close(self) -> None:
         """End all threads and processes."""
         close_server(self.server)
-        self.stream.stop()
-        self.studio.close()
+        self.drawing.stop()
+        self._truth_renderer.close()
 
-    def _set_stage(self) -> None:
-        """Where a new viewer stands, and what the page looks like."""
-        start = self.server.initial_camera
-        start.position, start.look_at = starting_place(self.cast.capture), middle_of(self.cast.capture)
-        start.up = np.array([0.0, 1.0, 0.0])
-        start.fov = fov_of(first_camera(self.cast.capture))
-        self.server.scene.set_up_direction("+y")
-        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
-
-    def _arrive(self, client: viser.ClientHandle) -> None:
-        state = ViewState(left=self.cast.titles[0], act=min(1, len(self.acts) - 1))
-        viewer = Viewer(client, self.acts, state, self.stream.wake)
-        page = Page(viewer, self.painter, self._render_truth)
+    def _connected(self, client: viser.ClientHandle) -> None:
+        viewer = Viewer(client, self.clips, self._first, self.drawing.wake)
+        page = Page(viewer, self.renderer, self._render_truth)
         with self._lock:
-            self._pages[client.client_id] = page
-        self.stream.add(viewer)
+            self.pages[client.client_id] = page
+        self.drawing.add(viewer)
 
-    def _leave(self, client: viser.ClientHandle) -> None:
+    def _disconnected(self, client: viser.ClientHandle) -> None:
         with self._lock:
-            page = self._pages.pop(client.client_id, None)
+            page = self.pages.pop(client.client_id, None)
         if page is not None:
-            self.stream.remove(page.viewer)
+            self.drawing.remove(page.viewer)
 
     def _render_truth(self, viewer: Viewer) -> str:
         """Begin to path-trace what a viewer sees."""
-        state = viewer.state
-        if state.eye is None:
+        state, page = viewer.state, self.pages.get(viewer.client.client_id)
+        if state.viewpoint is None or page is None:
             return ""
-        act, page = self.acts[state.act], self._pages.get(viewer.client.client_id)
-        shrink = min(1.0, (TRUTH_PIXELS / (state.eye.width * state.eye.height)) ** 0.5)
-        size = {"width": round(shrink * state.eye.width), "height": round(shrink * state.eye.height)}
-        camera = self.painter.camera(state, **size)
-        frame = act.frames[state.step]
-        captured = act.captured and not state.held
-        start = time.perf_counter()
+        window = state.viewpoint
+        shrink = min(1.0, (TRUTH_PIXELS / (window.width * window.height)) ** 0.5)
+        size = {"width": round(shrink * window.width), "height": round(shrink * window.height)}
+        camera, pose, start = self.renderer.camera(state, **size), self.renderer.pose(state), time.perf_counter()
+        captured = self.clips[state.clip].captured and not state.turned
 
-        def heard(words: str) -> None:
-            if page is not None:
-                page.truth_progress(f"Truth: {words} ...", STAGE_SHARE.get(words, 0.5))
+        def on_progress(stage: str) -> None:
+            page.show_truth_progress(f"Truth: {stage} ...", PROGRESS.get(stage, 0.5))
 
-        def shown(picture: np.ndarray | None, problem: str) -> None:
-            if picture is not None:
-                self.shelf.put(act, state, truth_from(camera, picture))
-            if page is not None:
-                took = f"Truth rendered in {time.perf_counter() - start:.0f} s."
-                page.truth_progress(problem or took, None)
-                viewer.redraw()
+        def on_done(straight: np.ndarray | None, problem: str) -> None:
+            if straight is not None:
+                picture = TruthPicture(camera=camera, on_black=metrics.on_black(straight))
+                self.truths.put(self.renderer.pose_key(state), picture)
+            took = f"Truth rendered in {time.perf_counter() - start:.0f} s."
+            page.show_truth_progress(problem or took, None)
+            viewer.change(replace)  # Drawn again, for the truth is known now.
 
-        wanted = Wanted(motion=self.painter.motion(act, state), frame=frame, camera=camera, captured=captured)
-        if not self.studio.ask(wanted, heard=heard, shown=shown):
+        request = TruthRequest(motion=pose.motion, frame=pose.frame, camera=camera, captured=captured)
+        if not self._truth_renderer.start(request, on_progress=on_progress, on_done=on_done):
             return "Another truth is being rendered; try again in a moment."
         return "Truth: waiting for the renderer ..."
 
@@ -110,7 +100,7 @@ def playing(
     motions: Sequence[str] = (),
     scene: str | None = None,
     methods: Sequence[str] = (),
-    doors: DoorOptions | None = None,
+    options: AuthOptions | None = None,
     device: str = "cpu",
     trust: bool = False,
 ) -> Iterator[PlayServer]:
@@ -122,18 +112,12 @@ def playing(
     before = torch.get_num_threads()
     torch.set_num_threads(cores())
     try:
-        with open_cast(run, scene=scene, methods=methods, device=device, trust=trust) as cast:
-            cast.actor(cast.titles[0])  # A run that cannot be played says so before a browser opens.
-            player = PlayServer(cast, motions, doors or DoorOptions())
+        with open_avatars(run, scene=scene, methods=methods, device=device, trust=trust) as avatars:
+            avatars[avatars.titles[0]]  # A run that cannot be played is refused before a browser opens.
+            player = PlayServer(avatars, motions, options or AuthOptions())
             try:
                 yield player
             finally:
                 player.close()
     finally:
         torch.set_num_threads(before)
-
-
-def wait_for_interrupt() -> None:
-    """Until Ctrl-C."""
-    with_nothing_to_do = threading.Event()
-    with_nothing_to_do.wait()

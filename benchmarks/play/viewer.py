@@ -1,5 +1,6 @@
-"""One browser: what it looks at, when its next picture is due, and how large that may be."""
+"""One browser: when its next picture is due, and how many pixels it may have."""
 
+import math
 import threading
 import time
 from collections import deque
@@ -9,30 +10,60 @@ from dataclasses import replace
 
 import viser
 
-from benchmarks.play import pace
-from benchmarks.play.cameras import STEPS_PER_SECOND
-from benchmarks.play.motions import Act
-from benchmarks.play.picture import Painter, Painting
-from benchmarks.play.state import SPIRAL, ViewState
+from benchmarks.play.cameras import SPIRAL, SPIRAL_STEPS_PER_SECOND
+from benchmarks.play.motions import MotionClip
+from benchmarks.play.rendering import RenderedView, ViewRenderer, ViewState
 
-Change = Callable[[ViewState], ViewState]
+SMOOTH_MS = 27.0  # per picture while a viewer moves: above thirty a second, with what the browser needs
+PLAYING_SHARE = 0.5  # of the time between two frames of the motion that drawing may take
+MIN_PIXELS, MAX_PIXELS = 144 * 144, 1_200_000
+STILL_SECONDS = 0.15  # without a change; then the picture becomes sharp
+MIN_INTERVAL = 1 / 32  # seconds between two pictures for one viewer
+MOVING_QUALITY, STILL_QUALITY = 45, 80  # of JPEG
 NEVER = float("inf")
 
 
+class AdaptiveResolution:
+    """As many pixels as keep motion smooth, from what drawing took; all of them for a viewer who stands still.
+
+    Sizes change by small steps, so that a single slow picture does not show.
+    """
+
+    def __init__(self) -> None:
+        self.pixels = 384.0 * 384.0
+
+    def size(self, *, width: int, height: int, sharp: bool) -> tuple[int, int]:
+        """Width and height of the picture for a window of that size."""
+        wanted = min(width * height, MAX_PIXELS if sharp else self.pixels)
+        scale = math.sqrt(wanted / (width * height))
+        return max(2, round(width * scale)), max(2, round(height * scale))
+
+    def update(self, *, drawn: int, ms: float, allowed_ms: float) -> None:
+        """So many pixels took `ms`, and might have taken `allowed_ms`."""
+        wanted = drawn * min(1.25, max(0.5, allowed_ms / ms))
+        self.pixels = min(max(wanted, MIN_PIXELS), MAX_PIXELS)
+
+
+def allowed_ms(*, playing_fps: float | None, viewers: int) -> float:
+    """Milliseconds that a picture may take, while so many viewers are being drawn for."""
+    alone = SMOOTH_MS if playing_fps is None else max(SMOOTH_MS, PLAYING_SHARE * 1000 / playing_fps)
+    return max(8.0, alone / viewers)
+
+
 class Viewer:
-    """What it looks at, and when it is drawn. Changed from the server's threads, drawn from one other."""
+    """What a browser looks at, and when it is drawn. Changed from the server's threads, drawn from one other."""
 
     def __init__(
-        self, client: viser.ClientHandle, acts: Sequence[Act], state: ViewState, wake: Callable[[], None]
+        self, client: viser.ClientHandle, clips: Sequence[MotionClip], state: ViewState, wake: Callable[[], None]
     ) -> None:
-        self.client, self.acts, self._wake = client, acts, wake
-        self.pace = pace.Pace()
+        self.client, self._clips, self._wake = client, clips, wake
         self.served = 0.0  # when its last picture was sent
-        self.show: Callable[[ViewState, Painting | None, str], None] = lambda state, drawn, words: None
+        self.show: Callable[[ViewState, RenderedView | None, str], None] = lambda state, drawn, message: None
+        self._resolution = AdaptiveResolution()
         self._state, self._lock = state, threading.Lock()
         self._dirty, self._sharp = True, False
-        self._touched = self._advanced = time.perf_counter()
-        self._owed = 0.0  # frames of the motion that have not been shown yet, a fraction
+        self._changed = self._advanced = time.perf_counter()
+        self._owed = 0.0  # frames of the motion that are not shown yet, a fraction
         self._sent: deque[float] = deque(maxlen=30)
 
     @property
@@ -40,115 +71,106 @@ class Viewer:
         """What it looks at now."""
         return self._state
 
-    def change(self, change: Change) -> ViewState:
-        """Replace the state; the next picture shows it, and what came between is never drawn."""
+    def change(self, change: Callable[[ViewState], ViewState]) -> ViewState:
+        """Replace the state; the next picture shows it, and states in between are never drawn."""
         with self._lock:
             self._state = change(self._state)
-            self._dirty, self._sharp, self._touched = True, False, time.perf_counter()
+            self._dirty, self._sharp, self._changed = True, False, time.perf_counter()
         self._wake()
         return self._state
 
-    def redraw(self) -> None:
-        """Something else than the state changed: a truth was rendered."""
-        self.change(lambda state: state)
-
     def due(self) -> float:
         """When the next picture is wanted, on `time.perf_counter`'s clock."""
-        if self._state.eye is None:
+        if self._state.viewpoint is None:
             return NEVER
-        if self._dirty or self._moves_by_itself:
-            return self.served + (pace.FASTEST if self._dirty or self._state.camera == SPIRAL else self._frame_seconds)
-        return NEVER if self._sharp else self._touched + pace.STILL_AFTER
+        if self._dirty or self._is_animated:
+            return self.served + (MIN_INTERVAL if self._dirty or self._state.camera == SPIRAL else self._frame_seconds)
+        return NEVER if self._sharp else self._changed + STILL_SECONDS
 
     @property
-    def _moves_by_itself(self) -> bool:
+    def _is_animated(self) -> bool:
         return self._state.playing or self._state.camera == SPIRAL
 
     @property
     def _frame_seconds(self) -> float:
-        return 1 / (self.acts[self._state.act].motion.fps * self._state.speed)
+        return 1 / (self._clips[self._state.clip].motion.fps * self._state.speed)
 
-    def draw(self, painter: Painter, *, viewers: int) -> None:
-        """Draw and send the picture of now. Whatever goes wrong is shown in the page."""
+    def draw(self, renderer: ViewRenderer, *, viewers: int) -> None:
+        """Draw and send the current picture. An exception is shown in the page."""
         start = time.perf_counter()
         state = self._advance(start)
-        assert state.eye is not None
-        moving = self._dirty or self._moves_by_itself
+        assert state.viewpoint is not None
+        moving = self._dirty or self._is_animated
         with self._lock:
             self._dirty = False
-        width, height = self.pace.size(width=state.eye.width, height=state.eye.height, sharp=not moving)
-        resting = start - self._touched > pace.STILL_AFTER
+        window = state.viewpoint
+        width, height = self._resolution.size(width=window.width, height=window.height, sharp=not moving)
+        resting = start - self._changed > STILL_SECONDS
+        with_scores = not moving or (resting and viewers == 1)
         try:
-            drawn = painter.draw(state, width=width, height=height, careful=not moving or (resting and viewers == 1))
-        except Exception as error:  # A broken avatar, a pose it does not know: the player lives on.
+            drawn = renderer.render(state, width=width, height=height, with_scores=with_scores)
+        except Exception as error:  # A broken avatar, a pose that it does not know: the player goes on.
             self.served, self._sharp = time.perf_counter(), True
-            self._stop()
-            with gone_is_fine(self.client):
+            with self._lock:
+                self._state = replace(self._state, playing=False)
+            with may_be_closed(self.client):
                 self.show(state, None, f"{type(error).__name__}: {error}")
             return
-        quality = pace.MOVING_QUALITY if moving else pace.STILL_QUALITY
-        with gone_is_fine(self.client):
+        quality = MOVING_QUALITY if moving else STILL_QUALITY
+        with may_be_closed(self.client):
             self.client.scene.set_background_image(drawn.pixels, format="jpeg", jpeg_quality=quality)
         self.served = time.perf_counter()
+        self._sent.append(self.served)
         ms = 1000 * (self.served - start)
         if moving:
             fps = 1 / self._frame_seconds if state.playing and resting and state.camera != SPIRAL else None
-            self.pace.learn(drawn=width * height, ms=ms, allowed_ms=pace.allowed_ms(playing_fps=fps, viewers=viewers))
+            allowed = allowed_ms(playing_fps=fps, viewers=viewers)
+            self._resolution.update(drawn=width * height, ms=ms, allowed_ms=allowed)
         else:
             self._sharp = not self._dirty
-        self._sent.append(self.served)
-        with gone_is_fine(self.client):
-            self.show(state, drawn, self._words(drawn, ms, moving=moving))
+        with may_be_closed(self.client):
+            self.show(state, drawn, self._describe(drawn, ms, moving=moving))
 
     def _advance(self, now: float) -> ViewState:
-        """Let the motion and the spiral go on by the time that has passed."""
+        """Advance the motion and the spiral by the time that has passed."""
         elapsed, self._advanced = min(now - self._advanced, 0.5), now
         with self._lock:
             state = self._state
             if state.camera == SPIRAL:
-                state = replace(state, angle=state.angle + STEPS_PER_SECOND * elapsed)
+                state = replace(state, spiral_step=state.spiral_step + SPIRAL_STEPS_PER_SECOND * elapsed)
             if state.playing:
                 self._owed += elapsed / self._frame_seconds
                 steps = int(self._owed + 0.25)  # The timer is a little early as often as late.
                 self._owed -= steps
-                state = state.stepped(steps, len(self.acts[state.act])) if steps else state
+                state = state.advanced(steps, len(self._clips[state.clip])) if steps else state
             self._state = state
         return state
 
-    def _stop(self) -> None:
-        with self._lock:
-            self._state = replace(self._state, playing=False)
-
-    def _words(self, drawn: Painting, ms: float, *, moving: bool) -> str:
+    def _describe(self, drawn: RenderedView, ms: float, *, moving: bool) -> str:
         height, width = drawn.pixels.shape[:2]
         times = [t for t in self._sent if self.served - t < 1.5]
         rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 2 else 0.0
-        stages = " · ".join(
-            f"{name.replace('stg', 'Stg.')} {value:.0f}" for name, value in sorted(drawn.stage_ms.items())
-        )
+        stages = " · ".join(f"{name.replace('stg', 'Stg.')} {t:.0f}" for name, t in sorted(drawn.stage_ms.items()))
         speed = f"{rate:.0f} pictures a second, " if moving and rate >= 2 else ""
         return f"{speed}{width} x {height}, {ms:.0f} ms" + (f" ({stages})" if stages else "")
 
 
 @contextmanager
-def gone_is_fine(client: viser.ClientHandle) -> Iterator[None]:
-    """A browser may close while something is written to it; viser warns of that, which is for mistakes."""
+def may_be_closed(client: viser.ClientHandle) -> Iterator[None]:
+    """A browser may close while something is written to it; viser warns of that."""
     with client._websock_connection.get_message_buffer().sanctioned_dead_writes():
         yield
 
 
-class Stream:
-    """The one thread that draws: always for the viewer who has waited longest. The latest state wins."""
+class DrawingThread:
+    """The one thread that draws, always for the viewer who has waited longest; of its states the latest."""
 
-    def __init__(self, painter: Painter) -> None:
-        self.painter = painter
-        self._viewers: list[Viewer] = []
+    def __init__(self, renderer: ViewRenderer) -> None:
+        self._renderer = renderer
+        self.viewers: list[Viewer] = []
         self._condition = threading.Condition()
         self._ending = False
         self._thread = threading.Thread(target=self._run, name="drawing", daemon=True)
-
-    def start(self) -> None:
-        """Begin to draw."""
         self._thread.start()
 
     def stop(self) -> None:
@@ -161,14 +183,14 @@ class Stream:
     def add(self, viewer: Viewer) -> None:
         """Draw for one more."""
         with self._condition:
-            self._viewers.append(viewer)
+            self.viewers.append(viewer)
             self._condition.notify()
 
     def remove(self, viewer: Viewer) -> None:
         """Draw for it no more."""
         with self._condition:
-            if viewer in self._viewers:
-                self._viewers.remove(viewer)
+            if viewer in self.viewers:
+                self.viewers.remove(viewer)
 
     def wake(self) -> None:
         """Something changed."""
@@ -176,19 +198,15 @@ class Stream:
             self._condition.notify()
 
     def _run(self) -> None:
-        while (next_one := self._wait()) is not None:
-            viewer, viewers = next_one
-            viewer.draw(self.painter, viewers=viewers)
-
-    def _wait(self) -> tuple[Viewer, int] | None:
-        """The next viewer and how many are being drawn for; None at the end."""
-        with self._condition:
-            while not self._ending:
+        while True:
+            with self._condition:
+                if self._ending:
+                    return
                 now = time.perf_counter()
-                due = [viewer for viewer in self._viewers if viewer.due() <= now]
-                if due:
-                    busy = [viewer for viewer in self._viewers if viewer.due() < now + 0.2]
-                    return min(due, key=lambda viewer: viewer.served), len(busy)
-                soonest = min((viewer.due() for viewer in self._viewers), default=NEVER)
-                self._condition.wait(None if soonest == NEVER else max(soonest - now, 0.0005))
-        return None
+                due = [viewer for viewer in self.viewers if viewer.due() <= now]
+                if not due:
+                    soonest = min((viewer.due() for viewer in self.viewers), default=NEVER)
+                    self._condition.wait(None if soonest == NEVER else max(soonest - now, 0.0005))
+                    continue
+                busy = sum(viewer.due() < now + 0.2 for viewer in self.viewers)
+            min(due, key=lambda viewer: viewer.served).draw(self._renderer, viewers=busy)

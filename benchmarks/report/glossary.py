@@ -40,7 +40,6 @@ GLOSSARY = {
     "and access to it was watched, but not made impossible.",
     "gap": "PSNR on training views minus PSNR here: overfitting.",
     "settled": "Seconds of training after which no score of reserved views differs by more than 0.3 dB from the last.",
-    "search time": "Seconds that a search for sufficient settings took before the training that counts.",
     "steps": "How many steps of the optimiser training took.",
     "cameras seen": "How many of the capture's training cameras the method learned from.",
     "frames seen": "How many of the capture's training frames the method learned from.",

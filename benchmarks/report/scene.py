@@ -25,7 +25,6 @@ COSTS = (
     *figures.STAGE_METRICS,
     "train_s",
     "train_cpu_s",
-    "search_s",
     "settled_s",
     "steps",
     "train_cameras",

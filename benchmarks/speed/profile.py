@@ -31,12 +31,10 @@ from ash.files import write_json
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted
 from ash.native.library import has_tiles
-from ash.training.adam import Adam
 from ash.training.batches import draw_batch
 from ash.training.images import TrainingImages, load_training_images
 from baselines.ddc import DdcAvatar, ddc
 from benchmarks.speed.frames import captured
-from benchmarks.speed.launches import LAUNCH_US, launches_of_step, launching_ms
 
 STATIC, VERTICES = "step with static views", "step with vertices"  # Both at once in the mesh: the latter.
 FORWARD = ("batch", "decode", "pose", "draw", "loss")
@@ -47,7 +45,6 @@ STEPS = 80
 SUBJECTS = (
     ("ash", "cpu", "float32"),
     ("ash", "cpu", "bfloat16"),
-    ("ash", "frugal", "float32"),
     ("ddc", "cpu", "float32"),
     ("ddc", "cpu", "bfloat16"),
 )
@@ -184,8 +181,8 @@ def _watched(parts: _Parts, learner: AshAvatar | DdcAvatar, run: ash.training.lo
         yield
 
 
-def profiles(capture: Capture, device: torch.device = CPU) -> Iterator[tuple[list[PartTime], int]]:
-    """The subjects' steps on one thread and a device, as they learn from a capture, and on a GPU a step's launches."""
+def profiles(capture: Capture, device: torch.device = CPU) -> Iterator[list[PartTime]]:
+    """The subjects' steps on one thread and a device, as they learn from a capture."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -196,18 +193,9 @@ def profiles(capture: Capture, device: torch.device = CPU) -> Iterator[tuple[lis
             recipe: presets.Recipe[Any] = presets.ash if method == "ash" else ddc
             make = recipe.but({"training.precision": precision, "device": str(device)})
             learner: AshAvatar | DdcAvatar = make(capture, seed=0, preset=preset)
-            yield profile_step(method, learner, images, preset, steps=STEPS), _launches(learner, images)
+            yield profile_step(method, learner, images, preset, steps=STEPS)
     finally:
         torch.set_num_threads(before)
-
-
-def _launches(learner: AshAvatar | DdcAvatar, images: TrainingImages) -> int:
-    """At least so many in a step on a GPU; 0 on the CPU."""
-    if images.device == CPU:
-        return 0
-    training = learner.config.training
-    batch = draw_batch(images, training, 0, 0)
-    return launches_of_step(learner, [batch], training, Adam(learner.parameter_groups(), eps=1e-15))
 
 
 def print_profile(profile: list[PartTime]) -> None:
@@ -222,12 +210,8 @@ def main(json_path: Path | None, folder: Path | None, device: torch.device = CPU
     """Print the profiles on a capture, and write them to `json_path`; returns the exit code."""
     found: list[PartTime] = []
     print(f"device {device}")
-    for profile, launched in profiles(captured(folder), device):
+    for profile in profiles(captured(folder), device):
         print_profile(profile)
-        if launched:
-            print(
-                f"  {launched} kernels or more are launched: {launching_ms(launched):.1f} ms at {LAUNCH_US:g} us each"
-            )
         found += profile
     for method, preset in sorted({(row.method, row.preset) for row in found if row.precision == "bfloat16"}):
         took = {

@@ -1,1 +1,1 @@
-"""Studies of one method: conformance, search, display, retargeting."""
+"""Studies of one method: conformance, display, retargeting."""

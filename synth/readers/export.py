@@ -1,15 +1,13 @@
-"""Exports of a finished capture: the released code's formats, nerfstudio, COLMAP text, and an animated GLB."""
+"""Exports of a finished capture: the released code's files, nerfstudio, COLMAP, plain files, and the test views."""
 
-import json
-import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ash.capture.dataset import Capture, Split
-from ash.files import InputError, write_atomic, write_image, write_json
-from synth.person.body import vertex_normals
+from ash.capture.formats import write_cameras, write_skeleton, write_template
+from ash.files import InputError, write_arrays, write_atomic, write_image, write_json
 from synth.posing import bone_frames, dual_quaternion_skinning, rotmat_to_unitquat, skinning_transforms
 from synth.readers.official import export_official
 
@@ -88,137 +86,94 @@ def _say(capture: Capture, folder: Path, what: str) -> None:
     write_atomic(folder / "ABOUT.txt", f"{capture.scene}, capture {capture.identity[:12]}: {what}.\n".encode())
 
 
-def export_glb(capture: Capture, folder: Path) -> Path:
-    """`human.glb`: the skinned, textured, animated template for any viewer. glTF skins linearly: joints are softer."""
-    template, skeleton = capture.template, capture.skeleton
-    pairs, corners = np.unique(
-        np.stack([template.faces.ravel(), template.uv_faces.ravel()], axis=1), axis=0, return_inverse=True
-    )
-    order = np.argsort(-template.skin_weights[pairs[:, 0]], axis=1, kind="stable")[:, :4]
-    weights = np.take_along_axis(template.skin_weights[pairs[:, 0]], order, axis=1)
-    buffer = GlbBuffer()
-    normals = vertex_normals(template.vertices, template.faces)[pairs[:, 0]]
-    attributes = {
-        "POSITION": buffer.add(template.vertices[pairs[:, 0]].astype(np.float32), "VEC3", bounds=True),
-        "NORMAL": buffer.add(normals.astype(np.float32), "VEC3"),
-        "TEXCOORD_0": buffer.add((template.uvs[pairs[:, 1]] * [1, -1] + [0, 1]).astype(np.float32), "VEC2"),
-        "JOINTS_0": buffer.add(order.astype(np.uint16), "VEC4"),
-        "WEIGHTS_0": buffer.add((weights / weights.sum(axis=1, keepdims=True)).astype(np.float32), "VEC4"),
-    }
-    indices = buffer.add(corners.reshape(-1).astype(np.uint32), "SCALAR")
-    inverse = np.tile(np.eye(4), (len(skeleton.names), 1, 1))
-    inverse[:, :3, 3] = -skeleton.heads
-    binds = buffer.add(np.swapaxes(inverse, 1, 2).reshape(-1, 16).astype(np.float32), "MAT4")
-    nodes, animation = _joint_nodes(capture, buffer)
-    document = {
-        "asset": {"version": "2.0", "generator": "ash-bench"},
-        "scene": 0,
-        "scenes": [{"nodes": [0, len(nodes)]}],
-        "nodes": [*nodes, {"mesh": 0, "skin": 0, "name": "human"}],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
-        "skins": [{"joints": list(range(len(nodes))), "inverseBindMatrices": binds}],
-        "animations": [animation],
-        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}, "doubleSided": True}],
-    }
-    texture = capture.folder / "truth" / "texture.png"
-    if texture.is_file():
-        document["images"] = [{"bufferView": buffer.raw(texture.read_bytes()), "mimeType": "image/png"}]
-        document["textures"] = [{"source": 0}]
-        document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}  # type: ignore[index]
-    write_atomic(folder / "human.glb", buffer.pack(document))
+View = tuple[str, str, int]  # split, camera, frame
+
+
+def export_plain(capture: Capture, folder: Path) -> Path:
+    """The training images with their cameras, poses and template, for a program that reads JSON, NumPy and PNG."""
+    train = capture.splits["train"]
+    for camera, frame in train.views:
+        write_image(folder / _image(camera, frame), capture.image(camera, frame))
+    _write_model(capture, folder, cameras=train.cameras, frames=train.frames)
+    images = [{"camera": camera, "frame": frame, "image": _image(camera, frame)} for camera, frame in train.views]
+    write_json(folder / "views.json", {"views": images})
+    _say(capture, folder, f"split train, {len(images)} images, straight alpha; poses.npz: {POSES}")
     return folder
 
 
-def _joint_nodes(capture: Capture, buffer: "GlbBuffer") -> tuple[list[dict], dict]:
-    """glTF nodes of the joints, and the animation that moves them."""
-    skeleton, motion = capture.skeleton, capture.motion
-    frames = bone_frames(skeleton, motion.dofs)
-    times = buffer.add(np.arange(len(frames), dtype=np.float32) / motion.fps, "SCALAR", bounds=True)
-    nodes: list[dict] = []
-    channels: list[dict] = []
-    samplers: list[dict] = []
-    for j, (name, parent) in enumerate(zip(skeleton.names, skeleton.parents, strict=True)):
-        rest = skeleton.heads[j] - (skeleton.heads[parent] if parent >= 0 else 0)
-        children = [int(k) for k in np.flatnonzero(skeleton.parents == j)]
-        nodes.append({"name": name, "translation": rest.tolist(), **({"children": children} if children else {})})
-        above = frames[:, parent, :3, :3] if parent >= 0 else np.eye(3)
-        quats = rotmat_to_unitquat(np.swapaxes(above, -1, -2) @ frames[:, j, :3, :3])
-        tracks = [("rotation", quats[:, [1, 2, 3, 0]], "VEC4")]
-        if parent < 0:
-            tracks.append(("translation", frames[:, 0, :3, 3], "VEC3"))
-        for path, values, kind in tracks:
-            channels.append({"sampler": len(samplers), "target": {"node": j, "path": path}})
-            samplers.append({"input": times, "output": buffer.add(values.astype(np.float32), kind)})
-    return nodes, {"channels": channels, "samplers": samplers}
+def export_test_views(capture: Capture, folder: Path, *, views: Sequence[View]) -> Path:
+    """What a method elsewhere is asked to render: cameras and poses of the scored views, none of their images."""
+    rows = [
+        {"split": split, "camera": camera, "frame": frame, "image": _image(camera, frame, split=split)}
+        for split, camera, frame in views
+    ]
+    cameras = tuple(dict.fromkeys(camera for _, camera, _ in views))
+    _write_model(capture, folder, cameras=cameras, frames=range(len(capture.motion.dofs)))
+    write_json(folder / "views.json", {"views": rows})
+    _say(capture, folder, f"{len(rows)} views to render as RGBA PNG, colour on black, at `image`; poses.npz: {POSES}")
+    return folder
 
 
-COMPONENT_TYPES = {"float32": 5126, "uint32": 5125, "uint16": 5123}
+POSES = (
+    "dofs (root translation in metres, then a rotation vector per joint in radians), joints and skinning "
+    "([f, j, 4, 4]: world from joint, world from rest pose)"
+)
 
 
-class GlbBuffer:
-    """The binary chunk of a GLB and the accessors into it."""
+def _image(camera: str, frame: int, *, split: str = "") -> str:
+    return "/".join(["images", *([split] if split else []), camera, f"{frame:06d}.png"])
 
-    def __init__(self) -> None:
-        self.content = bytearray()
-        self.views: list[dict] = []
-        self.accessors: list[dict] = []
 
-    def raw(self, content: bytes) -> int:
-        """Append bytes as a buffer view of their own, and return its index."""
-        self.content += b"\0" * (-len(self.content) % 4)
-        self.views.append({"buffer": 0, "byteOffset": len(self.content), "byteLength": len(content)})
-        self.content += content
-        return len(self.views) - 1
-
-    def add(self, array: np.ndarray, kind: str, *, bounds: bool = False) -> int:
-        """Append an array as an accessor of glTF type `kind`, with its bounds where glTF asks for them; its index."""
-        accessor = {
-            "bufferView": self.raw(np.ascontiguousarray(array).tobytes()),
-            "componentType": COMPONENT_TYPES[str(array.dtype)],
-            "count": len(array),
-            "type": kind,
-        }
-        if bounds:
-            flat = array.reshape(len(array), -1)
-            accessor |= {"min": flat.min(axis=0).tolist(), "max": flat.max(axis=0).tolist()}
-        self.accessors.append(accessor)
-        return len(self.accessors) - 1
-
-    def pack(self, document: dict) -> bytes:
-        """The whole file: the document, completed by what was added, and the binary chunk."""
-        self.content += b"\0" * (-len(self.content) % 4)
-        document = {**document, "buffers": [{"byteLength": len(self.content)}]}
-        document |= {"bufferViews": self.views, "accessors": self.accessors}
-        text = json.dumps(document, separators=(",", ":")).encode()
-        text += b" " * (-len(text) % 4)
-        size = 12 + 8 + len(text) + 8 + len(self.content)
-        head = struct.pack("<4sII", b"glTF", 2, size) + struct.pack("<I4s", len(text), b"JSON")
-        return head + text + struct.pack("<I4s", len(self.content), b"BIN\0") + bytes(self.content)
+def _write_model(capture: Capture, folder: Path, *, cameras: Sequence[str], frames: Sequence[int]) -> None:
+    """Cameras, skeleton, template, and the poses of some frames."""
+    motion, chosen = capture.motion, list(frames)
+    write_cameras(folder / "cameras.json", [capture.cameras[name] for name in cameras])
+    write_skeleton(folder / "skeleton.json", capture.skeleton)
+    write_template(folder / "template.npz", capture.template)
+    write_arrays(
+        folder / "poses.npz",
+        frame=np.array(chosen),
+        sequence=motion.sequence[chosen],
+        fps=np.array(motion.fps),
+        dofs=motion.dofs[chosen],
+        joints=bone_frames(capture.skeleton, motion.dofs[chosen]),
+        skinning=skinning_transforms(capture.skeleton, motion.dofs[chosen]),
+    )
 
 
 FORMATS: dict[str, Callable[..., Path]] = {
     "ash": export_official,
     "nerfstudio": export_nerfstudio,
     "colmap": export_colmap,
-    "glb": export_glb,
+    "plain": export_plain,
+    "test-views": export_test_views,
 }
+OF_ONE_SPLIT = ("nerfstudio", "colmap")
 
 
-CHOOSING = ("nerfstudio", "colmap")  # A frame and a split can be chosen; the others hold what their name says.
-WHOLE = {"ash": "ash holds the whole training part, as the release reads it", "glb": "glb holds the whole motion"}
+def export(
+    capture: Capture,
+    folder: Path,
+    *,
+    form: str,
+    split: str | None = None,
+    frame: int | None = None,
+    views: Sequence[View] = (),
+) -> Path:
+    """Write a capture into `folder` in one of the `FORMATS`.
 
-
-def export(capture: Capture, folder: Path, *, form: str, split: str | None = None, frame: int | None = None) -> Path:
-    """Write a capture into `folder` in one of the `FORMATS`; of nerfstudio and COLMAP a split and a frame.
+    `split` and `frame` choose what nerfstudio and COLMAP hold; `views` are the scored ones, for `test-views`.
 
     Raises:
         InputError: an unknown format, split or frame, or a folder that cannot be written.
     """
     if form not in FORMATS:
-        raise InputError(f"unknown format {form!r}, expected one of {', '.join(FORMATS)}")
-    if form in WHOLE and (split, frame) != (None, None):
-        raise InputError(f"{WHOLE[form]}; a split or a frame is chosen with {' or '.join(CHOOSING)}")
-    choice = {} if form in WHOLE else {"split": split or "train", "frame": frame}
+        raise InputError(f"format: expected one of {', '.join(FORMATS)}, got {form!r}")
+    choice: dict = {"split": split or "train", "frame": frame} if form in OF_ONE_SPLIT else {}
+    if form == "test-views":
+        choice["views"] = views
+    if not choice.get("split") and (split, frame) != (None, None):
+        raise InputError(f"a split or a frame is chosen with {' or '.join(OF_ONE_SPLIT)}, got the format {form}")
     try:
         return FORMATS[form](capture, folder, **choice)
     except OSError as error:

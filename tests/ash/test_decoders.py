@@ -130,7 +130,7 @@ def compare_with_the_definition(shape: tuple[int, ...], *, channels_last: bool) 
     if channels_last:
         net = net.to(memory_format=torch.channels_last)
         texture = texture.contiguous(memory_format=torch.channels_last)
-    assert net._takes_natively(texture)
+    assert net._can_use_native(texture)
     found = value_and_gradients(net, texture, features, net)
     assert len(found) == len(truth)
     assert max(relative_error(a, b) for a, b in zip(found, truth, strict=True)) < 1e-5
@@ -149,7 +149,7 @@ def test_texels_picked_by_the_native_network_are_those_of_the_definition(shuffle
     exact, rows = deepcopy(net).double(), TexelRows(LATTICE, shuffle)
     truth = value_and_gradients(exact, texture.double(), features.double(), lambda t, f: exact.picked(t, f, rows))
     found = value_and_gradients(net, texture, features, lambda t, f: net.picked(t, f, rows))
-    assert net._takes_natively(texture) and not exact._takes_natively(texture.double())
+    assert net._can_use_native(texture) and not exact._can_use_native(texture.double())
     assert found[0].shape == (1, len(LATTICE.texels), 7)
     assert max(relative_error(a, b) for a, b in zip(found, truth, strict=True)) < 1e-5
 
@@ -171,7 +171,7 @@ def test_frames_decoded_together_are_those_decoded_alone(shared_trunk, kind):
     ]
     together = torch.stack(list(decoders.together(frames)))
     alone = torch.stack([decoders(frame) for frame in frames])
-    assert decoders.nets[0]._takes_natively(frames[0].textures[None]) == (kind == torch.float32)
+    assert decoders.nets[0]._can_use_native(frames[0].textures[None]) == (kind == torch.float32)
     assert not torch.allclose(alone[0], alone[1])
     weights = torch.randn(alone.shape, generator=numbers).to(kind)
     found, expected = (
@@ -222,10 +222,10 @@ def test_two_networks_of_one_shape_keep_their_own_activations():
 
 def test_what_the_kernels_do_not_know_goes_the_way_of_the_definition():
     net, texture, _ = network_and_inputs(SHAPES["narrow"])
-    assert net._takes_natively(texture)
-    assert not net._takes_natively(texture.double())
-    assert not net._takes_natively(texture.clone().requires_grad_())
-    assert not UNet(6, 4, width=8, levels=3, norm="instance")._takes_natively(texture)
-    assert not UNet(6, 4, width=64, levels=3, norm="none")._takes_natively(texture)
+    assert net._can_use_native(texture)
+    assert not net._can_use_native(texture.double())
+    assert not net._can_use_native(texture.clone().requires_grad_())
+    assert not UNet(6, 4, width=8, levels=3, norm="instance")._can_use_native(texture)
+    assert not UNet(6, 4, width=64, levels=3, norm="none")._can_use_native(texture)
     with torch.autocast("cpu", torch.bfloat16):
-        assert not net._takes_natively(texture)
+        assert not net._can_use_native(texture)

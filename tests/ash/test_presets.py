@@ -31,7 +31,7 @@ def capture(tmp_path_factory):
 def small(config: AshConfig, **training) -> AshConfig:
     """The same choices at the size of the tests' capture."""
     shuffle = min(config.model.shuffle, 2)
-    model = replace(config.model, texels=16, width=4, levels=2, window=2, shuffle=shuffle, rank=2)
+    model = replace(config.model, texels=16, width=4, levels=2, window=2, shuffle=shuffle)
     settings = {"steps": 4, "warmup_steps": 2, "views_per_step": 1} | training
     template = replace(config.template, nodes=30, blocks=1, width=4, steps=2)
     return replace(config, model=model, training=replace(config.training, **settings), template=template)
@@ -74,7 +74,7 @@ def test_every_preset_records_on_what_it_was_chosen():
 
 
 def test_unknown_presets_are_refused_with_the_known_ones_named():
-    with pytest.raises(InputError, match="ci, brief, cpu, fit, thorough, budget, frugal, paper, official"):
+    with pytest.raises(InputError, match="ci, brief, cpu, thorough, budget, paper, official"):
         named("paperr")
 
 
@@ -236,7 +236,7 @@ def test_noise_is_smooth_standard_and_a_function_of_its_seed():
     assert noise.diff(dim=2).abs().max() < 0.5
 
 
-@pytest.mark.parametrize("model", [{"head": "blendshapes", "shuffle": 1}, {"standardise": False}, {"motion": False}])
+@pytest.mark.parametrize("model", [{"standardise": False}, {"motion": False}])
 def test_noise_without_standardised_textures_is_refused(model):
     base = named("ci")
     with pytest.raises(InputError, match="texture_noise"):

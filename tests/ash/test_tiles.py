@@ -87,7 +87,7 @@ def value_and_gradients(net: UNet, texture: Tensor, features: Tensor | None, cal
 
 def in_tiles(net: UNet, texture: Tensor, features: Tensor | None) -> list[Tensor]:
     with torch.autocast("cpu", torch.bfloat16):
-        assert net._takes_natively(texture)
+        assert net._can_use_native(texture)
         return value_and_gradients(net, texture, features, net)
 
 
@@ -129,7 +129,7 @@ def test_where_there_are_no_tiles_decoders_learn_in_float32(monkeypatch):
     monkeypatch.setattr(ash.native.library, "has_tiles", lambda: False)
     assert decoding_precision("bfloat16", CPU, 16) == "float32"
     with torch.autocast("cpu", torch.bfloat16):
-        assert not net._takes_natively(texture)
+        assert not net._can_use_native(texture)
     monkeypatch.setattr(ash.native.library, "has_tiles", lambda: True)
     assert decoding_precision("bfloat16", CPU, 16) == "bfloat16"
     assert decoding_precision("float32", CPU, 16) == "float32"

@@ -15,7 +15,7 @@ from baselines.ddc import ddc
 from baselines.mlp import mlp, mlp_base
 from baselines.oracle_texture import oracle_texture
 from baselines.static import static
-from baselines.switches import ash_frugal, wo_disp, wo_mot, wo_offset
+from baselines.switches import wo_disp, wo_mot, wo_offset
 
 RECIPES: dict[str, Recipe[Any]] = {
     "ddc": ddc,
@@ -26,7 +26,6 @@ RECIPES: dict[str, Recipe[Any]] = {
     "wo_mot": wo_mot,
     "wo_disp": wo_disp,
     "wo_offset": wo_offset,
-    "ash_frugal": ash_frugal,
     "mlp": mlp,
     "mlp_base": mlp_base,
 }

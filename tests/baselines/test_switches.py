@@ -13,9 +13,8 @@ from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture, Pose
 from ash.config import TemplateConfig
 from ash.protocol import StageClock
-from baselines import switches
 from baselines.mlp import mlp
-from benchmarks.cell.methods import ORACLES, configured, find_method, is_oracle
+from benchmarks.cell.methods import configured, find_method, is_oracle
 from benchmarks.suites.files import find_suite
 from benchmarks.suites.suites import MethodSpec
 
@@ -58,13 +57,6 @@ def test_a_way_to_the_template_is_learned_and_draws(row: MethodSpec, capture: Ca
     require_a_way(made(row, capture), row.name == "unlearned", capture, tmp_path)
 
 
-def test_the_template_may_be_learned_from_what_only_an_oracle_sees(capture: Capture, tmp_path: Path) -> None:
-    for way in (switches.by_surface, switches.by_vertices):
-        require_a_way(
-            way(capture, seed=0, preset="ci"), False, capture, tmp_path / way.config("ci").template.supervision
-        )
-
-
 def require_a_way(avatar: AshAvatar, unlearned: bool, capture: Capture, folder: Path) -> None:
     assert (avatar.template.learned is None) == unlearned
     avatar.fit(capture, folder=folder)
@@ -91,9 +83,7 @@ def test_the_mlp_tells_frames_apart_and_learns_no_texels_beneath(
 
 
 def test_the_suites_have_them_as_rows() -> None:
-    assert len(SWITCHES) == 23 and len(LEARNED) == 4
+    assert len(SWITCHES) == 22 and len(LEARNED) == 4
     methods = [row.of or row.name for suite in ("switches", "template") for row in find_suite(suite).methods]
     assert all(find_method(method).is_ours and callable(find_method(method).load()) for method in methods)
-    named = ["baselines.switches:by_surface", "baselines.switches:by_vertices"]
-    assert [method for method in methods if ":" in method] == named
-    assert set(named) <= ORACLES and not is_oracle("by_scans")
+    assert not is_oracle("by_scans")

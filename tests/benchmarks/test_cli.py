@@ -1,4 +1,5 @@
 import json
+import os
 import re
 import shutil
 import signal
@@ -186,8 +187,8 @@ def test_people_to_choose_by_have_runs_of_their_own_which_say_so(capture: Path, 
     search, table = tmp_path / "search", tmp_path / "table"
     assert cli.main([*run, "--validation", "--capture", str(chosen), "--out", str(search)]) == arguments.DONE
     assert cli.main([*run, "--capture", str(capture), "--out", str(table)]) == arguments.DONE
-    assert "to choose by, and no verdict" in (search / "report.md").read_text()
-    assert "to choose by" not in (table / "report.md").read_text()
+    assert "are for validation: choose by these numbers" in (search / "report.md").read_text()
+    assert "choose by these numbers" not in (table / "report.md").read_text()
     own = ("--validation", "--capture", str(capture), "--out", str(search))
     assert "subject 0 is for tables, expected one from 100 on" in refused_last(capsys, *run, *own)
     mixed = ("report", str(search), str(table), "--out", str(tmp_path / "both"))
@@ -212,7 +213,7 @@ def test_the_reference_holds_the_public_names(tmp_path: Path) -> None:
         "ash/capture/dataset.html": ("Skeleton.heads", "Motion.dofs", "require_pose"),
         "ash/capture/manifest.html": ("Split.views",),
         "ash/protocol.html": ("Avatar.fit", "Configurable.config"),
-        "benchmarks/play/avatars.html": ("load_avatar", "TrainedAvatar.draw"),
+        "benchmarks/play/avatars.html": ("load_avatar", "LoadedAvatar.draw"),
     }
     for page, names in wanted.items():
         text = (tmp_path / page).read_text()
@@ -373,3 +374,38 @@ def test_a_variant_of_a_scene_has_a_capture_of_its_own(tmp_path: Path, monkeypat
     assert folders == {tmp_path / "mannequin-ci-0", tmp_path / "seen-ci-0"}
     assert (captures.described(seen).rig.cameras, captures.described(seen).name) == (9, "seen")
     assert captures.described(seen).identity != captures.described(plain).identity
+
+
+OPENMP = ("OMP_NUM_THREADS", "GOMP_SPINCOUNT", "OMP_WAIT_POLICY")
+
+
+@pytest.mark.parametrize(
+    ("given", "spins"), [({}, "1000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "passive"}, "0")]
+)
+def test_commands_set_how_idle_threads_wait_unless_the_user_did(given: dict[str, str], spins: str) -> None:
+    settings = {name: value for name, value in os.environ.items() if name not in OPENMP}
+    done = subprocess.run(
+        [sys.executable, "-c", "from benchmarks import cli; cli.main(['suites', 'ci']); import torch"],
+        env=settings | given | {"OMP_DISPLAY_ENV": "verbose"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    reported = {name: re.findall(rf"{name} ?= ?'(\w+)'", done.stderr) for name in OPENMP}
+    if not reported["GOMP_SPINCOUNT"]:
+        pytest.skip("torch's OpenMP runtime is not GNU's")
+    assert (reported["GOMP_SPINCOUNT"], reported["OMP_NUM_THREADS"]) == ([spins], ["1"])
+
+
+def test_commands_give_blas_one_thread_as_in_cells() -> None:
+    """`eval` and `train` take times in this process: a second thread that waits busily falsifies them."""
+    code = """
+import os
+from benchmarks import cli
+import numpy as np
+np.ones((500, 500)) @ np.ones((500, 500))
+print(len(os.listdir("/proc/self/task")))
+"""
+    settings = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    done = subprocess.run([sys.executable, "-c", code], env=settings, capture_output=True, text=True, check=True)
+    assert done.stdout == "1\n"

@@ -66,7 +66,7 @@ for command in COMMANDS:
         ("run --size huge --dry-run", "unknown size 'huge', expected one of ci, rung, quick, long, table, paper"),
         ("speed else", "WHAT: expected one of kernels, frame, got 'else'"),
         ("verify", "expected FOLDER"),
-        ("export", "expected FOLDER and --format"),
+        ("export", "expected SOURCE and --format"),
         ("suites qiuck", "unknown suite 'qiuck', did you mean quick"),
         ("synth tihgt", "unknown scene 'tihgt', did you mean tight"),
         ("synth mannequin --rig.camers 24", "unknown option '--rig.camers', did you mean --rig.cameras"),

@@ -29,14 +29,10 @@ from ash.capture.formats import load_capture, read_cameras, read_motion, read_sk
 from ash.capture.manifest import read_manifest, verify_capture
 from ash.checkpoints import load_module, read_safetensors
 from ash.files import InputError, read_arrays, read_image, read_json, write_image, write_json
-from ash.searching import Choice, Tried
-from ash.searching import _read as read_choice
 from benchmarks.cell.cells import Cell, CellConfig, failed_result, read_cell, read_result, write_config, write_result
 from benchmarks.cell.curves import read_curve
 from benchmarks.cell.lpips import _load as read_tensors
 from benchmarks.gate.gate import read_baseline
-from benchmarks.studies.search import SearchResult
-from benchmarks.studies.search import _read as read_found
 from benchmarks.studies.trial import Outcome, read_outcome
 from benchmarks.suites.files import read_suite
 from benchmarks.suites.runs import read_run
@@ -93,10 +89,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Rea
         "cell": (folder / "cell" / "config.json", lambda path: read_cell(path.parent)),
         "json": (run, read_json),
         "weights": (_weights(folder / "model.safetensors"), _load_weights),
-        "choice": (_choice(folder / "choice.json"), read_choice),
         "suite": (_suite(folder / "mine.toml"), read_suite),
         "trial": (_outcome(folder / "outcome.json"), lambda path: read_outcome(path.parent)),
-        "search": (_found(folder / "found.json"), read_found),
         "lpips": (_tensors(folder / "alex.pth"), read_tensors),
     }
 
@@ -110,12 +104,6 @@ def _load_weights(path: Path) -> None:
     load_module(torch.nn.Linear(3, 2), read_safetensors(path)[0], path)
 
 
-def _choice(path: Path) -> Path:
-    tried = Tried(name="as the preset", parameters=10, fade=1.0, seen=20.0, left_out=19.0)
-    write_json(path, asdict(Choice(name=tried.name, fade=1.0, seconds=2.0, tried=(tried,))))
-    return path
-
-
 def _suite(path: Path) -> Path:
     path.write_text(
         'about = "mine"\nscenes = ["mannequin", { of = "tight", name = "swings", outfit.swing = 0.8 }]\nsize = "ci"\n'
@@ -126,12 +114,6 @@ def _suite(path: Path) -> Path:
 
 def _outcome(path: Path) -> Path:
     write_json(path, asdict(Outcome(pictures=("00", "01"), again=("00",), seconds=1.5)))
-    return path
-
-
-def _found(path: Path) -> Path:
-    found = SearchResult(name="preset", value="", seed=0, psnr=20.0, train_s=2.5, params=30)
-    write_json(path, asdict(found))
     return path
 
 
@@ -157,7 +139,7 @@ def as_a_user_runs_it(monkeypatch: pytest.MonkeyPatch) -> None:
 
 KINDS = (
     "manifest", "cameras", "skeleton", "template", "motion", "surface", "image", "bvh", "amass", "joint map", "rig",
-    "baseline", "curve", "run", "result", "cell", "json", "weights", "choice", "suite", "trial", "search", "lpips",
+    "baseline", "curve", "run", "result", "cell", "json", "weights", "suite", "trial", "lpips",
 )  # fmt: skip
 
 

@@ -46,7 +46,6 @@ def tiny(config: Any, **template: Any) -> Any:
         model=replace(config.model, **size),
         training=replace(config.training, steps=4, warmup_steps=0),
         template=replace(small.template, **({"kind": "skinned"} | template)),
-        search=False,
         **({"texture": 32} if hasattr(config, "texture") else {}),
     )
 

@@ -8,11 +8,10 @@ import struct
 import numpy as np
 import torch
 from plyfile import PlyData
-from pygltflib import GLTF2
+from pygltflib import GLTF2, BufferFormat
 
 from ash.gaussians.gaussians import Gaussians
-from ash.harmonics import SH_C0
-from benchmarks.export.axes import HALF_TURN_ABOUT_X, turned
+from benchmarks.export.gaussians import HALF_TURN_ABOUT_X, turned
 
 
 def read_ply(content: bytes) -> Gaussians:
@@ -29,20 +28,6 @@ def read_ply(content: bytes) -> Gaussians:
         scales=columns(*(f"scale_{i}" for i in range(3))).exp(),
         opacities=columns("opacity")[:, 0].sigmoid(),
         sh=torch.cat([columns(*(f"f_dc_{i}" for i in range(3)))[:, None], rest], 1).contiguous(),
-    )
-    return turned(down, HALF_TURN_ABOUT_X)
-
-
-def read_splat(content: bytes) -> Gaussians:
-    """32 bytes each, as viewers take them apart."""
-    floats = np.frombuffer(content, dtype="<f4").reshape(-1, 8)[:, :6].copy()
-    small = np.frombuffer(content, dtype=np.uint8).reshape(-1, 32)[:, 24:].astype(np.float32)
-    down = Gaussians(
-        means=torch.from_numpy(floats[:, :3].copy()),
-        quats=torch.from_numpy((small[:, 4:] - 128) / 128),
-        scales=torch.from_numpy(floats[:, 3:].copy()),
-        opacities=torch.from_numpy(small[:, 3] / 255),
-        sh=torch.from_numpy((small[:, None, :3] / 255 - 0.5) / SH_C0),
     )
     return turned(down, HALF_TURN_ABOUT_X)
 
@@ -82,8 +67,9 @@ def read_spz(content: bytes) -> Gaussians:
 
 
 def read_gltf(content: bytes) -> Gaussians:
-    """By pygltflib."""
-    document = GLTF2.load_from_bytes(content)
+    """By pygltflib: binary, or JSON with its numbers in base64."""
+    document = GLTF2.load_from_bytes(content) if content[:4] == b"glTF" else GLTF2.from_json(content.decode())
+    document.convert_buffers(BufferFormat.BINARYBLOB)
     (primitive,) = document.meshes[0].primitives
     assert primitive.mode == 0 and document.extensionsUsed == ["KHR_gaussian_splatting"]
     kernel = primitive.extensions["KHR_gaussian_splatting"]

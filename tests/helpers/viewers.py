@@ -17,15 +17,15 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from benchmarks.play.player import PlayServer
-from benchmarks.play.state import ViewState
+from benchmarks.play.rendering import ViewState
 
 PATIENCE = 120.0  # seconds; software graphics on a busy machine
 
 
 def state_of(player: PlayServer) -> ViewState:
     """What the only viewer looks at, once the one before has left."""
-    wait_for(lambda: len(player._pages) == 1, PATIENCE)
-    (page,) = player._pages.values()
+    wait_for(lambda: len(player.pages) == 1, PATIENCE)
+    (page,) = player.pages.values()
     return page.viewer.state
 
 

@@ -73,7 +73,6 @@ LEARNERS = {
     "noise": lambda capture: AshAvatar(of_frames(noise=0.5, window=3), capture),
     "instance": lambda capture: AshAvatar(of_frames(norm="instance"), capture),
     "refining": lambda capture: AshAvatar(of_frames(refine=True), capture),
-    "blendshapes": lambda capture: AshAvatar(of_frames(head="blendshapes", fade=0.0), capture),
     "motionless": lambda capture: AshAvatar(of_frames(motion=False), capture),
     "mesh": lambda capture: DdcAvatar(mesh_of_frames(noise=0.5, global_features=True), capture),
     "moving mesh": lambda capture: DdcAvatar(replace(mesh_of_frames(), refine="motion"), capture),
@@ -86,7 +85,7 @@ def test_the_gradient_of_a_step_is_the_mean_of_its_frames(
     learner: str, natively: bool, capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not natively:  # As on a GPU: the frames are one batch of the U-Nets.
-        monkeypatch.setattr(UNet, "_takes_natively", lambda net, texture: False)
+        monkeypatch.setattr(UNet, "_can_use_native", lambda net, texture: False)
     avatar = LEARNERS[learner](capture)
     for net in avatar.module.modules():
         if isinstance(net, UNet):

@@ -4,8 +4,6 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -14,17 +12,16 @@ from helpers.cells import cell
 from helpers.commands import refused, refused_last
 
 import ash.devices
-from ash.devices import obstacle
+from ash.devices import cuda_error
 from ash.files import InputError
 from benchmarks import cli
 from benchmarks.cell.cells import CellConfig, read_cell, read_result, write_config, write_result
 from benchmarks.cell.process import placed_on
 from benchmarks.commands import doctor
 from benchmarks.commands.devices import chosen_device, on_device
-from benchmarks.play.actors import open_cast
+from benchmarks.play.avatars import open_avatars
 from benchmarks.provenance import gpu_name
 from benchmarks.report.sentences import doubts
-from benchmarks.speed import pace, rows
 from benchmarks.suites.files import find_suite
 
 without_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
@@ -37,14 +34,14 @@ without_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a 
     ids=lambda command: command[0],
 )
 def test_a_gpu_that_is_not_there_is_one_line_and_exit_code_2(command: tuple[str, ...], capsys) -> None:
-    assert refused(capsys, *command, "--device", "cuda").endswith(f"device cuda: {obstacle()}")
+    assert refused(capsys, *command, "--device", "cuda").endswith(f"device cuda: {cuda_error()}")
     assert "expected cpu, cuda or cuda:N, got 'gpu'" in refused(capsys, *command, "--device", "gpu")
 
 
 def test_auto_takes_cuda_where_it_works_and_says_why_where_not(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    monkeypatch.setattr(ash.devices, "obstacle", lambda name="cuda": "")
+    monkeypatch.setattr(ash.devices, "cuda_error", lambda name="cuda": "")
     assert chosen_device("auto") == "cuda" and capsys.readouterr().err == ""
-    monkeypatch.setattr(ash.devices, "obstacle", lambda name="cuda": "it is asleep")
+    monkeypatch.setattr(ash.devices, "cuda_error", lambda name="cuda": "it is asleep")
     assert chosen_device("auto") == "cpu" and capsys.readouterr().err == "device: cpu, because it is asleep\n"
     with pytest.raises(InputError, match=re.escape("device cuda:1: it is asleep")):
         chosen_device("cuda:1")
@@ -62,42 +59,13 @@ def test_rows_that_have_a_device_are_moved_and_others_stay() -> None:
     assert there["ash"] != here["ash"] and there["nearest"] == here["nearest"]
 
 
-def test_doctor_says_what_the_gpu_can_do(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(doctor.provenance, "gpu_name", lambda: "a GPU")
-    monkeypatch.setattr(ash.devices, "obstacle", lambda name="cuda": "torch is built without CUDA")
-    finding = doctor._gpu()
-    assert finding.found == "a GPU, but torch is built without CUDA" and "processor" in finding.consequence
-    monkeypatch.setattr(ash.devices, "obstacle", lambda name="cuda": "")
-    properties = SimpleNamespace(total_memory=24 << 30, major=8, minor=9)
-    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: properties)
-    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda: True)
-    assert doctor._gpu().found == "a GPU, 24 GB, compute capability 8.9, with bfloat16"
-    timed = []
-    monkeypatch.setattr(pace, "steps_per_second", lambda preset, device, seconds: timed.append((preset, device)) or 8.0)
-    training = next(finding for finding in doctor.examine(tmp_path) if finding.what == "training on cuda")
-    assert [(preset.name, str(device)) for preset, device in timed] == [("cpu", "cuda"), ("paper", "cuda")]
-    assert "paper at 1285x940 makes 8 steps per second" in training.found
-    assert training.consequence == (
-        "cpu trains for at most 4,000 steps, 0.14 hours; paper trains for at most 2,000,000 steps, 69 hours"
-    )
-    monkeypatch.setattr(doctor.provenance, "gpu_name", gpu_name)
+def test_doctor_says_why_a_gpu_cannot_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
     if gpu_name() is None:
         assert doctor._gpu().found == "none"
-
-
-def test_steps_are_timed_by_the_function_that_a_gpu_is_timed_by(monkeypatch: pytest.MonkeyPatch) -> None:
-    now, advance = [100.0], pace.ash.training.loop._Run.advance
-
-    def counted(run: Any, batches: Any) -> None:
-        assert float(batches[0].foreground.mean()) > 0.1, "somebody is seen"
-        advance(run, batches)
-        now[0] += 5.0 if run.step <= pace.FIRST_STEPS else 0.25  # The first steps compile.
-
-    monkeypatch.setattr(pace, "time", SimpleNamespace(perf_counter=lambda: now[0]))
-    monkeypatch.setattr(pace.ash.training.loop._Run, "advance", counted)
-    small = pace.PacedPreset(name="ci", width=64, height=48)
-    assert pace.steps_per_second(small, torch.device("cpu"), seconds=1.0) == pytest.approx(4.0)
-    assert now[0] == pytest.approx(100 + 3 * 5 + 4 * 0.25)
+    monkeypatch.setattr(doctor.provenance, "gpu_name", lambda: "a GPU")
+    monkeypatch.setattr(ash.devices, "cuda_error", lambda name="cuda": "torch is built without CUDA")
+    finding = doctor._gpu()
+    assert finding.found == "a GPU, but torch is built without CUDA" and "processor" in finding.consequence
 
 
 def learned_on_cuda(method: str) -> CellConfig:
@@ -139,7 +107,7 @@ def test_a_cell_that_learned_on_a_gpu_is_scored_here_where_the_cpu_is_named(
     result = read_result(folder)
     write_config(replace(learned, config=config, folder=folder))
     write_result(folder, replace(result, config=config, drawn_on="cuda"))
-    assert f"device cuda: {obstacle()}" in refused_last(capsys, "eval", str(folder))
+    assert f"device cuda: {cuda_error()}" in refused_last(capsys, "eval", str(folder))
     assert read_result(folder).drawn_on == "cuda"
     assert cli.main(["eval", str(folder), "--device", "cpu"]) == cli.DONE
     again = read_result(folder)
@@ -149,23 +117,13 @@ def test_a_cell_that_learned_on_a_gpu_is_scored_here_where_the_cpu_is_named(
 
 @without_cuda
 def test_every_avatar_that_is_played_goes_to_the_device(tube_run: Path) -> None:
-    with open_cast(tube_run, device="cuda") as cast:
-        assert len(cast.titles) == 2
-        for title in cast.titles:
+    with open_avatars(tube_run, device="cuda") as avatars:
+        assert len(avatars.titles) == 2
+        for title in avatars.titles:
             with pytest.raises(InputError, match=r"^device cuda: "):
-                cast.actor(title)
+                avatars[title]
 
 
 def test_a_report_says_which_milliseconds_are_those_of_a_gpu() -> None:
     results = [replace(cell(method, 30.0), drawn_on=device) for method, device in (("ash", "cuda"), ("ddc", "cpu"))]
     assert doubts(results) == ("ASH: drawn on cuda, so that milliseconds are not those of one core.",)
-
-
-def test_a_timed_call_is_over_when_the_device_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
-    events = []
-    monkeypatch.setattr(rows, "finish", lambda device: events.append(device.type))
-    candidate = rows.TimedCandidate(name="it", threads=1, call=lambda: events.append("call"))
-    times = rows.time_interleaved([candidate], rounds=2, device=torch.device("cuda"))
-    assert events == ["cuda", "call", "cuda", "call", "cuda"]
-    (row,) = rows.rows_of("splat", "S", "forward", times, torch.device("cuda"))
-    assert row.device == "cuda"

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.browser import Visitor
+from helpers.scoring import psnr
 from PIL import Image
 
 from ash.capture.dataset import Pose
-from ash.inference import psnr
 from ash.protocol import StageClock
 from benchmarks import cli
-from benchmarks.play.actors import open_cast
+from benchmarks.play.avatars import open_avatars
 
 PAPER = (236, 236, 236)
 PATIENCE = 120_000  # milliseconds: software graphics on a busy machine
@@ -48,21 +48,24 @@ def test_a_viewer_shows_the_frame_that_the_avatar_renders(
 ) -> None:
     page, out = tmp_path / "page.html", tmp_path / f"frame.{form}"
     cell = str(tube_cells["ash"])
-    assert cli.main(["share", cell, "--motion", "train", "--frames", "0", "--out", str(page)]) == cli.DONE
-    command = ["export-avatar", cell, "--format", form, "--motion", "train", "--frames", "2", "--out", str(out)]
+    assert (
+        cli.main(["export", cell, "--format", "html", "--motion", "train", "--frames", "0", "--out", str(page)])
+        == cli.DONE
+    )
+    command = ["export", cell, "--format", form, "--motion", "train", "--frames", "2", "--out", str(out)]
     assert cli.main(command) == cli.DONE
     seen = visit(page, size=(200, 200))
     seen.page.wait_for_function("window.avatar", timeout=PATIENCE)
     seen.page.keyboard.press(" ")  # The page's own clip stands still meanwhile.
-    with open_cast(tube_cells["ash"]) as cast:
-        actor, camera = cast.actor(cast.titles[0]), cast.capture.cameras["cam2"]
+    with open_avatars(tube_cells["ash"]) as avatars:
+        loaded, camera = avatars[avatars.titles[0]], avatars.capture.cameras["cam2"]
         matrix = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1, -1, 1])
         fov = float(np.rad2deg(2 * np.arctan2(camera.height / 2, camera.K[1, 1])))
-        place = [matrix.T.ravel().tolist(), fov, camera.width, camera.height, actor.avatar.dilation]
+        place = [matrix.T.ravel().tolist(), fov, camera.width, camera.height, loaded.avatar.dilation]
         encoded = seen.page.evaluate(OPEN, [base64.b64encode(out.read_bytes()).decode(), form, turned, *place])
-        pose = Pose(cast.capture.motion, 2)
-        ours = actor.view(pose, camera, StageClock(), PAPER) / 255
-        alpha = actor.picture(pose, camera, StageClock())[..., 3]
+        pose = Pose(avatars.capture.motion, 2)
+        ours = loaded.on_colour(pose, camera, StageClock(), PAPER) / 255
+        alpha = loaded.premultiplied(pose, camera, StageClock())[..., 3]
     theirs = np.asarray(Image.open(io.BytesIO(base64.b64decode(encoded.partition(",")[2]))).convert("RGB")) / 255
     assert (alpha > 0.5).mean() > 0.05
     assert psnr(theirs, ours, alpha) > 30, psnr(theirs, ours, alpha)

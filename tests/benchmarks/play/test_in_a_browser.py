@@ -11,20 +11,21 @@ import numpy as np
 import pytest
 import torch
 from helpers.browser import PHONE, Visitor
+from helpers.scoring import psnr
 from helpers.viewers import PATIENCE, state_of
 from helpers.waiting import wait_for
 from PIL import Image
 
 from ash.capture.dataset import Pose
-from ash.inference import psnr
 from ash.protocol import StageClock
 from benchmarks import cli
-from benchmarks.play.actors import on_colour
+from benchmarks.play.avatars import composite
+from benchmarks.play.camera_control import NEAREST_FRUSTUM_M
 from benchmarks.play.cameras import START, middle_of, resized
 from benchmarks.play.joints import ranges_of
-from benchmarks.play.picture import LIGHT, _fit
 from benchmarks.play.player import PlayServer, playing
-from benchmarks.play.standpoint import BLOCKS_M
+from benchmarks.play.rendering import LIGHT, fitted
+from benchmarks.play.truth import TruthPicture
 
 WINDOW = (900, 420)  # CSS pixels; the panel covers the right third
 
@@ -84,7 +85,7 @@ def tab(player: PlayServer, visit: Visitor) -> Iterator[Any]:
 
 
 def test_it_shows_turns_scrubs_and_switches(player: PlayServer, tab: Any) -> None:
-    first, eye = seen(tab), state_of(player).eye.viewmat
+    first, view = seen(tab), state_of(player).viewpoint.viewmat
     step = state_of(player).step
     tab.keyboard.press("ArrowRight")
     wait_for(lambda: state_of(player).step == (step + 1) % 2)
@@ -93,16 +94,16 @@ def test_it_shows_turns_scrubs_and_switches(player: PlayServer, tab: Any) -> Non
     tab.keyboard.press("e")
     tab.keyboard.press("e")
     wait_for(lambda: state_of(player).error == "no")
-    np.testing.assert_array_equal(state_of(player).eye.viewmat, eye, "keys are commands and move no camera")
+    np.testing.assert_array_equal(state_of(player).viewpoint.viewmat, view, "keys are commands and move no camera")
     scrubbed = seen(tab, unlike=first)
     tab.mouse.move(200, 200)
     tab.mouse.down()
     tab.mouse.move(230, 210, steps=5)
     tab.mouse.up()
     turned = seen(tab, unlike=scrubbed)
-    assert np.abs(state_of(player).eye.viewmat - eye).max() > 0.05
+    assert np.abs(state_of(player).viewpoint.viewmat - view).max() > 0.05
     tab.keyboard.press("m")
-    tab.get_by_text(f"{player.cast.titles[1]} · Held-out").first.wait_for(timeout=1000 * PATIENCE)
+    tab.get_by_text(f"{player.avatars.titles[1]} · Held-out").first.wait_for(timeout=1000 * PATIENCE)
     seen(tab, unlike=turned)
 
 
@@ -112,7 +113,7 @@ def test_the_divider_is_dragged(player: PlayServer, tab: Any) -> None:
     tab.keyboard.press("t")
     handle.wait_for(state="visible", timeout=1000 * PATIENCE)
     box = handle.bounding_box()
-    eye = state_of(player).eye.viewmat
+    view = state_of(player).viewpoint.viewmat
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     assert abs(x - 450) < 3
     tab.mouse.move(x, y)
@@ -120,7 +121,7 @@ def test_the_divider_is_dragged(player: PlayServer, tab: Any) -> None:
     tab.mouse.move(225, y, steps=4)
     tab.mouse.up()
     wait_for(lambda: abs(state_of(player).divider - 0.25) < 0.01)
-    np.testing.assert_array_equal(state_of(player).eye.viewmat, eye, "the person stays as it was")
+    np.testing.assert_array_equal(state_of(player).viewpoint.viewmat, view, "the person stays as it was")
     tab.keyboard.press("t")
     wait_for(lambda: state_of(player).right == "nothing")
     handle.wait_for(state="hidden", timeout=1000 * PATIENCE)
@@ -143,10 +144,10 @@ def test_on_a_phone_the_person_comes_first_and_nothing_is_wider_than_the_screen(
     words.wait_for(state="attached", timeout=1000 * PATIENCE)
     words.wait_for(state="hidden", timeout=1000 * PATIENCE)
     wait_for(lambda: state_of(player).dark)
-    eye, middle = state_of(player).eye, middle_of(player.cast.capture)
-    seen_at, _ = eye.camera(width=PHONE[0], height=PHONE[1]).project(middle)
+    view, middle = state_of(player).viewpoint, middle_of(player.avatars.capture)
+    seen_at, _ = view.camera(width=PHONE[0], height=PHONE[1]).project(middle)
     np.testing.assert_allclose(seen_at, np.array(PHONE) / 2, atol=2, err_msg="it looks at the person's middle")
-    ahead = (eye.position - middle) / np.linalg.norm(eye.position - middle)
+    ahead = (view.position - middle) / np.linalg.norm(view.position - middle)
     assert ahead @ np.array(START) > 0.99, "from the front"
     bar = visited.page.get_by_text("ash-bench play", exact=True).locator("visible=true")
     bar.tap()
@@ -155,43 +156,48 @@ def test_on_a_phone_the_person_comes_first_and_nothing_is_wider_than_the_screen(
 
 
 def test_a_click_on_a_camera_lands_in_its_view(player: PlayServer, tab: Any) -> None:
-    own = player.cast.capture.cameras
+    own = player.avatars.capture.cameras
     tab.get_by_text("Show cameras").click()
-    eye = state_of(player).eye
-    assert eye is not None and (eye.width, eye.height) == WINDOW
-    mine = eye.camera(width=eye.width, height=eye.height)
+    view = state_of(player).viewpoint
+    assert view is not None and (view.width, view.height) == WINDOW
+    mine = view.camera(width=view.width, height=view.height)
     aims = {}
     for name, camera in own.items():  # At the middle of each frustum that stands free.
         (x, y), depth = mine.project(camera.position + 0.15 * camera.viewmat[2, :3])
-        if depth > 0 and 20 < x < 540 and 20 < y < 400 and np.linalg.norm(camera.position - eye.position) > BLOCKS_M:
+        if (
+            depth > 0
+            and 20 < x < 540
+            and 20 < y < 400
+            and np.linalg.norm(camera.position - view.position) > NEAREST_FRUSTUM_M
+        ):
             aims[name] = (float(x), float(y))
     assert aims, "one can be seen"
     name, (x, y) = next(iter(aims.items()))
     time.sleep(1.0)  # As a hand needs: the frustums are there.
-    (page,) = player._pages.values()
-    distances = {other: np.linalg.norm(own[other].position - eye.position) for other in own}
-    shown = {other: handle.visible for other, handle in page.standpoint._frustums.items()}
-    assert shown == {other: distance > BLOCKS_M for other, distance in distances.items()}
+    (page,) = player.pages.values()
+    distances = {other: np.linalg.norm(own[other].position - view.position) for other in own}
+    shown = {other: handle.visible for other, handle in page.cameras.frustums.items()}
+    assert shown == {other: distance > NEAREST_FRUSTUM_M for other, distance in distances.items()}
     before = shot(tab)[:, :500]
     tab.mouse.move(x, y)
     tab.mouse.click(x, y)
     wait_for(lambda: state_of(player).camera == name, PATIENCE)
     chosen = "(name) => [...document.querySelectorAll('input')].some((box) => box.value === name)"
     tab.wait_for_function(chosen, arg=name, timeout=1000 * PATIENCE)
-    wait_for(lambda: np.abs(state_of(player).eye.viewmat - own[name].viewmat).max() < 1e-3, PATIENCE)
+    wait_for(lambda: np.abs(state_of(player).viewpoint.viewmat - own[name].viewmat).max() < 1e-3, PATIENCE)
     seen(tab, unlike=before)
     tab.get_by_text("Show cameras").click()
-    act, state = player.acts[1], state_of(player)
+    clip, state = player.clips[1], state_of(player)
     with torch.no_grad():
         through = resized(own[name], width=WINDOW[0], height=WINDOW[1])
-        pose = Pose(act.motion, act.frames[state.step])
-        wanted = player.cast.actor(state.left).avatar.render(pose, through, clock=StageClock())
-    wait_for(lambda: agreement(shot(tab)[:, :560], on_colour(wanted, LIGHT)[:, :560]) > 25, PATIENCE)
+        pose = Pose(clip.motion, clip.frames[state.step])
+        wanted = player.avatars[state.left].avatar.render(pose, through, clock=StageClock())
+    wait_for(lambda: agreement(shot(tab)[:, :560], composite(wanted, LIGHT)[:, :560]) > 25, PATIENCE)
 
 
 def test_truth_is_rendered_where_nobody_ever_looked(person: PlayServer, visit: Visitor) -> None:
     """An arm is raised and a frame chosen with the page's own controls; the button renders, and the score appears."""
-    arm = person.cast.capture.skeleton.names.index("upper_arm_left")
+    arm = person.avatars.capture.skeleton.names.index("upper_arm_left")
     with standing(person, visit) as tab:
         step = state_of(person).step
         frame = slider_named(tab, "Frame")
@@ -207,11 +213,11 @@ def test_truth_is_rendered_where_nobody_ever_looked(person: PlayServer, visit: V
         number.blur()
         limits = ranges_of("upper_arm_left")[1]
         assert limits is not None
-        wait_for(lambda: dict(state_of(person).held).get(arm, (0, 0, 0))[1] == limits.high, PATIENCE)
+        wait_for(lambda: dict(state_of(person).turned).get(arm, (0, 0, 0))[1] == limits.high, PATIENCE)
         number.fill("120")
         number.blur()
-        wait_for(lambda: dict(state_of(person).held)[arm][1] == 120, PATIENCE)
-        assert person.shelf.find(person.acts[1], state_of(person)) is None
+        wait_for(lambda: dict(state_of(person).turned)[arm][1] == 120, PATIENCE)
+        assert known_truth(person) is None
         tab.get_by_role("tab", name="Compare").click()
         tab.get_by_role("button", name="Render truth here").click()
         tab.get_by_role("progressbar").wait_for(timeout=1000 * PATIENCE)
@@ -221,12 +227,19 @@ def test_truth_is_rendered_where_nobody_ever_looked(person: PlayServer, visit: V
         tab.get_by_text("Against the truth").first.wait_for(timeout=1000 * PATIENCE)
         assert "dB, FLIP" in tab.get_by_text("Against the truth").first.inner_text()
         state = state_of(person)
-        truth = person.shelf.find(person.acts[1], state)
+        truth = known_truth(person)
         assert truth is not None and (truth.on_black[..., 3] > 128).mean() > 0.02
-        wanted = _fit(truth, state.eye.camera(width=WINDOW[0], height=WINDOW[1]), state)
+        wanted = fitted(truth, state.viewpoint.camera(width=WINDOW[0], height=WINDOW[1]), state.background)
         half = slice(470, 575)  # Right of the divider, left of the panel: the raised arm is there.
         assert np.ptp(wanted[:, half].reshape(-1, 3), axis=0).max() > 60
         wait_for(lambda: agreement(shot(tab)[:, half], wanted[:, half]) > 25, PATIENCE)
+
+
+def known_truth(player: PlayServer) -> TruthPicture | None:
+    """The truth of what the only viewer looks at."""
+    state = state_of(player)
+    camera = player.renderer.camera(state, width=100, height=100)
+    return player.truths.find(player.renderer.pose_key(state), player.clips[state.clip], camera)
 
 
 def slider_named(tab: Any, label: str) -> Any:
@@ -267,24 +280,24 @@ def test_fingers_turn_the_view_come_closer_and_move_the_divider(player: PlayServ
     tab.keyboard.press(" ")
     wait_for(lambda: not state_of(player).playing)
     time.sleep(0.5)
-    first, eye = seen(tab), state_of(player).eye
+    first, view = seen(tab), state_of(player).viewpoint
     target = np.array([0.0, 0.5, 0.0])  # the tube's middle
     fingers.drag(((100, 300), (220, 300)))
     seen(tab, unlike=first)
-    turned = state_of(player).eye
-    reach, now = (np.linalg.norm(each.position - target) for each in (eye, turned))
-    assert np.linalg.norm(turned.position - eye.position) > 0.2 and abs(now / reach - 1) < 0.05, "around the person"
+    turned = state_of(player).viewpoint
+    reach, now = (np.linalg.norm(each.position - target) for each in (view, turned))
+    assert np.linalg.norm(turned.position - view.position) > 0.2 and abs(now / reach - 1) < 0.05, "around the person"
     fingers.drag(((170, 300), (110, 300)), ((220, 300), (280, 300)))
-    wait_for(lambda: np.linalg.norm(state_of(player).eye.position - target) < 0.97 * reach, PATIENCE)
+    wait_for(lambda: np.linalg.norm(state_of(player).viewpoint.position - target) < 0.97 * reach, PATIENCE)
     tab.keyboard.press("t")
     handle = tab.locator("#split")
     handle.wait_for(state="visible", timeout=1000 * PATIENCE)
     time.sleep(0.5)
-    box, eye = handle.bounding_box(), state_of(player).eye
+    box, view = handle.bounding_box(), state_of(player).viewpoint
     y = box["y"] + box["height"] / 2
     fingers.drag(((PHONE[0] / 2, y), (0.25 * PHONE[0], y)))
     wait_for(lambda: abs(state_of(player).divider - 0.25) < 0.01, PATIENCE)
-    np.testing.assert_array_equal(state_of(player).eye.viewmat, eye.viewmat, "the person stays as it was")
+    np.testing.assert_array_equal(state_of(player).viewpoint.viewmat, view.viewmat, "the person stays as it was")
     box = handle.bounding_box()
     assert abs(box["x"] + box["width"] / 2 - 0.25 * PHONE[0]) < 3
     assert visited.errors == []

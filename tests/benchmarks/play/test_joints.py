@@ -8,7 +8,7 @@ import pytest
 from helpers.figures import tube_skeleton
 
 from ash.capture.dataset import Motion, Skeleton
-from benchmarks.play.joints import RANGES, UNKNOWN, angles_of, held, ranges_of
+from benchmarks.play.joints import FREE_DEG, RANGES, angles_of, ranges_of, with_angles
 from synth.motion.clips import make_motion
 from synth.motion.generators import GENERATORS
 from synth.person import mannequin
@@ -43,7 +43,7 @@ def rest(skeleton: Skeleton) -> Motion:
 def neutral(skeleton: Skeleton) -> Motion:
     """Arms hanging, all joints at zero."""
     zeros = {joint: (0.0, 0.0, 0.0) for joint, name in enumerate(skeleton.names) if name != "pelvis"}
-    return held(rest(skeleton), skeleton, zeros)
+    return with_angles(rest(skeleton), skeleton, zeros)
 
 
 def bone(skeleton: Skeleton, motion: Motion, start: str, end: str) -> np.ndarray:
@@ -73,12 +73,14 @@ def test_at_zero_people_stand_with_hanging_arms_and_angles_go_where_their_names_
     ):
         joint = skeleton.names.index(f"{turned}_{side}")
         ends = [f"{name}_{side}" for name in of]
-        np.testing.assert_allclose(bone(skeleton, held(start, skeleton, {joint: degrees}), *ends), wanted, atol=1e-9)
+        np.testing.assert_allclose(
+            bone(skeleton, with_angles(start, skeleton, {joint: degrees}), *ends), wanted, atol=1e-9
+        )
     elbow, shoulder = (skeleton.names.index(f"{name}_{side}") for name in ("forearm", "upper_arm"))
-    turned_in = held(start, skeleton, {elbow: (90.0, 0.0, 0.0), shoulder: (0.0, 0.0, 90.0)})
+    turned_in = with_angles(start, skeleton, {elbow: (90.0, 0.0, 0.0), shoulder: (0.0, 0.0, 90.0)})
     np.testing.assert_allclose(bone(skeleton, turned_in, f"forearm_{side}", f"hand_{side}"), -outwards, atol=1e-9)
     ankle = skeleton.names.index(f"foot_{side}")
-    up = held(start, skeleton, {ankle: (20.0, 0.0, 0.0)})
+    up = with_angles(start, skeleton, {ankle: (20.0, 0.0, 0.0)})
     assert (
         bone(skeleton, up, f"foot_{side}", f"toe_{side}")[1] > bone(skeleton, start, f"foot_{side}", f"toe_{side}")[1]
     )
@@ -87,9 +89,11 @@ def test_at_zero_people_stand_with_hanging_arms_and_angles_go_where_their_names_
 def test_the_trunk_bends_forward_to_the_left_and_turns_left(skeleton: Skeleton) -> None:
     start = neutral(skeleton)
     spine = skeleton.names.index("spine")
-    assert bone(skeleton, held(start, skeleton, {spine: (40.0, 0.0, 0.0)}), "spine", "head")[2] > 0.6
-    assert bone(skeleton, held(start, skeleton, {spine: (0.0, 17.5, 0.0)}), "spine", "head")[0] > 0.29
-    shoulders = bone(skeleton, held(start, skeleton, {spine: (0.0, 0.0, 22.5)}), "upper_arm_right", "upper_arm_left")
+    assert bone(skeleton, with_angles(start, skeleton, {spine: (40.0, 0.0, 0.0)}), "spine", "head")[2] > 0.6
+    assert bone(skeleton, with_angles(start, skeleton, {spine: (0.0, 17.5, 0.0)}), "spine", "head")[0] > 0.29
+    shoulders = bone(
+        skeleton, with_angles(start, skeleton, {spine: (0.0, 0.0, 22.5)}), "upper_arm_right", "upper_arm_left"
+    )
     np.testing.assert_allclose(shoulders, [np.cos(np.pi / 8), 0, -np.sin(np.pi / 8)], atol=1e-9)
 
 
@@ -97,7 +101,7 @@ def test_angles_that_are_held_are_read_back(skeleton: Skeleton) -> None:
     draw = np.random.default_rng(0)
     for joint in range(len(skeleton.names)):
         wanted = tuple(draw.uniform([-170, -80, -170], [170, 80, 170]).tolist())
-        motion = held(rest(skeleton), skeleton, {joint: wanted})
+        motion = with_angles(rest(skeleton), skeleton, {joint: wanted})
         at = slice(3 + 3 * joint, 6 + 3 * joint)
         np.testing.assert_allclose(angles_of(skeleton, joint, motion.dofs[0, at]), wanted, atol=1e-6)
         others = np.delete(motion.dofs, np.arange(at.start, at.stop), axis=1)
@@ -131,7 +135,7 @@ def test_every_joint_of_ours_has_ranges_and_unknown_ones_the_default() -> None:
     names = {name.removesuffix("_left").removesuffix("_right") for name, _ in JOINTS}
     assert names - set(RANGES) == {"pelvis"} and set(RANGES) <= names
     for name in ("pelvis", *tube_skeleton().names, "knee_left"):
-        assert [(each.low, each.high) for each in ranges_of(name) if each] == [(-UNKNOWN, UNKNOWN)] * 3
+        assert [(each.low, each.high) for each in ranges_of(name) if each] == [(-FREE_DEG, FREE_DEG)] * 3
     assert ranges_of("shin_left") == ranges_of("shin_right")
     (knee, *stiff), elbow = ranges_of("shin_left"), ranges_of("forearm_right")
     assert knee and (knee.low, knee.high) == (0, 135) and stiff == [None, None]

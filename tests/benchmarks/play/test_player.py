@@ -15,13 +15,15 @@ from helpers.browser import FLAGS, find_chromium
 from helpers.viewers import PATIENCE, FakeBrowser, browsers, state_of
 from helpers.waiting import wait_for
 
-from benchmarks.play.doors import DoorOptions
+from ash.capture.formats import load_capture
+from benchmarks.play.auth import AuthOptions
+from benchmarks.play.motions import first_clip, motion_clips
 from benchmarks.play.player import PlayServer, playing
 
 
 @pytest.fixture(scope="module")
 def player(tube_run: Path) -> Iterator[PlayServer]:
-    with playing(tube_run, doors=DoorOptions(clients=8)) as player:
+    with playing(tube_run, options=AuthOptions(clients=8)) as player:
         yield player
 
 
@@ -58,7 +60,7 @@ def test_speed_loop_and_spiral_are_chosen(player: PlayServer, viewer: FakeBrowse
     viewer.set("Again and again", False)
     viewer.wait_for(lambda: not state_of(player).playing and state_of(player).step == 1, PATIENCE)
     viewer.set("Camera", "spiral")
-    viewer.wait_for(lambda: state_of(player).angle > 2, PATIENCE)
+    viewer.wait_for(lambda: state_of(player).spiral_step > 2, PATIENCE)
     count = len(viewer.arrivals)
     viewer.wait_for(lambda: len(viewer.arrivals) > count + 3, PATIENCE)
 
@@ -71,14 +73,14 @@ def test_the_latest_camera_wins(player: PlayServer, viewer: FakeBrowser) -> None
         viewer.angle += 0.005
         viewer.look(viewer.angle)
     eye = np.array([2.5 * np.sin(viewer.angle), 1.2, 2.5 * np.cos(viewer.angle)])
-    viewer.wait_for(lambda: np.allclose(state_of(player).eye.position, eye, atol=1e-5), PATIENCE)
+    viewer.wait_for(lambda: np.allclose(state_of(player).viewpoint.position, eye, atol=1e-5), PATIENCE)
     time.sleep(1.0)
     assert count < len(viewer.arrivals) < count + 200, "many were never drawn"
 
 
 def test_methods_truth_errors_and_joints_are_chosen(player: PlayServer, viewer: FakeBrowser) -> None:
     viewer.press("Play or pause")
-    other = player.cast.titles[1]
+    other = player.avatars.titles[1]
     viewer.set("Avatar", other)
     assert other == "DDC"
     viewer.wait_for(lambda: "**DDC**" in viewer.words, PATIENCE)
@@ -86,23 +88,23 @@ def test_methods_truth_errors_and_joints_are_chosen(player: PlayServer, viewer: 
     viewer.press("Truth beside it")
     viewer.wait_for(lambda: "Against the truth" in viewer.words and "dB, FLIP" in viewer.words, PATIENCE)
     viewer.set("Show the error", "FLIP")
-    viewer.set("Joint", player.cast.capture.skeleton.names[1])
+    viewer.set("Joint", player.avatars.capture.skeleton.names[1])
     time.sleep(1.0)  # As a hand needs: the sliders take the joint's angles first.
     viewer.set("About x", 30)
-    viewer.wait_for(lambda: [(joint, angles[0]) for joint, angles in state_of(player).held] == [(1, 30.0)])
+    viewer.wait_for(lambda: [(joint, angles[0]) for joint, angles in state_of(player).turned] == [(1, 30.0)])
     viewer.wait_for(lambda: "No truth of this view yet" in viewer.words, PATIENCE)
 
 
 def test_an_avatar_that_fails_is_told_of_and_the_player_lives_on(
     player: PlayServer, viewer: FakeBrowser, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    actor = player.cast.actor(player.cast.titles[0])
+    loaded = player.avatars[player.avatars.titles[0]]
     with monkeypatch.context() as patch:
 
-        def broken(*_: object) -> None:
+        def broken(*_: object, **__: object) -> None:
             raise RuntimeError("the <b>decoder</b> fell over")
 
-        patch.setattr(actor, "view", broken)
+        patch.setattr(loaded, "on_colour", broken)
         viewer.look(1.0)
         viewer.wait_for(lambda: "could not be drawn" in viewer.words and "decoder" in viewer.words, PATIENCE)
         assert "<b>" not in viewer.words
@@ -145,11 +147,11 @@ def test_browsers_that_are_killed_leave_nothing_behind(player: PlayServer, tmp_p
             command, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         try:
-            wait_for(lambda: any(page.viewer.served for page in list(player._pages.values())), PATIENCE)
+            wait_for(lambda: any(page.viewer.served for page in list(player.pages.values())), PATIENCE)
         finally:
             os.killpg(browser.pid, signal.SIGKILL)
             browser.wait(20)
-        wait_for(lambda: not player.doors.inside and not player._pages and not player.stream._viewers, PATIENCE)
+        wait_for(lambda: not player.auth.connected and not player.pages and not player.drawing.viewers, PATIENCE)
         if number == 0:  # The first brings the server's pool of threads along.
             names, children = thread_names(), psutil.Process().children()
     assert thread_names() == names and psutil.Process().children() == children
@@ -157,6 +159,20 @@ def test_browsers_that_are_killed_leave_nothing_behind(player: PlayServer, tmp_p
 
 def thread_names() -> list[str]:
     return sorted(thread.name for thread in threading.enumerate() if "ThreadPool" not in thread.name)
+
+
+@pytest.mark.parametrize(
+    ("asked", "opens"), [((), "test"), (("train",), "train"), (("walk",), "walk"), (("dance", "test"), "dance")]
+)
+def test_it_opens_on_the_motion_that_was_asked_for(asked: tuple[str, ...], opens: str, small_capture: Path) -> None:
+    clips = motion_clips(load_capture(small_capture), asked)
+    assert len({clip.name for clip in clips}) == len(clips) == 2 + len(set(asked) - {"train", "test"})
+    assert clips[first_clip(clips, asked)].name == opens
+
+
+def test_a_new_viewer_sees_the_motion_that_was_asked_for(tube_run: Path) -> None:
+    with playing(tube_run, motions=("train",)) as player, browsers(player.url, 1, width=64, height=64) as (browser,):
+        browser.wait_for(lambda: "Training motion, frame" in browser.words, PATIENCE)
 
 
 def test_all_threads_end_with_the_player(tube_run: Path) -> None:

@@ -1,4 +1,4 @@
-"""`share`: the page in a real browser, from a file, beside our own picture."""
+"""`export --format html`: the page in a real browser, from a file, beside our own picture."""
 
 import base64
 import io
@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import torch
 from helpers.browser import Visitor
+from helpers.scoring import psnr
 from PIL import Image
 
 from ash.capture.dataset import Pose
-from ash.inference import psnr
 from ash.protocol import StageClock
 from benchmarks import cli
-from benchmarks.play.actors import open_cast
+from benchmarks.play.avatars import open_avatars
 from benchmarks.play.share import COLUMNS
 
 PAPER = (236, 236, 236)
@@ -27,18 +27,21 @@ PATIENCE = 120_000  # milliseconds: software graphics on a busy machine
 @pytest.fixture(scope="module")
 def page(tube_cells: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("shared") / "avatar.html"
-    assert cli.main(["share", str(tube_cells["ash"]), "--motion", "train", "--out", str(out)]) == cli.DONE
+    assert (
+        cli.main(["export", str(tube_cells["ash"]), "--format", "html", "--motion", "train", "--out", str(out)])
+        == cli.DONE
+    )
     return out
 
 
 def test_the_page_draws_in_a_browser_what_we_draw(page: Path, tube_cells: dict[str, Path], visit: Visitor) -> None:
     seen = visit(page, size=(200, 200))
     tab = seen.page
-    with open_cast(tube_cells["ash"]) as cast:
+    with open_avatars(tube_cells["ash"]) as avatars:
         tab.wait_for_function("window.avatar", timeout=PATIENCE)
         tab.keyboard.press(" ")
         assert not tab.evaluate("window.avatar.playing")
-        actor, capture = cast.actor(cast.titles[0]), cast.capture
+        loaded, capture = avatars[avatars.titles[0]], avatars.capture
         for frame, name in ((0, "cam1"), (3, "cam3")):
             camera = capture.cameras[name]
             matrix = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1, -1, 1])
@@ -48,8 +51,8 @@ def test_the_page_draws_in_a_browser_what_we_draw(page: Path, tube_cells: dict[s
             tab.wait_for_function("window.avatar.resting", timeout=PATIENCE)
             encoded = tab.evaluate("window.avatar.picture()").partition(",")[2]
             theirs = np.asarray(Image.open(io.BytesIO(base64.b64decode(encoded))).convert("RGB")) / 255
-            ours = actor.view(Pose(capture.motion, frame), camera, StageClock(), PAPER) / 255
-            alpha = actor.picture(Pose(capture.motion, frame), camera, StageClock())[..., 3]
+            ours = loaded.on_colour(Pose(capture.motion, frame), camera, StageClock(), PAPER) / 255
+            alpha = loaded.premultiplied(Pose(capture.motion, frame), camera, StageClock())[..., 3]
             assert theirs.shape == ours.shape and (alpha > 0.5).mean() > 0.05
             assert psnr(theirs, ours, alpha) > 40 and psnr(theirs, ours, np.ones_like(alpha)) > 40
         tab.keyboard.press("ArrowRight")
@@ -66,10 +69,10 @@ def test_the_page_holds_every_frame_to_its_bytes(page: Path, tube_cells: dict[st
     steps = np.frombuffer(packed, dtype=np.uint8).reshape(clip["frames"], size)
     bytes_of = np.cumsum(steps, axis=0, dtype=np.uint64).astype(np.uint8).reshape(clip["frames"], columns_of_all, -1)
     high, low = np.array(clip["high"])[:, None], np.array(clip["low"])[:, None]
-    with open_cast(tube_cells["ash"]) as cast:
-        actor, capture = cast.actor(cast.titles[0]), cast.capture
+    with open_avatars(tube_cells["ash"]) as avatars:
+        loaded, capture = avatars[avatars.titles[0]], avatars.capture
         for frame, columns in enumerate(bytes_of):
-            wanted = actor.avatar.gaussians(Pose(capture.motion, frame))
+            wanted = loaded.avatar.gaussians(Pose(capture.motion, frame))
             place = low + (high - low) * (256.0 * columns[:3] + columns[3:6]) / 65535
             np.testing.assert_allclose(place.T, wanted.means, atol=1e-4)
             turns = columns[9:13].astype(np.int8).T / 127
@@ -98,6 +101,6 @@ def test_what_cannot_be_shared_is_refused(tube_run: Path, tube_cells, tmp_path: 
         ([str(tube_cells["ash"]), "--motion", "fly", "--out", str(tmp_path / "a.html")], "expected train, test, walk"),
         ([str(tube_cells["ash"]), "--motion", "walk", "--out", str(tmp_path / "a.html")], "a person's skeleton"),
     ):
-        assert cli.main(["share", *arguments]) == cli.WRONG_INPUT
+        assert cli.main(["export", "--format", "html", *arguments]) == cli.WRONG_INPUT
         assert words in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

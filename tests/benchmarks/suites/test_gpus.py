@@ -101,7 +101,7 @@ def test_a_run_takes_as_many_cells_side_by_side_as_there_are_gpus(
     taken: list[RunOptions] = []
     monkeypatch.delenv(VISIBLE, raising=False)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 3)
-    monkeypatch.setattr(ash.devices, "obstacle", lambda name="cuda": "")
+    monkeypatch.setattr(ash.devices, "cuda_error", lambda name="cuda": "")
     monkeypatch.setattr("benchmarks.provenance.cores", lambda: 5)
     monkeypatch.setattr(benchmarks.commands.runs, "run_and_report", lambda suite, options: taken.append(options) or 0)
     assert cli.main(["run", "ci", *flags]) == cli.DONE

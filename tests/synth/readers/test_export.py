@@ -1,7 +1,6 @@
 """Exports are read back by plain parsers written from the formats' description, sharing no code with the writers."""
 
 import json
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -57,51 +56,46 @@ def test_colmap_text_projects_as_ours(capture: Capture, tmp_path: Path):
         np.testing.assert_allclose(pixels, camera.project(points)[0], atol=1e-6)
 
 
-def test_glb_animates_the_skinned_template(capture: Capture, tmp_path: Path):
-    content = (export(capture, tmp_path, form="glb") / "human.glb").read_bytes()
-    magic, version, size = struct.unpack("<4sII", content[:12])
-    assert (magic, version, size) == (b"glTF", 2, len(content))
-    length = struct.unpack("<I", content[12:16])[0]
-    document, binary = json.loads(content[20 : 20 + length]), content[28 + length :]
+def test_plain_files_say_where_a_point_of_the_template_is_seen(capture: Capture, tmp_path: Path):
+    """Read by JSON, NumPy and PNG: a rigidly bound vertex projects into the silhouette of its image."""
+    export(capture, tmp_path, form="plain")
+    views = json.loads((tmp_path / "views.json").read_text())["views"]
+    assert {(view["camera"], view["frame"]) for view in views} == set(capture.splits["train"].views)
+    cameras = {row["name"]: row for row in json.loads((tmp_path / "cameras.json").read_text())["cameras"]}
+    poses, template = np.load(tmp_path / "poses.npz"), np.load(tmp_path / "template.npz")
+    np.testing.assert_array_equal(poses["dofs"], capture.motion.dofs[poses["frame"]])
+    rigid = template["skin_weights"].max(axis=1) > 0.999
+    assert rigid.sum() > 20
+    points = np.concatenate([template["vertices"], np.ones((len(rigid), 1))], axis=1)[rigid]
+    joint = template["skin_weights"][rigid].argmax(axis=1)
+    for view in views:
+        camera, row = cameras[view["camera"]], int(np.flatnonzero(poses["frame"] == view["frame"])[0])
+        world = np.einsum("vab,vb->va", poses["skinning"][row][joint], points)
+        seen = world @ np.array(camera["viewmat"]).T
+        pixels = (seen[:, :3] @ np.array(camera["K"]).T)[:, :2] / seen[:, 2:3]
+        with Image.open(tmp_path / view["image"]) as image:
+            rgba = np.array(image)
+        np.testing.assert_array_equal(rgba, capture.image(view["camera"], view["frame"]))
+        column, line = pixels.astype(int).T
+        assert (rgba[line, column, 3] > 0).mean() > 0.9
 
-    def read(index: int) -> np.ndarray:
-        accessor = document["accessors"][index]
-        view = document["bufferViews"][accessor["bufferView"]]
-        kind = {5126: np.float32, 5125: np.uint32, 5123: np.uint16}[accessor["componentType"]]
-        flat = np.frombuffer(binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]], dtype=kind)
-        return flat.reshape(accessor["count"], -1).astype(np.float64)
 
-    attributes = document["meshes"][0]["primitives"][0]["attributes"]
-    positions, joints, weights = (read(attributes[name]) for name in ("POSITION", "JOINTS_0", "WEIGHTS_0"))
-    frame = 2
-    local = [np.eye(4) for _ in capture.skeleton.names]
-    for j, node in enumerate(document["nodes"][: len(local)]):
-        local[j][:3, 3] = node["translation"]
-    animation = document["animations"][0]
-    for channel in animation["channels"]:
-        value = read(animation["samplers"][channel["sampler"]]["output"])[frame]
-        j = channel["target"]["node"]
-        if channel["target"]["path"] == "translation":
-            local[j][:3, 3] = value
-        else:
-            x, y, z, w = value
-            skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-            local[j][:3, :3] = np.eye(3) + 2 * w * skew + 2 * skew @ skew
-    world: list[np.ndarray] = []
-    for j, parent in enumerate(capture.skeleton.parents):
-        world.append(local[j] if parent < 0 else world[parent] @ local[j])
-    bind = read(document["skins"][0]["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)
-    dense = np.zeros((len(positions), len(world)))
-    np.add.at(dense, (np.arange(len(positions))[:, None], joints.astype(int)), weights)
-    posed = linear_blend_skinning(positions, dense, np.array(world) @ bind)
-    expected = linear_blend_skinning(
-        positions, dense, skinning_transforms(capture.skeleton, capture.motion.dofs)[frame]
-    )
-    np.testing.assert_allclose(posed, expected, atol=1e-5)
+def test_test_views_hold_poses_and_cameras_and_no_image(capture: Capture, tmp_path: Path):
+    chosen = [(split, capture.splits[split]) for split in ("novel_view", "novel_pose")]
+    views = [(name, split.cameras[0], split.frames[0]) for name, split in chosen]
+    export(capture, tmp_path, form="test-views", views=views)
+    rows = json.loads((tmp_path / "views.json").read_text())["views"]
+    assert [(row["split"], row["camera"], row["frame"]) for row in rows] == views
+    assert rows[0]["image"] == f"images/novel_view/{views[0][1]}/{views[0][2]:06d}.png"
+    assert {row["name"] for row in json.loads((tmp_path / "cameras.json").read_text())["cameras"]} == {
+        camera for _, camera, _ in views
+    }
+    np.testing.assert_array_equal(np.load(tmp_path / "poses.npz")["dofs"], capture.motion.dofs)
+    assert not list(tmp_path.rglob("*.png"))
 
 
 def test_unknown_formats_are_refused(capture: Capture, tmp_path: Path):
-    with pytest.raises(InputError, match="ash, nerfstudio, colmap, glb"):
+    with pytest.raises(InputError, match="ash, nerfstudio, colmap, plain, test-views"):
         export(capture, tmp_path, form="fbx")
 
 
@@ -124,8 +118,8 @@ def test_frames_and_splits_can_be_chosen(capture: Capture, tmp_path: Path):
     [
         ("colmap", {"split": "test"}, "novel_pose, novel_view, train"),
         ("colmap", {"frame": 999}, r"frame 999.*expected one of"),
-        ("glb", {"frame": 0}, "glb holds the whole motion"),
-        ("ash", {"split": "novel_pose"}, "ash holds"),
+        ("plain", {"frame": 0}, "chosen with nerfstudio or colmap"),
+        ("ash", {"split": "novel_pose"}, "chosen with nerfstudio or colmap"),
     ],
 )
 def test_a_wrong_choice_is_refused(capture: Capture, tmp_path: Path, form: str, choice: dict, message: str):

@@ -1,9 +1,9 @@
 """A viser server that only the person who started it can use.
 
-viser by itself listens on every address, asks for no token, looks at neither Host nor Origin, opens a public tunnel for
-any client that asks, and takes files. Here it listens on the loopback address; every request needs a random token and
-an exact Host, every WebSocket an exact Origin too; four kinds of messages are heard, all others are dropped unread;
-messages are small, and clients few. The hooks are viser's private ones: its version is pinned, and each door is tested.
+viser by itself listens on every address, asks for no token, checks neither Host nor Origin, opens a public tunnel for
+any client that asks, and accepts uploads. Here it listens on the loopback address; every request needs a random token
+and an exact Host, every WebSocket an exact Origin too; four kinds of messages are handled, all others are dropped;
+messages are small, and clients few. The hooks are viser's private ones: its version is pinned, and each is tested.
 """
 
 import contextlib
@@ -29,14 +29,14 @@ from websockets.http11 import Request, Response
 from ash.files import InputError
 
 # Camera, sliders and buttons, hot keys, and a click on a camera's frustum.
-HEARD = (
+ALLOWED_MESSAGES = (
     messages.ViewerCameraMessage,
     messages.GuiUpdateMessage,
     messages.CommandTriggerMessage,
     messages.SceneNodeClickMessage,
 )
-LARGEST_MESSAGE = 64 << 10  # bytes; a click is a few hundred
-EVERYWHERE = ("0.0.0.0", "::")
+MAX_MESSAGE = 64 << 10  # bytes; a click is a few hundred
+ANY_ADDRESS = ("0.0.0.0", "::")
 SAFE_HEADERS = {
     "Cache-Control": "no-store",
     "Content-Security-Policy": (
@@ -48,8 +48,8 @@ SAFE_HEADERS = {
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class DoorOptions:
-    """Who may come in."""
+class AuthOptions:
+    """Where the server listens, and who may connect."""
 
     host: str = "127.0.0.1"
     port: int = 0  # 0: a free one
@@ -59,19 +59,24 @@ class DoorOptions:
 
 
 @dataclass(kw_only=True, slots=True)
-class Doors:
-    """What is known once the server listens, and how many are inside."""
+class Auth:
+    """The secrets of a running server, and how many clients are connected."""
 
-    options: DoorOptions
+    options: AuthOptions
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24))
-    # Cookies know no ports, and another player may run on another.
+    # Cookies do not depend on the port, and another player may run on another.
     cookie: str = field(default_factory=lambda: f"ash_bench_{secrets.token_hex(4)}")
     origins: frozenset[str] = frozenset()
-    inside: int = 0
+    connected: int = 0
+
+    @property
+    def is_full(self) -> bool:
+        """No further client may connect."""
+        return self.connected >= self.options.clients
 
 
-def require_safe(options: DoorOptions) -> None:
-    """Refuse to listen to other machines unless that was asked for, and origins that are none.
+def require_safe(options: AuthOptions) -> None:
+    """Refuse to listen to other machines unless that was asked for, and malformed origins.
 
     Raises:
         InputError: says what `--expose` would mean.
@@ -88,16 +93,13 @@ def require_safe(options: DoorOptions) -> None:
 
 
 def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
+    with contextlib.suppress(ValueError):
         return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+    return host == "localhost"
 
 
-def open_server(options: DoorOptions, *, label: str) -> tuple[viser.ViserServer, str, Doors]:
-    """Start the server behind its doors; also the one address that opens them.
+def open_server(options: AuthOptions, *, label: str) -> tuple[viser.ViserServer, str, Auth]:
+    """Start a protected server; also the one address that opens it.
 
     Raises:
         InputError: the address is not safe or cannot be listened to.
@@ -105,14 +107,18 @@ def open_server(options: DoorOptions, *, label: str) -> tuple[viser.ViserServer,
     require_safe(options)
     if options.port and not _is_free(options.host, options.port):
         raise InputError(f"port: {options.port} on {options.host} is taken; expected a free one (0: any)")
-    doors = Doors(options=options)
-    with _behind(doors), _silent():
+    auth = Auth(options=options)
+    with _protected(auth), _silent():
         server = viser.ViserServer(host=options.host, port=options.port, label=label, verbose=False)
     port = server.get_port()
-    doors.origins = frozenset({*_origins(options, port), *options.allow_origins})
-    _hear_only(server)
-    shown = "127.0.0.1" if options.host in EVERYWHERE else options.host
-    return server, f"http://{_bracketed(shown)}:{port}/?token={doors.token}", doors
+    auth.origins = frozenset({*_own_origins(options.host, port), *options.allow_origins})
+    inner = server._websock_server
+    for kind in [kind for kind in inner._incoming_handlers if kind not in ALLOWED_MESSAGES]:
+        inner.unregister_handler(kind)
+    _drop_other_messages(inner)
+    inner.on_client_connect(_drop_other_messages)
+    shown = "127.0.0.1" if options.host in ANY_ADDRESS else options.host
+    return server, f"http://{_bracketed(shown)}:{port}/?token={auth.token}", auth
 
 
 def close_server(server: viser.ViserServer) -> None:
@@ -121,12 +127,12 @@ def close_server(server: viser.ViserServer) -> None:
         server.stop()
 
 
-def _origins(options: DoorOptions, port: int) -> set[str]:
+def _own_origins(host: str, port: int) -> set[str]:
     """What a browser calls this server."""
-    names = {options.host}
-    if _is_loopback(options.host) or options.host in EVERYWHERE:
+    names = {host}
+    if _is_loopback(host) or host in ANY_ADDRESS:
         names |= {"127.0.0.1", "localhost", "::1"}
-    if options.host in EVERYWHERE:
+    if host in ANY_ADDRESS:
         addresses = [address for each in psutil.net_if_addrs().values() for address in each]
         names |= {a.address.partition("%")[0] for a in addresses if a.family in (socket.AF_INET, socket.AF_INET6)}
         names |= {socket.gethostname()}
@@ -138,8 +144,7 @@ def _bracketed(host: str) -> str:
 
 
 def _is_free(host: str, port: int) -> bool:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as trial:
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM) as trial:
         trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             trial.bind((host, port))
@@ -150,21 +155,31 @@ def _is_free(host: str, port: int) -> bool:
 
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
-    """viser announces its addresses, which lack the token."""
+    """viser prints its addresses, which lack the token."""
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):  # noqa: PTH123
         yield
 
 
 @contextlib.contextmanager
-def _behind(doors: Doors) -> Iterator[None]:
-    """While the body starts a server, the doors are put before it."""
+def _protected(auth: Auth) -> Iterator[None]:
+    """A server that starts while the body runs checks its requests, limits its clients and their messages."""
     serve = websockets.asyncio.server.serve
 
     def guarded(handler: Callable[[Any], Awaitable[None]], *args: Any, **options: Any) -> Any:
+        async def limited(connection: Any) -> None:
+            if auth.is_full:
+                await connection.close(1013, f"at most {auth.options.clients} viewers")
+                return
+            auth.connected += 1
+            try:
+                await handler(connection)
+            finally:
+                auth.connected -= 1
+
         page = options.pop("process_request")
-        options["max_size"] = LARGEST_MESSAGE
-        options["process_request"] = lambda connection, request: answer(doors, connection, request, page)
-        return serve(_limited(doors, handler), *args, **options)
+        options["max_size"] = MAX_MESSAGE
+        options["process_request"] = lambda connection, request: respond(auth, connection, request, page)
+        return serve(limited, *args, **options)
 
     websockets.asyncio.server.serve = guarded  # type: ignore[assignment,misc]
     try:
@@ -173,36 +188,20 @@ def _behind(doors: Doors) -> Iterator[None]:
         websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
-def _limited(doors: Doors, handler: Callable[[Any], Awaitable[None]]) -> Callable[[Any], Awaitable[None]]:
-    async def enter(connection: Any) -> None:
-        if doors.inside >= doors.options.clients:
-            await connection.close(1013, f"{doors.options.clients} viewers are here already")
-            return
-        doors.inside += 1
-        try:
-            await handler(connection)
-        finally:
-            doors.inside -= 1
-
-    return enter
-
-
-def answer(doors: Doors, connection: Any, request: Request, page: Callable[[Any, Request], Any]) -> Response | None:
-    """What a request gets: the page, a WebSocket (None), or the reason why neither."""
-    reason = why_refused(doors, request)
+def respond(auth: Auth, connection: Any, request: Request, page: Callable[[Any, Request], Any]) -> Response | None:
+    """The response to a request: the page, None (a WebSocket may open), or the reason for neither."""
+    reason = refusal(auth, request)
     if reason is not None:
         return _plain(http.HTTPStatus.FORBIDDEN, reason)
     if _is_websocket(request):
-        if doors.inside >= doors.options.clients:
-            return _plain(http.HTTPStatus.SERVICE_UNAVAILABLE, "too many viewers")
-        return None
+        return _plain(http.HTTPStatus.SERVICE_UNAVAILABLE, "too many viewers") if auth.is_full else None
     url = urlsplit(request.path)
     if url.path != "/":
         return _plain(http.HTTPStatus.NOT_FOUND, "there is one page: /")
     if url.query:  # The token goes into a cookie and out of the address bar.
         response = _plain(http.HTTPStatus.SEE_OTHER, "")
         response.headers["Location"] = "/"
-        response.headers["Set-Cookie"] = f"{doors.cookie}={doors.token}; HttpOnly; SameSite=Lax; Path=/"
+        response.headers["Set-Cookie"] = f"{auth.cookie}={auth.token}; HttpOnly; SameSite=Lax; Path=/"
         return response
     response = page(connection, request)
     for name, value in SAFE_HEADERS.items():
@@ -210,17 +209,21 @@ def answer(doors: Doors, connection: Any, request: Request, page: Callable[[Any,
     return response
 
 
-def why_refused(doors: Doors, request: Request) -> str | None:
-    """In the order in which it is looked at: Host, Origin, token; None: it may come in."""
+def refusal(auth: Auth, request: Request) -> str | None:
+    """Why a request is refused, None where it is not: Host, Origin and token are checked in this order."""
     headers = request.headers
-    hosts = {urlsplit(origin).netloc for origin in doors.origins}
+    hosts = {urlsplit(origin).netloc for origin in auth.origins}
     if headers.get_all("Host") not in [[host] for host in hosts]:
         return "wrong Host: open the address that ash-bench play printed, or start it with --allow-origin"
     origins = headers.get_all("Origin")
-    if (origins or _is_websocket(request)) and origins not in [[origin] for origin in doors.origins]:
+    if (origins or _is_websocket(request)) and origins not in [[origin] for origin in auth.origins]:
         return "wrong Origin: start ash-bench play with --allow-origin if this address is yours"
-    given = [*parse_qs(urlsplit(request.path).query).get("token", []), *_cookies(headers, doors.cookie)]
-    if not any(secrets.compare_digest(token.encode(), doors.token.encode()) for token in given):
+    given = parse_qs(urlsplit(request.path).query).get("token", [])
+    for line in headers.get_all("Cookie"):
+        with contextlib.suppress(CookieError):
+            jar = SimpleCookie(line)
+            given += [jar[auth.cookie].value] if auth.cookie in jar else []
+    if not any(secrets.compare_digest(token.encode(), auth.token.encode()) for token in given):
         return "wrong token: open the address that ash-bench play printed"
     return None
 
@@ -229,36 +232,18 @@ def _is_websocket(request: Request) -> bool:
     return any(value.strip().lower() == "websocket" for value in request.headers.get_all("Upgrade"))
 
 
-def _cookies(headers: Headers, name: str) -> list[str]:
-    found = []
-    for line in headers.get_all("Cookie"):
-        with contextlib.suppress(CookieError):
-            jar = SimpleCookie(line)
-            found += [jar[name].value] if name in jar else []
-    return found
-
-
 def _plain(status: http.HTTPStatus, text: str) -> Response:
     body = text.encode()
     headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)), **SAFE_HEADERS})
     return Response(status.value, status.phrase, headers, body)
 
 
-def _hear_only(server: viser.ViserServer) -> None:
-    """Drop every message that is not in HEARD, at the server and at each connection, before any handler sees it."""
-    inner = server._websock_server
-    for kind in list(inner._incoming_handlers):
-        if kind not in HEARD:
-            inner.unregister_handler(kind)
-    _filter(inner)
-    inner.on_client_connect(_filter)
+def _drop_other_messages(handler: viser.infra.WebsockMessageHandler) -> None:
+    """Drop every message that is not allowed before any of viser's handlers sees it."""
+    handle = handler._handle_incoming_message
 
+    async def handle_allowed(client: Any, message: Any) -> None:
+        if type(message) in ALLOWED_MESSAGES:
+            await handle(client, message)
 
-def _filter(handler: viser.infra.WebsockMessageHandler) -> None:
-    hear = handler._handle_incoming_message
-
-    async def hear_some(client: Any, message: Any) -> None:
-        if type(message) in HEARD:
-            await hear(client, message)
-
-    handler._handle_incoming_message = hear_some  # type: ignore[method-assign, assignment]
+    handler._handle_incoming_message = handle_allowed  # type: ignore[method-assign, assignment]

@@ -7,26 +7,26 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from helpers.captures import SIZE
+from helpers.scoring import psnr
 from PIL import Image, ImageSequence
 
 from ash.capture.dataset import Capture, Pose
 from ash.capture.formats import load_capture
 from ash.files import InputError
-from ash.inference import psnr
 from ash.protocol import StageClock
 from benchmarks import cli
 from benchmarks.cell import metrics
-from benchmarks.play.actors import open_cast
+from benchmarks.play.avatars import open_avatars
 from benchmarks.play.cameras import resized, spiral_camera
-from benchmarks.play.film import CAPTION, capture_image
-from benchmarks.play.joints import held
-from benchmarks.play.motions import act_named
-from benchmarks.play.truth import TruthStudio, Wanted
+from benchmarks.play.joints import with_angles
+from benchmarks.play.motions import motion_clip
+from benchmarks.play.truth import TruthRenderer, TruthRequest, capture_image
+from benchmarks.play.video import CAPTION
 from benchmarks.report.pictures import on_paper
 
 
 def film(run: Path, out: Path, *more: str) -> int:
-    return cli.main(["video", str(run), "--out", str(out), *more])
+    return cli.main(["export", str(run), "--format", "mp4", "--out", str(out), *more])
 
 
 def panel(frame: np.ndarray, number: int) -> np.ndarray:
@@ -44,19 +44,21 @@ def test_a_film_shows_the_truth_and_each_avatar_side_by_side(tube_run: Path, tmp
             assert image.info["duration"] == 200 and image.info["loop"] == 0
     else:
         decode = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(out), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
-        told = subprocess.run(decode, capture_output=True, check=True)
-        assert ", 5 fps," in told.stderr.decode()
-        frames = list(np.frombuffer(told.stdout, np.uint8).reshape(-1, CAPTION + SIZE, 3 * SIZE, 3))
+        messages = subprocess.run(decode, capture_output=True, check=True)
+        assert ", 5 fps," in messages.stderr.decode()
+        frames = list(np.frombuffer(messages.stdout, np.uint8).reshape(-1, CAPTION + SIZE, 3 * SIZE, 3))
     assert len(frames) == 2 and frames[0].shape == (CAPTION + SIZE, 3 * SIZE, 3)
-    with open_cast(tube_run) as cast:
-        act, camera = act_named(cast.capture, "test"), cast.capture.cameras["cam0"]
-        for shown, frame in zip(frames, act.frames, strict=True):
-            truth = capture_image(cast.capture, act, frame, camera)
+    with open_avatars(tube_run) as avatars:
+        clip, camera = motion_clip(avatars.capture, "test"), avatars.capture.cameras["cam0"]
+        for shown, frame in zip(frames, clip.frames, strict=True):
+            truth = capture_image(avatars.capture, clip, frame, camera)
             assert truth is not None
-            drawn = [cast.actor(title).picture(Pose(act.motion, frame), camera, StageClock()) for title in cast.titles]
+            drawn = [
+                avatars[title].premultiplied(Pose(clip.motion, frame), camera, StageClock()) for title in avatars.titles
+            ]
             for number, picture in enumerate([truth, *map(metrics.quantise, drawn)]):
-                wanted = on_paper(picture) / 255
-                assert psnr(panel(shown, number), wanted, np.ones((SIZE, SIZE))) > 22, "as far as a codec goes"
+                request = on_paper(picture) / 255
+                assert psnr(panel(shown, number), request, np.ones((SIZE, SIZE))) > 22, "as far as a codec goes"
             assert np.ptp(shown[:CAPTION, :SIZE]) > 100, "the name is burnt in"
             assert psnr(panel(shown, 1), panel(shown, 2), np.ones((SIZE, SIZE))) < 40, "methods differ"
 
@@ -68,15 +70,15 @@ def test_a_rig_gives_a_row_per_avatar_and_a_spiral_turns(tube_run: Path, tmp_pat
     with Image.open(rig) as image:
         assert image.size == (SIZE, CAPTION + SIZE), "the one held-out camera"
     assert film(tube_run, spiral, *more, "--frames", "0:3") == cli.DONE
-    with open_cast(tube_run) as cast, Image.open(spiral) as image:
+    with open_avatars(tube_run) as avatars, Image.open(spiral) as image:
         assert image.n_frames == 3
-        places = [spiral_camera(cast.capture, float(step), width=8, height=8).position for step in range(3)]
+        places = [spiral_camera(avatars.capture, float(step), width=8, height=8).position for step in range(3)]
     assert np.linalg.norm(places[1] - places[0]) > 0.01 and np.linalg.norm(places[2] - places[0]) > 0.02
 
 
 def test_what_cannot_be_filmed_is_refused(tube_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, more, words in (
-        ("a.gif", [], "ends with .mp4 or .webp"),
+        ("a.gif", [], "ends with .mp4 or .webp for the format mp4"),
         ("a.webp", ["--camera", "cam9"], "expected spiral, rig or one of cam0"),
         ("a.webp", ["--methods", "nerf"], "method: expected one of"),
         ("a.webp", ["--frames", "9"], "within 0:2"),
@@ -93,32 +95,32 @@ def capture(small_capture: Path) -> Capture:
 
 
 @pytest.fixture(scope="module")
-def studio(capture: Capture):
+def truth(capture: Capture):
     """The process that traces light."""
-    studio = TruthStudio(capture.folder)
-    yield studio
-    studio.close()
-    assert studio._process is None
+    truth = TruthRenderer(capture.folder)
+    yield truth
+    truth.close()
+    assert truth._process is None
 
 
 def test_the_truth_rendered_here_is_the_captures_own_image_where_that_exists(
-    capture: Capture, studio: TruthStudio
+    capture: Capture, truth: TruthRenderer
 ) -> None:
     camera, frame = capture.splits["novel_pose"].views[0]
-    wanted = Wanted(motion=capture.motion, frame=frame, camera=capture.cameras[camera], captured=True)
-    told: list[str] = []
-    np.testing.assert_array_equal(studio.render(wanted, told.append), capture.image(camera, frame))
-    assert "tracing light" in told
+    request = TruthRequest(motion=capture.motion, frame=frame, camera=capture.cameras[camera], captured=True)
+    messages: list[str] = []
+    np.testing.assert_array_equal(truth.render(request, messages.append), capture.image(camera, frame))
+    assert "tracing light" in messages
 
 
-def test_the_truth_of_a_pose_that_was_never_rendered(capture: Capture, studio: TruthStudio) -> None:
+def test_the_truth_of_a_pose_that_was_never_rendered(capture: Capture, truth: TruthRenderer) -> None:
     camera, frame = capture.splits["novel_pose"].views[0]
     small = resized(capture.cameras[camera], width=32, height=32)
-    own = studio.render(Wanted(motion=capture.motion, frame=frame, camera=small, captured=True), lambda _: None)
-    again = studio.render(Wanted(motion=capture.motion, frame=frame, camera=small, captured=False), lambda _: None)
+    own = truth.render(TruthRequest(motion=capture.motion, frame=frame, camera=small, captured=True))
+    again = truth.render(TruthRequest(motion=capture.motion, frame=frame, camera=small, captured=False), lambda _: None)
     arm = capture.skeleton.names.index("upper_arm_left")
-    raised = held(capture.motion, capture.skeleton, {arm: (0.0, 100.0, 0.0)})
-    other = studio.render(Wanted(motion=raised, frame=frame, camera=small, captured=False), lambda _: None)
+    raised = with_angles(capture.motion, capture.skeleton, {arm: (0.0, 100.0, 0.0)})
+    other = truth.render(TruthRequest(motion=raised, frame=frame, camera=small, captured=False))
     assert own.shape == other.shape == (32, 32, 4) and (own[..., 3] > 128).mean() > 0.03
     silhouettes = [picture[..., 3] > 128 for picture in (own, again, other)]
     assert (silhouettes[0] ^ silhouettes[1]).sum() <= 0.05 * silhouettes[0].sum(), "posed anew, it is the same person"
@@ -126,21 +128,23 @@ def test_the_truth_of_a_pose_that_was_never_rendered(capture: Capture, studio: T
 
 
 def test_a_renderer_that_cannot_says_why(tmp_path: Path, capture: Capture) -> None:
-    studio = TruthStudio(tmp_path)
-    wanted = Wanted(motion=capture.motion, frame=0, camera=next(iter(capture.cameras.values())), captured=True)
+    truth = TruthRenderer(tmp_path)
+    request = TruthRequest(motion=capture.motion, frame=0, camera=next(iter(capture.cameras.values())), captured=True)
     try:
         with pytest.raises(InputError, match=r"manifest\.json: cannot be read"):
-            studio.render(wanted, lambda _: None)
+            truth.render(request)
     finally:
-        studio.close()
+        truth.close()
 
 
-def test_one_truth_at_a_time(capture: Capture, studio: TruthStudio) -> None:
+def test_one_truth_at_a_time(capture: Capture, truth: TruthRenderer) -> None:
     camera, frame = capture.splits["novel_pose"].views[0]
     small = resized(capture.cameras[camera], width=16, height=16)
-    wanted = Wanted(motion=capture.motion, frame=frame, camera=small, captured=True)
+    request = TruthRequest(motion=capture.motion, frame=frame, camera=small, captured=True)
     pictures: list[np.ndarray | None] = []
-    assert studio.ask(wanted, heard=lambda _: None, shown=lambda picture, problem: pictures.append(picture))
-    assert not studio.ask(wanted, heard=lambda _: None, shown=lambda picture, problem: pictures.append(picture))
-    studio.render(wanted, lambda _: None)  # Waits for its turn.
+    assert truth.start(request, on_progress=lambda _: None, on_done=lambda picture, problem: pictures.append(picture))
+    assert not truth.start(
+        request, on_progress=lambda _: None, on_done=lambda picture, problem: pictures.append(picture)
+    )
+    truth.render(request)  # Waits for its turn.
     assert len(pictures) == 1 and pictures[0] is not None

@@ -1,4 +1,4 @@
-"""`export-avatar`: what is written is the avatar that the cell renders."""
+"""`export` of avatars: what is written is the avatar that the cell renders."""
 
 import io
 from pathlib import Path
@@ -9,27 +9,33 @@ import torch
 import trimesh
 from helpers.figures import tube_motion, tube_skeleton
 from helpers.gaussian_files import read_gltf, read_ply
+from helpers.scoring import psnr
 
 from ash.capture.dataset import Pose
 from ash.gaussians.splatting import splat
-from ash.inference import psnr
 from ash.mesh.drawing import draw_mesh, textured, topology_of
 from ash.model import image_of, views_of
 from ash.protocol import StageClock
 from benchmarks import cli
 from benchmarks.export.bvh import bvh_bytes
-from benchmarks.play.actors import open_cast
+from benchmarks.play.avatars import open_avatars
 from synth.posing import bone_frames, rotvec_to_rotmat
 
 
-@pytest.mark.parametrize(("form", "reader"), [("ply", read_ply), ("gltf", read_gltf)])
-def test_exported_gaussians_draw_the_frame_that_the_avatar_renders(form, reader, tube_cells, tmp_path: Path) -> None:
-    out = tmp_path / "frame"
-    command = ["export-avatar", str(tube_cells["ash"]), "--format", form, "--motion", "train", "--frames", "1"]
-    assert cli.main([*command, "--out", str(out)]) == cli.DONE
-    read = reader(out.read_bytes())
-    with open_cast(tube_cells["ash"]) as cast:
-        capture, avatar = cast.capture, cast.actor(cast.titles[0]).avatar
+def exported(source: Path, form: str, out: Path, *more: str) -> int:
+    return cli.main(["export", str(source), "--format", form, "--out", str(out), *more])
+
+
+@pytest.mark.parametrize(
+    ("form", "suffix", "start"), [("ply", ".ply", b"ply\n"), ("gltf", ".glb", b"glTF"), ("gltf", ".gltf", b'{"asset"')]
+)
+def test_exported_gaussians_draw_the_frame_that_the_avatar_renders(form, suffix, start, tube_cells, tmp_path) -> None:
+    out = tmp_path / f"frame{suffix}"
+    assert exported(tube_cells["ash"], form, out, "--motion", "train", "--frames", "1") == cli.DONE
+    assert out.read_bytes().startswith(start)
+    read = (read_ply if form == "ply" else read_gltf)(out.read_bytes())
+    with open_avatars(tube_cells["ash"]) as avatars:
+        capture, avatar = avatars.capture, avatars[avatars.titles[0]].avatar
         frame = capture.splits["train"].frames[1]
         for camera in capture.cameras.values():
             ours = avatar.render(Pose(capture.motion, frame), camera, clock=StageClock())
@@ -38,23 +44,22 @@ def test_exported_gaussians_draw_the_frame_that_the_avatar_renders(form, reader,
             assert psnr(theirs[..., :3], ours[..., :3], ours[..., 3]) > 60
 
 
-def test_a_range_of_frames_becomes_a_folder_of_files(tube_cells, tmp_path: Path, capsys) -> None:
-    out = tmp_path / "frames"
-    command = ["export-avatar", str(tube_cells["ash"]), "--format", "splat", "--motion", "train", "--frames", "1:4"]
-    assert cli.main([*command, "--out", str(out)]) == cli.DONE
-    files = sorted(out.iterdir())
-    assert [file.name for file in files] == ["000000.splat", "000001.splat", "000002.splat"]
-    assert len({file.read_bytes() for file in files}) == 3 and len({file.stat().st_size for file in files}) == 1
+def test_a_range_of_frames_becomes_a_folder_of_files_named_by_the_captures_frames(tube_cells, tmp_path: Path) -> None:
+    for motion, frames, names in (("train", "1:4", (1, 2, 3)), ("test", "0:2", (4, 5))):
+        out = tmp_path / motion
+        assert exported(tube_cells["ash"], "spz", out, "--motion", motion, "--frames", frames) == cli.DONE
+        files = sorted(out.iterdir())
+        assert [file.name for file in files] == [f"{frame:06d}.spz" for frame in names]
+        assert len({file.read_bytes() for file in files}) == len(names)
 
 
 def test_the_exported_mesh_is_the_mesh_that_is_drawn(tube_cells, tmp_path: Path) -> None:
     out = tmp_path / "frame.glb"
-    command = ["export-avatar", str(tube_cells["ddc"]), "--format", "glb", "--frames", "0", "--out", str(out)]
-    assert cli.main(command) == cli.DONE
+    assert exported(tube_cells["ddc"], "gltf", out, "--frames", "0") == cli.DONE
     (mesh,) = trimesh.load(io.BytesIO(out.read_bytes()), file_type="glb", process=False).geometry.values()
     texture = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"))
-    with open_cast(tube_cells["ddc"]) as cast:
-        capture, avatar = cast.capture, cast.actor(cast.titles[0]).avatar
+    with open_avatars(tube_cells["ddc"]) as avatars:
+        capture, avatar = avatars.capture, avatars[avatars.titles[0]].avatar
         frame = capture.splits["novel_pose"].frames[0]
         camera = capture.cameras["cam0"]
         ours = avatar.render(Pose(capture.motion, frame), camera, clock=StageClock())
@@ -70,24 +75,43 @@ def test_the_exported_mesh_is_the_mesh_that_is_drawn(tube_cells, tmp_path: Path)
     )
 
 
-def test_formats_that_an_avatar_cannot_fill_are_refused(tube_run: Path, tube_cells, tmp_path: Path, capsys) -> None:
-    refused = {
-        ("ash", "glb"): "has no textured mesh",
-        ("ddc", "ply"): "has no Gaussians",
-        ("ash", "obj"): "expected one of ply, splat, spz, gltf, glb, bvh, got 'obj'",
-    }
-    for (method, form), words in refused.items():
-        command = ["export-avatar", str(tube_cells[method]), "--format", form, "--out", str(tmp_path / "x")]
-        assert cli.main(command) == cli.WRONG_INPUT
-        assert words in capsys.readouterr().err
-    command = ["export-avatar", str(tube_run), "--format", "ply", "--out", str(tmp_path / "x")]
-    assert cli.main(command) == cli.WRONG_INPUT
-    assert "expected one avatar" in capsys.readouterr().err
-    for frames, words in (("7", "within 0:2"), ("1:1", "within 0:2"), ("a", "A:B or one number")):
-        command = ["export-avatar", str(tube_cells["ash"]), "--format", "ply", "--frames", frames]
-        assert cli.main([*command, "--out", str(tmp_path / "x")]) == cli.WRONG_INPUT
-        assert words in capsys.readouterr().err
-    assert not (tmp_path / "x").exists()
+@pytest.mark.parametrize(
+    ("source", "form", "out", "more", "words"),
+    [
+        ("ddc", "ply", "x", (), "has no Gaussians"),
+        ("ash", "obj", "x", (), "expected one of ply, spz, gltf, bvh, mp4, html for a trained avatar"),
+        ("ash", "colmap", "x", (), "expected one of ply, spz, gltf, bvh, mp4, html for a trained avatar"),
+        ("capture", "ply", "x", (), "expected one of ash, nerfstudio, colmap, plain, test-views for a capture"),
+        ("ash", "ply", "x.spz", (), "x.spz: expected a name that ends with .ply for the format ply"),
+        ("ash", "gltf", "x.ply", (), "x.ply: expected a name that ends with .glb or .gltf for the format gltf"),
+        ("run", "ply", "x", (), "expected one avatar"),
+        ("ash", "ply", "x", ("--frames", "7"), "within 0:2"),
+        ("ash", "ply", "x", ("--frames", "1:1"), "within 0:2"),
+        ("ash", "ply", "x", ("--frames", "a"), "A:B or one number"),
+        ("ash", "ply", "x", ("--truth",), "--truth: goes with the format mp4, got ply"),
+        ("capture", "ash", "x", ("--frame", "0"), "--frame: goes with the format nerfstudio, colmap, got ash"),
+        ("capture", "plain", "x", ("--motion", "walk"), "--motion: goes with the format ply, spz, gltf"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused_in_one_line(
+    source, form, out, more, words, tube_run: Path, tube_cells, tmp_path: Path, capsys
+) -> None:
+    folder = {"run": tube_run, "capture": tube_run.parent / "capture", **tube_cells}[source]
+    assert exported(folder, form, tmp_path / out, *more) == cli.WRONG_INPUT
+    message = capsys.readouterr().err
+    assert words in message and message.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_old_commands_are_aliases_that_say_what_to_type(tube_cells, tmp_path: Path, capsys) -> None:
+    cell, out = str(tube_cells["ddc"]), tmp_path / "frame.glb"
+    assert cli.main(["export-avatar", cell, "--format", "glb", "--out", str(out)]) == cli.DONE
+    assert out.read_bytes().startswith(b"glTF")
+    assert capsys.readouterr().err == "ash-bench: export-avatar is now: export\n"
+    for old, form, out in (("video", "mp4", "x.gif"), ("share", "html", "x.txt")):
+        assert cli.main([old, cell, "--out", out]) == cli.WRONG_INPUT
+        message = capsys.readouterr().err
+        assert f"{old} is now: export --format {form}\n" in message and "expected a name that" in message
 
 
 def test_bvh_says_where_every_joint_is(tmp_path: Path) -> None:

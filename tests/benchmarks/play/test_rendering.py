@@ -8,14 +8,27 @@ import numpy as np
 import pytest
 from helpers.captures import write_tube_capture
 
-from ash.capture.dataset import Camera, Pose
+from ash.capture.dataset import Camera
 from ash.files import InputError
-from benchmarks.play.actors import open_cast
+from benchmarks.play.avatars import open_avatars
 from benchmarks.play.cameras import resized
-from benchmarks.play.motions import acts_of, joint_heads
-from benchmarks.play.picture import DARK, HELD_JOINT, JOINT, LIGHT, MESH, UNKNOWN_TRUTH, Painter, _fit, _with_mesh
-from benchmarks.play.shelf import TruthPicture, TruthShelf
-from benchmarks.play.state import ABSOLUTE, FLIP, TRUTH, ViewState
+from benchmarks.play.motions import motion_clips
+from benchmarks.play.rendering import (
+    ABSOLUTE,
+    DARK,
+    FLIP,
+    JOINT,
+    LIGHT,
+    MESH,
+    TRUTH,
+    TURNED_JOINT,
+    UNKNOWN_TRUTH,
+    ViewRenderer,
+    ViewState,
+    fitted,
+    with_mesh,
+)
+from benchmarks.play.truth import TruthCache, TruthPicture
 
 
 def test_a_truth_in_other_pixels_has_no_fringe(tmp_path: Path) -> None:
@@ -27,9 +40,9 @@ def test_a_truth_in_other_pixels_has_no_fringe(tmp_path: Path) -> None:
         premultiplied = alpha[..., None] * np.array([*colour, 255])
         truth = TruthPicture(camera=own, on_black=np.rint(premultiplied).astype(np.uint8))
         camera = resized(own, width=150, height=130)
-        shown = _fit(truth, camera, ViewState(left="", dark=dark)).astype(int)
+        shown = fitted(truth, camera, ViewState(left="", dark=dark).background).astype(int)
         assert shown.shape == (130, 150, 3) and np.abs(shown - np.array(colour)).max() <= 3
-        assert np.abs(_fit(truth, camera, ViewState(left="", dark=not dark)) - shown).max() > 100
+        assert np.abs(fitted(truth, camera, ViewState(left="", dark=not dark).background) - shown).max() > 100
 
 
 def before_a_camera(side: int) -> Camera:
@@ -50,7 +63,7 @@ def grid(cells: int) -> tuple[np.ndarray, np.ndarray]:
 def lines(cells: int, side: int) -> np.ndarray:
     """How opaque the outlines of a grid are drawn, `[h, w]`."""
     white = np.full((side, side, 3), 255, dtype=np.uint8)
-    drawn = _with_mesh(white, *grid(cells), before_a_camera(side))
+    drawn = with_mesh(white, *grid(cells), before_a_camera(side))
     return (255 - drawn[..., 0].astype(float)) / (255 - MESH[0])
 
 
@@ -69,76 +82,74 @@ def test_outlines_of_triangles_smaller_than_pixels_are_no_speckle() -> None:
 
 
 @pytest.fixture(scope="module")
-def painter(tube_run: Path) -> Iterator[Painter]:
-    with open_cast(tube_run) as cast:
-        yield Painter(cast, acts_of(cast.capture), TruthShelf(cast.capture))
+def renderer(tube_run: Path) -> Iterator[ViewRenderer]:
+    with open_avatars(tube_run) as avatars:
+        yield ViewRenderer(avatars, motion_clips(avatars.capture), TruthCache(avatars.capture))
 
 
-def drawn(painter: Painter, state: ViewState, side: int = 96) -> np.ndarray:
-    return painter.draw(state, width=side, height=side, careful=True).pixels.astype(int)
+def drawn(renderer: ViewRenderer, state: ViewState, side: int = 96) -> np.ndarray:
+    return renderer.render(state, width=side, height=side, with_scores=True).pixels.astype(int)
 
 
 @pytest.fixture
-def plain(painter: Painter) -> ViewState:
+def plain(renderer: ViewRenderer) -> ViewState:
     """The first avatar in the held-out motion, through the held-out camera: there the truth is known."""
-    return ViewState(left=painter.cast.titles[0], act=1, camera="cam0")
+    return ViewState(left=renderer.avatars.titles[0], clip=1, camera="cam0")
 
 
-def test_two_avatars_and_the_truth_lie_side_by_side(painter: Painter, plain: ViewState) -> None:
-    left, other = drawn(painter, plain), drawn(painter, replace(plain, left=painter.cast.titles[1]))
-    own = painter.cast.capture
-    image = own.image("cam0", painter.acts[1].frames[0]).astype(float)
+def test_two_avatars_and_the_truth_lie_side_by_side(renderer: ViewRenderer, plain: ViewState) -> None:
+    left, other = drawn(renderer, plain), drawn(renderer, replace(plain, left=renderer.avatars.titles[1]))
+    own = renderer.avatars.capture
+    image = own.image("cam0", renderer.clips[1].frames[0]).astype(float)
     alpha = image[..., 3:] / 255
     truth = alpha * image[..., :3] + (1 - alpha) * np.array(LIGHT)
-    for right, wanted in ((painter.cast.titles[1], other), (TRUTH, truth)):
+    for right, wanted in ((renderer.avatars.titles[1], other), (TRUTH, truth)):
         side = own.cameras["cam0"].width if right == TRUTH else 96
-        split = drawn(painter, replace(plain, right=right, divider=0.25), side)
+        split = drawn(renderer, replace(plain, right=right, divider=0.25), side)
         names = round(0.7 * side)  # below are the names
         column = side // 4
-        alone = left if side == 96 else drawn(painter, plain, side)
+        alone = left if side == 96 else drawn(renderer, plain, side)
         np.testing.assert_array_equal(split[:names, : column - 1], alone[:names, : column - 1])
         assert np.abs(split[:names, column + 2 :] - wanted[:names, column + 2 :]).max() <= 2
         assert np.abs(split[:names, column + 2 :] - alone[:names, column + 2 :]).max() > 40
 
 
-def test_errors_are_shown_where_the_truth_is_known(painter: Painter, plain: ViewState) -> None:
-    shown = {error: drawn(painter, replace(plain, error=error)) for error in (ABSOLUTE, FLIP)}
+def test_errors_are_shown_where_the_truth_is_known(renderer: ViewRenderer, plain: ViewState) -> None:
+    shown = {error: drawn(renderer, replace(plain, error=error)) for error in (ABSOLUTE, FLIP)}
     assert np.abs(shown[ABSOLUTE] - shown[FLIP]).max() > 40
-    alike = replace(plain, left=painter.cast.titles[1], error=ABSOLUTE)
-    assert np.abs(drawn(painter, alike) - shown[ABSOLUTE]).max() > 40, "another avatar is wrong elsewhere"
-    known = painter.draw(replace(plain, error=FLIP), width=96, height=96, careful=True)
+    alike = replace(plain, left=renderer.avatars.titles[1], error=ABSOLUTE)
+    assert np.abs(drawn(renderer, alike) - shown[ABSOLUTE]).max() > 40, "another avatar is wrong elsewhere"
+    known = renderer.render(replace(plain, error=FLIP), width=96, height=96, with_scores=True)
     assert "dB, FLIP" in known.score and known.note == ""
     for asked in ({"error": FLIP}, {"right": TRUTH}):
-        elsewhere = painter.draw(replace(plain, camera="cam2", **asked), width=96, height=96, careful=True)
+        elsewhere = renderer.render(replace(plain, camera="cam2", **asked), width=96, height=96, with_scores=True)
         assert elsewhere.note == UNKNOWN_TRUTH and elsewhere.score == ""
 
 
-def test_mesh_skeleton_and_ellipsoids_lie_where_the_avatar_is(painter: Painter, plain: ViewState) -> None:
-    bare = drawn(painter, plain, 240)
+def test_mesh_skeleton_and_ellipsoids_lie_where_the_avatar_is(renderer: ViewRenderer, plain: ViewState) -> None:
+    bare = drawn(renderer, plain, 240)
     inside = np.abs(bare - np.array(LIGHT)).max(axis=-1) > 30
-    with_mesh = drawn(painter, replace(plain, mesh=True), 240)
+    with_mesh = drawn(renderer, replace(plain, mesh=True), 240)
     changed = np.abs(with_mesh - bare).max(axis=-1) > 40
     assert 0.02 < changed[inside].mean() < 0.6 and changed[~inside].mean() < 0.02
     strongest = with_mesh[changed][np.abs(with_mesh[changed] - np.array(MESH)).sum(axis=-1).argmin()]
     assert np.abs(strongest - np.array(MESH)).max() < 30
-    state = replace(plain, skeleton=True, held=((1, (20.0, 0.0, 0.0)),))
-    skeleton = drawn(painter, state, 240)
-    camera = painter.camera(state, width=240, height=240)
-    pose = Pose(painter.motion(painter.acts[1], state), painter.acts[1].frames[0])
-    for (x, y), colour in zip(
-        camera.project(joint_heads(painter.cast.capture, pose))[0], (JOINT, HELD_JOINT), strict=True
-    ):
+    state = replace(plain, skeleton=True, turned=((1, (20.0, 0.0, 0.0)),))
+    skeleton = drawn(renderer, state, 240)
+    camera = renderer.camera(state, width=240, height=240)
+    positions = renderer.joint_positions(renderer.pose(state))
+    for (x, y), colour in zip(camera.project(positions)[0], (JOINT, TURNED_JOINT), strict=True):
         np.testing.assert_array_equal(skeleton[round(y - 0.5), round(x - 0.5)], colour)
-    ellipsoids = drawn(painter, replace(plain, ellipsoids=True), 240)
+    ellipsoids = drawn(renderer, replace(plain, ellipsoids=True), 240)
     apart = np.abs(ellipsoids - np.array(LIGHT)).max(axis=-1) > 30
     assert 0.1 < apart[inside].mean() < 0.95 and apart[~inside].mean() < 0.01, "small, with room between them"
     with pytest.raises(InputError, match="has no Gaussians"):
-        drawn(painter, replace(plain, left=painter.cast.titles[1], ellipsoids=True))
+        drawn(renderer, replace(plain, left=renderer.avatars.titles[1], ellipsoids=True))
 
 
 def test_a_motion_begins_anew_or_ends_as_loop_says() -> None:
     state = ViewState(left="", step=3)
-    assert state.stepped(3, 5).step == 1 and state.stepped(3, 5).playing
+    assert state.advanced(3, 5).step == 1 and state.advanced(3, 5).playing
     once = replace(state, loop=False)
-    assert once.stepped(3, 5).step == 4 and not once.stepped(3, 5).playing
-    assert once.stepped(-7, 5).step == 0
+    assert once.advanced(3, 5).step == 4 and not once.advanced(3, 5).playing
+    assert once.advanced(-7, 5).step == 0

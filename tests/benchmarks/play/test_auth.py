@@ -1,12 +1,12 @@
-"""Each door of the player's server: what comes in, and that nothing else does."""
+"""The player's server: which requests and messages it accepts, and that it refuses all others."""
 
 import contextlib
 import http.client
 import math
-import socket
 import threading
 from pathlib import Path
 
+import psutil
 import pytest
 import viser
 import viser._messages as messages
@@ -17,32 +17,39 @@ from websockets.sync.client import connect
 
 from ash.files import InputError
 from benchmarks import cli
-from benchmarks.play.doors import HEARD, DoorOptions, close_server, open_server, require_safe
-
-
-@pytest.fixture(scope="module")
-def url():
-    """A server with nothing in it."""
-    server, url, _ = open_server(DoorOptions(clients=3, allow_origins=("http://my.host:9000",)), label="doors")
-    yield url
-    close_server(server)
+from benchmarks.play.auth import ALLOWED_MESSAGES, AuthOptions, close_server, open_server, require_safe
 
 
 @pytest.fixture()
 def served():
-    """A server of one's own, and its address."""
-    server, url, doors = open_server(DoorOptions(clients=3), label="doors")
-    yield server, url, doors
+    """A server without content, its address, and who may connect."""
+    server, url, auth = open_server(AuthOptions(clients=3, allow_origins=("http://my.host:9000",)), label="auth")
+    yield server, url, auth
     close_server(server)
 
 
+@pytest.fixture(scope="module")
+def url():
+    """The address of a server that tests share."""
+    server, url, _ = open_server(AuthOptions(clients=3, allow_origins=("http://my.host:9000",)), label="auth")
+    yield url
+    close_server(server)
+
+
+def listening(port: int) -> set[str]:
+    """The addresses on which this process listens at a port, by the kernel's own table."""
+    return {
+        each.laddr.ip for each in psutil.Process().net_connections("inet") if each.laddr.port == port and not each.raddr
+    }
+
+
 def test_it_listens_on_the_loopback_address_alone(url: str) -> None:
-    host, _, port = address_of(url).partition(":")
-    assert host == "127.0.0.1"
-    others = {info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)} - {"127.0.0.1"}
-    for other in others:
-        with pytest.raises(OSError):
-            socket.create_connection((other, int(port)), timeout=2)
+    assert listening(int(address_of(url).rpartition(":")[2])) == {"127.0.0.1"}
+    server, exposed, _ = open_server(AuthOptions(host="0.0.0.0", expose=True), label="auth")
+    try:  # The same check sees a server that listens everywhere.
+        assert listening(int(address_of(exposed).rpartition(":")[2])) == {"0.0.0.0"}
+    finally:
+        close_server(server)
 
 
 def test_the_printed_address_opens_the_page_and_the_token_leaves_the_address_bar(url: str) -> None:
@@ -148,8 +155,8 @@ def test_files_are_not_taken(served) -> None:
 def test_four_kinds_of_messages_are_heard_and_all_others_dropped(served) -> None:
     server, url, _ = served
     heard: list[str] = []
-    kinds = [kind for kind in messages.Message.get_subclasses() if kind not in HEARD]
-    assert len(kinds) > 80 and len(HEARD) == 4
+    kinds = [kind for kind in messages.Message.get_subclasses() if kind not in ALLOWED_MESSAGES]
+    assert len(kinds) > 80 and len(ALLOWED_MESSAGES) == 4
     for kind in (messages.LocalStorageGetItemResponseMessage, messages.GetRenderResponseMessage):
         server._websock_server.register_handler(kind, lambda _, m: heard.append(type(m).__name__))
     with browsers(url, 1) as (browser,):
@@ -160,42 +167,42 @@ def test_four_kinds_of_messages_are_heard_and_all_others_dropped(served) -> None
 
 
 def test_large_and_broken_messages_end_their_connection_and_nothing_else(served) -> None:
-    server, url, doors = served
-    with browsers(url, 1) as (kept,):
+    server, url, auth = served
+    with browsers(url, 1) as (other_browser,):
         for bad in (b"\xff" * 100, b"", message("NoSuchMessage"), message("ViewerCameraMessage"), b"\x90" * 70_000):
             with enter(url) as other:
                 other.send(bad)
                 with pytest.raises(ConnectionClosed):
                     for _ in range(200):
                         other.recv(timeout=10)
-        wait_for(lambda: doors.inside == 1)
-        _settle(server, kept)
+        wait_for(lambda: auth.connected == 1)
+        _settle(server, other_browser)
 
 
 def test_so_many_viewers_and_no_more(served) -> None:
-    _, url, doors = served
+    _, url, auth = served
     with browsers(url, 3):
-        wait_for(lambda: doors.inside == 3)
+        wait_for(lambda: auth.connected == 3)
         with pytest.raises(InvalidStatus) as refused:
             enter(url)
         assert refused.value.response.status_code == 503
-    wait_for(lambda: doors.inside == 0)
+    wait_for(lambda: auth.connected == 0)
     enter(url).close()
 
 
 def test_a_rush_lets_no_more_in_than_there_are_places(served) -> None:
-    _, url, doors = served
+    _, url, auth = served
     cookie, inside, most = cookie_of(url), [], []
 
     def rush() -> None:
         with contextlib.suppress(InvalidStatus, ConnectionClosed, TimeoutError, EOFError):
             inside.append(enter(url, cookie=cookie))
-        most.append(doors.inside)
+        most.append(auth.connected)
 
     threads = [threading.Thread(target=rush) for _ in range(16)]
     [thread.start() for thread in threads]
     [thread.join() for thread in threads]
-    assert max(most) == 3 and doors.inside <= 3
+    assert max(most) == 3 and auth.connected <= 3
     for each in inside:
         each.close()
 
@@ -203,26 +210,26 @@ def test_a_rush_lets_no_more_in_than_there_are_places(served) -> None:
 def test_other_machines_are_let_in_only_when_that_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for host in ("0.0.0.0", "::", "192.168.1.5", "my.host"):
         with pytest.raises(InputError, match="--expose"):
-            require_safe(DoorOptions(host=host))
-        require_safe(DoorOptions(host=host, expose=True))
+            require_safe(AuthOptions(host=host))
+        require_safe(AuthOptions(host=host, expose=True))
     for host in ("127.0.0.1", "localhost", "::1", "127.0.0.2"):
-        require_safe(DoorOptions(host=host))
+        require_safe(AuthOptions(host=host))
     assert cli.main(["play", str(tmp_path), "--host", "0.0.0.0"]) == cli.WRONG_INPUT
     assert "nothing is encrypted" in capsys.readouterr().err
     for origin in ("localhost:9000", "http://", "ftp://x:1", "http://x:1/", "http://x:1/path"):
         with pytest.raises(InputError, match="http://HOST:PORT"):
-            require_safe(DoorOptions(allow_origins=(origin,)))
+            require_safe(AuthOptions(allow_origins=(origin,)))
 
 
 def test_a_taken_port_is_refused_and_not_replaced(url: str) -> None:
     port = int(address_of(url).rpartition(":")[2])
     with pytest.raises(InputError, match=f"port: {port}"):
-        open_server(DoorOptions(port=port), label="doors")
+        open_server(AuthOptions(port=port), label="auth")
 
 
 def test_tokens_are_long_and_differ(url: str, served) -> None:
-    _, other, doors = served
-    assert url.partition("token=")[2] != other.partition("token=")[2] and len(doors.token) >= 32
+    _, other, auth = served
+    assert url.partition("token=")[2] != other.partition("token=")[2] and len(auth.token) >= 32
 
 
 def _settle(server: viser.ViserServer, browser: FakeBrowser) -> None:
