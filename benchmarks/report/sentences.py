@@ -73,11 +73,6 @@ def remarks(tables: RunTables, scene: str) -> list[str]:
     found = [FOR_VALIDATION] if tables.for_validation(scene) else []
     found += [_exact(tables, scene), _cost(tables, scene), _template(tables, scene), _noise(tables, scene)]
     outcomes = tables.outcomes[tables.outcomes["scene"] == scene]
-    choices = outcomes[outcomes["choice"] != ""].drop_duplicates(["method", "choice"])
-    said = [
-        f"{style_of(method).title}: {choice}" for method, choice in zip(choices.method, choices.choice, strict=True)
-    ]
-    found.append(f"Settings chosen by a search: {'; '.join(said)}." if said else "")
     learned = outcomes[outcomes["template"] != ""].drop_duplicates(["method", "template"])
     said = [f"{template} ({titles([*rows['method']])})" for template, rows in learned.groupby("template", sort=False)]
     found.append(f"Templates: {'; '.join(said)}." if said else "")
