@@ -293,10 +293,10 @@ def test_the_code_version_reads_the_sources_that_run() -> None:
 
 
 def test_two_runs_in_one_folder_do_not_meet(boxes: str, tmp_path: Path, capsys) -> None:
-    from ash.files import only_run_in
+    from ash.files import run_lock
 
     (tmp_path / "run").mkdir()
-    with only_run_in(tmp_path / "run"):
+    with run_lock(tmp_path / "run"):
         assert "another ash-bench is at work there" in refused(capsys, "run", boxes, "--out", str(tmp_path / "run"))
 
 
