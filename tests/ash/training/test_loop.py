@@ -21,7 +21,7 @@ from ash.files import InputError
 from ash.protocol import StageClock
 from ash.training import loop, stopping
 from ash.training.adam import Adam
-from ash.training.batches import composite, composite_naive, cut_batch, draw_batch
+from ash.training.batches import cut_batch, draw_batch
 from ash.training.images import load_training_images
 from ash.training.loop import Diverged, Interrupted
 
@@ -193,7 +193,7 @@ def test_far_from_training_a_static_avatar_has_its_share_of_the_picture(capture,
             assert not torch.equal(alone[0].rgb, alone[1].rgb)
             for trust, larger in ((1.0, 0), (0.75, 0), (0.25, 1)):
                 with monkeypatch.context() as patched:
-                    patched.setattr(avatar.texture_drawer(), "trust", lambda textures, trust=trust: trust)
+                    patched.setattr(avatar.module.textures, "trust", lambda textures, trust=trust: trust)
                     drawn, kept = avatar.module(pose, camera), avatar.gaussians(pose)
                 for name in ("rgb", "alpha", "depth"):
                     wanted = trust * getattr(alone[0], name) + (1 - trust) * getattr(alone[1], name)
@@ -236,17 +236,6 @@ def test_reserved_views_are_never_trained_on(capture):
         seen = {(camera.name, batch.frame) for camera in batch.cameras}
         assert not seen & set(images.reserved)
         assert len(seen) == 4 - sum(frame == batch.frame for _, frame in images.reserved)
-
-
-def test_a_window_over_a_background_is_its_definition():
-    rgba = np.random.default_rng(0).integers(0, 256, (30, 40, 4), np.uint8)
-    rgba[:4, :, 3], rgba[4:8, :, 3] = 0, 255
-    for window in map(torch.from_numpy, (rgba, rgba[3:20, 5:38])):
-        for background in (torch.zeros(3), torch.tensor([0.2, 0.5, 0.9])):
-            rgb, alpha = composite(window, background)
-            expected_rgb, expected_alpha = composite_naive(window, background)
-            torch.testing.assert_close(rgb, expected_rgb, rtol=0, atol=2e-7)
-            assert torch.equal(alpha, expected_alpha)
 
 
 def test_equal_seeds_give_equal_bits_and_other_seeds_do_not(capture, tmp_path):
