@@ -9,3 +9,5 @@ OLD_COMMANDS: dict[str, tuple[str, ...]] = {  # old command -> what is typed in 
 }
 
 OLD_FORMATS = {"glb": "gltf"}  # of `export`, for avatars
+
+OLD_FIELDS = {"model.fade": "model.novelty_scale"}  # of configurations, as flags and as keys of a suite's file

@@ -115,12 +115,12 @@ class SynthCommand:
 
     def _described(self) -> tuple["Scene", str]:
         """The scene that is asked for, and its name among captures."""
-        from ash.fields import replaced
+        from ash.fields import apply_overrides
         from benchmarks.suites.scenes import scene_of
         from benchmarks.suites.suites import capture_name, varied_name
 
         changes = dict(changes_of(self))
-        wanted = replaced(self.settings(), changes, of=self.scene)
+        wanted = apply_overrides(self.settings(), changes, of=self.scene)
         if changes and "name" not in changes:
             wanted = replace(wanted, name=varied_name(self.scene, tuple(changes.items())))
         wanted = self._moved(wanted)

@@ -101,12 +101,12 @@ class SuitesCommand:
 
     def __call__(self) -> int:
         """Print them."""
-        from ash.fields import nearest
+        from ash.fields import suggest
         from benchmarks.suites.files import suite_files
 
         known = suite_files()
         if self.name and self.name not in known:
-            raise InputError(f"unknown suite {self.name!r}, {nearest(self.name, tuple(known))}")
+            raise InputError(f"unknown suite {self.name!r}, {suggest(self.name, tuple(known))}")
         for name, path in known.items():
             if self.name in ("", name):
                 print(f"# {name}.toml\n{path.read_text()}")

@@ -25,7 +25,7 @@ from ash.capture.formats import load_capture
 from ash.files import InputError, link_or_copy
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted, splat
-from ash.model import image_of, mixed, views_of
+from ash.model import blend_renders, image_of, views_of
 from ash.protocol import Avatar, PosedGeometry, PosesGaussians, StageClock
 from benchmarks.analysis.style import style_of
 from benchmarks.cell.cells import CHECKPOINT, Cell, is_trained, read_cell
@@ -137,7 +137,9 @@ class LoadedAvatar:
     def _splat(self, components: Components, camera: Camera, background: torch.Tensor | None) -> Splatted:
         assert isinstance(self.avatar, PosesGaussians)
         options = {**views_of([camera]), "dilation": self.avatar.dilation, "threads": torch.get_num_threads()}
-        return mixed([(weight, splat(gaussians, background=background, **options)) for weight, gaussians in components])
+        return blend_renders(
+            [(weight, splat(gaussians, background=background, **options)) for weight, gaussians in components]
+        )
 
 
 def composite(premultiplied: np.ndarray, background: Colour) -> np.ndarray:

@@ -19,8 +19,8 @@ from ash.config import AshConfig
 from ash.devices import CPU, moved
 from ash.files import InputError, write_json
 from ash.gaussians.splatting import Splatted, splat_naive
-from ash.gaussians.texels import place_naive, pose_naive
-from ash.model import AshModel, image_of, mixed, views_of
+from ash.gaussians.texels import pose_naive, sample_surface_naive
+from ash.model import AshModel, blend_renders, image_of, views_of
 from ash.presets import named
 from ash.protocol import Avatar, StageClock
 from ash.training.adam import Adam
@@ -191,10 +191,12 @@ def _fill_heads(avatar: AshAvatar) -> None:
 def frame_by_definition(model: AshModel, pose: Pose, camera: Camera) -> np.ndarray:
     """The image of a frame by the definitions alone: premultiplied RGBA, float32 `[h, w, 4]`."""
     posed = model.template.pose(pose)
-    canonical, normals, transforms = place_naive(model.lattice, posed, model.config.anchor)
-    conditions = replace(model.conditions(pose), canonical=canonical, normals=normals, transforms=transforms)
-    shares = model.shares(model.decode(conditions), conditions)
-    return image_of(mixed([(share, _splat_by_definition(model, raw, conditions, [camera])) for share, raw in shares]))
+    canonical, normals, transforms = sample_surface_naive(model.lattice, posed, model.config.anchor)
+    conditions = replace(model.frame_inputs(pose), canonical=canonical, normals=normals, transforms=transforms)
+    shares = model.blend_components(model.decode(conditions), conditions)
+    return image_of(
+        blend_renders([(share, _splat_by_definition(model, raw, conditions, [camera])) for share, raw in shares])
+    )
 
 
 def _splat_by_definition(
@@ -266,13 +268,13 @@ def time_clip(
 @torch.no_grad()
 def decoder_weight(model: AshModel, pose: Pose) -> float:
     """The weight of the decoded picture in a pose, 0..1."""
-    return model.conditions(pose).trust
+    return model.frame_inputs(pose).decoder_weight
 
 
 def _arrive(model: AshModel, pose: Pose, threads: int) -> None:
     """Leave with the template what playback leaves there: the frames before this one, and not this one."""
     torch.set_num_threads(threads)
-    model.template.forget()
+    model.template.clear_cache()
     for past in pose.window(model.config.window):
         if past != pose.frame:
             model.template.pose(pose.at(int(past)))
@@ -290,7 +292,7 @@ def time_steps(avatar: AshAvatar, preset: str, capture: Capture, *, rounds: int)
         torch.set_num_threads(1)
         if number not in batches:
             batches[number] = draw_batch(images, avatar.config.training, 0, number)
-        avatar._conditions_of(batches[number].frame)
+        avatar._inputs_of(batches[number].frame)
 
     def candidate(name: str, *, naive: bool, repeats: int) -> Candidate:
         optimiser = Adam([group | {"lr": 0.0} for group in avatar.parameter_groups()])
@@ -313,7 +315,7 @@ def time_steps(avatar: AshAvatar, preset: str, capture: Capture, *, rounds: int)
 def _step(avatar: AshAvatar, batch: Batch, optimiser: Adam, *, naive: bool) -> None:
     training = avatar.config.training
     if naive:
-        conditions = avatar._conditions_of(batch.frame)
+        conditions = avatar._inputs_of(batch.frame)
         raw = avatar.module.decode(conditions)
         drawn = _splat_by_definition(avatar.module, raw, conditions, batch.cameras, batch.background).rgb
     else:

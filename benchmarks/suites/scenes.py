@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ash.fields import Changes, nearest, replaced
+from ash.fields import Changes, apply_overrides, suggest
 from ash.files import InputError
 from benchmarks.suites.progress import Progress
 from synth.presets import SCENES, scene, skinned
@@ -23,14 +23,14 @@ def scene_names() -> tuple[str, ...]:
 
 
 def scene_of(of: str, *, size: str, seed: int = 0, subject: int = 0, name: str = "", changes: Changes = ()) -> Scene:
-    """A scene by name, with fields replaced; `name` is what it is called then.
+    """A scene by name, with changed fields; `name` is what it is called then.
 
     Raises:
         InputError: no such scene, size or field, or a value that the scene refuses.
     """
     if of not in scene_names():
-        raise InputError(f"unknown scene {of!r}, {nearest(of, scene_names())}")
-    return replaced(replace(_plain(of, size, seed), subject=subject, name=name or of), changes, of=of)
+        raise InputError(f"unknown scene {of!r}, {suggest(of, scene_names())}")
+    return apply_overrides(replace(_plain(of, size, seed), subject=subject, name=name or of), changes, of=of)
 
 
 def _plain(of: str, size: str, seed: int) -> Scene:

@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from ash.kept import Kept, size_of
+from ash.bounded_cache import BoundedCache, size_of
 from ash.rotations import RigidTransforms
 
 
@@ -12,7 +12,7 @@ def test_what_fits_is_made_once_and_the_rest_each_time_alike():
         made.append(key)
         return np.full(10, key, np.uint8)
 
-    kept = Kept(make, max_bytes=25)
+    kept = BoundedCache(make, max_bytes=25)
     for _ in range(3):
         assert [int(kept[key][0]) for key in range(4)] == [0, 1, 2, 3]
     assert made == [0, 1, 2, 3, 2, 3, 2, 3]

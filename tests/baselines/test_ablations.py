@@ -70,14 +70,17 @@ def test_the_mlp_tells_frames_apart_and_learns_no_texels_beneath(
 ) -> None:
     """All that it draws comes out of its decoder; a decoder that does not learn draws what it started from."""
     changes = {"training.learning_rate": rate, "training.steps": 24, "training.fitted_steps": 4}
-    avatar = mlp(capture.training_only(), seed=0, preset="ci", config=mlp.but(changes).config("ci"))
-    started, learned = avatar.module.base.clone(), {id(p) for g in avatar.parameter_groups() for p in g["params"]}
+    avatar = mlp(capture.training_only(), seed=0, preset="ci", config=mlp.with_overrides(changes).config("ci"))
+    started, learned = (
+        avatar.module.base_texels.clone(),
+        {id(p) for g in avatar.parameter_groups() for p in g["params"]},
+    )
     avatar.fit(capture.training_only(), folder=tmp_path)
     outcome = avatar.outcome()
     assert outcome is not None and outcome.carries_nothing == dead
     assert (outcome.correction_spread == 0) == dead
-    assert avatar.module.static is None and not avatar.module.base.requires_grad
-    assert id(avatar.module.base) not in learned and torch.equal(avatar.module.base, started)
+    assert avatar.module.fallback_texels is None and not avatar.module.base_texels.requires_grad
+    assert id(avatar.module.base_texels) not in learned and torch.equal(avatar.module.base_texels, started)
     assert (started == started[0]).all(), "grey texels, all alike"
     assert {id(p) for p in avatar.module.decoders.parameters()} <= learned
 

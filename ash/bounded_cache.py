@@ -14,7 +14,7 @@ Value = TypeVar("Value")
 MAX_BYTES = 256 * 2**20
 
 
-class Kept(Generic[Key, Value]):
+class BoundedCache(Generic[Key, Value]):
     """Values by key. The first ones stay; from `max_bytes` on a value is made anew each time it is asked for.
 
     Training asks for frames in random order, each as often as the others: to drop one for another would gain nothing.
