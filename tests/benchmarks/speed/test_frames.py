@@ -126,7 +126,7 @@ def test_a_timed_frame_poses_its_own_template_and_not_that_of_the_frames_before(
 ) -> None:
     avatar, capture = trained
     template, posed, timed = avatar.module.template, [], []
-    anew, render = template.pose_anew, avatar.render
+    anew, render = template.pose_uncached, avatar.render
 
     def recorded(pose, *rest, **options):
         posed.clear()
@@ -134,7 +134,7 @@ def test_a_timed_frame_poses_its_own_template_and_not_that_of_the_frames_before(
         timed.append((pose.frame, *posed))
         return image
 
-    monkeypatch.setattr(template, "pose_anew", lambda pose: posed.append(pose.frame) or anew(pose))
+    monkeypatch.setattr(template, "pose_uncached", lambda pose: posed.append(pose.frame) or anew(pose))
     monkeypatch.setattr(avatar, "render", recorded)
     agreements(avatar, capture, threads=(1, 2))
     assert avatar.config.model.window > 1
