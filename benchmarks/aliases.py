@@ -3,6 +3,8 @@
 OLD_COMMANDS: dict[str, tuple[str, ...]] = {  # old command -> what is typed in its place; arguments follow unchanged
     "merge": ("report",),
     "rescore": ("eval", "--scores-only"),
+    "retarget": ("eval",),
+    "undistort": ("export", "--format", "undistorted"),
     "export-avatar": ("export",),
     "share": ("export", "--format", "html"),
     "video": ("export", "--format", "mp4"),

@@ -44,18 +44,13 @@ COMMANDS = {
     "compare": "runs:CompareCommand",
     "eval": "runs:EvalCommand",
     "verify": "captures:VerifyCommand",
-    "undistort": "captures:UndistortCommand",
     "motions": "captures:MotionsCommand",
-    "sheets": "captures:SheetsCommand",
     "check-method": "methods:CheckMethodCommand",
-    "retarget": "methods:RetargetCommand",
-    "display": "methods:DisplayCommand",
     "play": "avatars:PlayCommand",
     "export": "avatars:ExportCommand",
     "gate": "gate:GateCommand",
     "speed": "checkout:SpeedCommand",
     "doctor": "checkout:DoctorCommand",
-    "docs": "checkout:DocsCommand",
     "test": "checkout:TestCommand",
 }
 

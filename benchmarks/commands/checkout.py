@@ -114,24 +114,6 @@ class SuitesCommand:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DocsCommand:
-    """Write the reference of the public names as HTML, from their docstrings; needs pdoc."""
-
-    out: Folder = Path("runs/docs")  # where the pages go
-
-    def __call__(self) -> int:
-        """Write it."""
-        try:
-            import pdoc
-        except ImportError:
-            raise InputError("the reference needs the package pdoc, of the extra dev") from None
-        pdoc.render.configure(docformat="google", show_source=True)
-        pdoc.pdoc(*PUBLIC, output_directory=self.out)
-        print(self.out / "index.html")
-        return DONE
-
-
-@dataclass(frozen=True, kw_only=True)
 class TestCommand:
     """Run every check that CI runs; what follows -- goes to pytest."""
 

@@ -1,12 +1,9 @@
 """Every scene by its name, those of the generator and `splats`, and how each becomes a capture."""
 
-from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-
-import numpy as np
 
 from ash.fields import Changes, apply_overrides, suggest
 from ash.files import InputError
@@ -77,14 +74,3 @@ def draw_scene(of: str, wanted: Scene, folder: Path, *, title: str, workers: int
                 " when memory runs out, and fewer --workers need less"
             ) from None
     progress.close()
-
-
-def draw_views_of(of: str) -> Callable[..., list[np.ndarray]]:
-    """What draws single views of a scene, for sheets."""
-    if of == SPLATS:
-        from benchmarks.suites.splats import draw_views
-
-        return draw_views
-    from synth.readers.sheets import path_traced
-
-    return path_traced

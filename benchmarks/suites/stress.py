@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from ash.capture.dataset import Capture
 from ash.fields import suggest
 from ash.files import InputError
-from synth.readers.perturb import Perturbation
+from synth.perturbation.perturb import Perturbation
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

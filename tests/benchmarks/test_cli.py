@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from helpers.commands import ash_bench, refused, refused_last
+from helpers.commands import refused, refused_last
 from helpers.waiting import wait_for
 
 from ash.capture.manifest import read_manifest
@@ -204,20 +204,6 @@ def test_a_scene_that_a_suite_has_under_other_names_only_is_asked_for_by_them(tm
     told = refused(capsys, "run", str(suite), "--scenes", "still", "--dry-run")
     assert "mine has 'still' as still+cameras=160: expected that name in --scenes" in told
     assert cli.main(["run", str(suite), "--scenes", "still+cameras=160", "--dry-run"]) == arguments.DONE
-
-
-def test_the_reference_holds_the_public_names(tmp_path: Path) -> None:
-    pytest.importorskip("pdoc", reason="of the extra dev")
-    assert ash_bench("docs", "--out", str(tmp_path)).returncode == arguments.DONE
-    wanted = {
-        "ash/capture/dataset.html": ("Skeleton.heads", "Motion.dofs", "require_pose"),
-        "ash/capture/manifest.html": ("Split.views",),
-        "ash/protocol.html": ("Avatar.fit", "Configurable.config"),
-        "benchmarks/play/avatars.html": ("load_avatar", "LoadedAvatar.draw"),
-    }
-    for page, names in wanted.items():
-        text = (tmp_path / page).read_text()
-        assert [name for name in names if f'id="{name}"' not in text] == []
 
 
 def test_eval_renders_again_from_the_checkpoint(capture: Path, tmp_path: Path) -> None:

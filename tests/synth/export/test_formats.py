@@ -10,8 +10,8 @@ from PIL import Image
 from ash.capture.dataset import Capture
 from ash.capture.formats import load_capture
 from ash.files import InputError
+from synth.export.formats import export
 from synth.posing import linear_blend_skinning, skinning_transforms
-from synth.readers.export import export
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ from PIL import Image
 
 from ash.capture.dataset import Capture, TemplateMesh
 from ash.capture.formats import load_capture, read_template_truth
+from synth.export.formats import export
+from synth.export.official import graph_faces, graph_nodes, taken_vertices
 from synth.posing import bone_frames, linear_blend_skinning
-from synth.readers.export import export
-from synth.readers.official import graph_faces, graph_nodes, taken_vertices
 
 
 @pytest.fixture(scope="module")

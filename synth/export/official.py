@@ -304,7 +304,7 @@ def export_official(capture: Capture, folder: Path, *, subject: str = "Synthetic
     windows = np.stack([capture.motion.window(frame, 3) for frame in range(len(dofs))])
     cameras = [capture.cameras[name] for name in capture.splits["train"].cameras]
     if not all(camera.is_pinhole for camera in cameras):
-        raise InputError(f"{capture.folder}: a lens distorts and the release reads pinholes; run ash-bench undistort")
+        raise InputError(f"{capture.folder}: a lens distorts; expected pinholes: ash-bench export --format undistorted")
     training = max(capture.splits["train"].frames) + 1
     if capture.splits["train"].parts:
         raise InputError(

@@ -10,9 +10,9 @@ from ash.files import InputError, read_arrays
 from synth.camera.render import probe
 from synth.capture import make_body
 from synth.cloth import surface as cloth
-from synth.readers.retargeting import scene_of
 from synth.scene import Scene, stream
 from synth.shooting import studio_of
+from synth.truth.retargeting import scene_of
 
 HISTORY = 24  # frames before the pose, through which clothes are carried: they depend on where they came from
 

@@ -13,8 +13,8 @@ from ash.capture.formats import load_capture, read_surface_truth, write_cameras
 from ash.files import InputError, link_or_copy, read_arrays, sha256_of, write_arrays, write_image
 from synth.camera.render import Studio, probe
 from synth.person.body import Surface
-from synth.readers.truth import surface_truth
 from synth.scene import Light
+from synth.truth.pixels import surface_truth
 
 
 def undistort(source: Path, folder: Path) -> Path:

@@ -1,6 +1,6 @@
 """Which code makes captures: a capture made by other code is made again, never reused.
 
-All of `synth` but `synth.readers`, which decides no byte of one, and what defines one: `ash.capture`, `ash.files`.
+All of `synth` but its exports, perturbations and derived truth, and what defines a capture: `ash.capture`, `ash.files`.
 """
 
 import hashlib
@@ -12,7 +12,7 @@ from ash.files import hash_sources, source_files
 
 HERE = Path(__file__).parent
 MAKERS = (HERE, HERE.parent / "ash" / "capture", HERE.parent / "ash" / "files.py")
-READERS = (HERE / "readers",)
+NOT_HASHED = (HERE / "export", HERE / "perturbation", HERE / "truth")
 PACKAGES = ("anny", "drjit", "mitsuba", "numpy", "pillow", "scipy")
 
 
@@ -26,12 +26,12 @@ def code_version() -> str:
 @lru_cache(maxsize=1)
 def source_version() -> str:
     """Hash of our sources alone: equal on machines whose renders differ by rounding."""
-    return hash_sources(*MAKERS, without=READERS)[:16]
+    return hash_sources(*MAKERS, without=NOT_HASHED)[:16]
 
 
 def maker_sources() -> list[Path]:
     """The files of source that decide the bytes of a capture."""
-    return source_files(*MAKERS, without=READERS)
+    return source_files(*MAKERS, without=NOT_HASHED)
 
 
 def _version(package: str) -> str:

@@ -18,7 +18,10 @@ def scene_of(manifest: Manifest, folder: Path) -> Scene:
         InputError: the capture is not one of ours, or was made by a version whose scenes were others.
     """
     try:
-        scene: Scene = from_json(Scene, manifest.parameters)
+        parameters = dict(manifest.parameters)
+        if isinstance(rig := parameters.get("rig"), dict) and rig.get("shutter") == 0:
+            parameters["rig"] = {key: value for key, value in rig.items() if key != "shutter"}
+        scene: Scene = from_json(Scene, parameters)
     except ValueError as error:
         raise InputError(f"{folder}: its manifest describes no scene of this version ({error})") from error
     if scene.identity != manifest.identity:

@@ -8,8 +8,8 @@ import numpy as np
 from ash.capture.dataset import Capture, Split
 from ash.capture.formats import write_cameras, write_skeleton, write_template
 from ash.files import InputError, write_arrays, write_atomic, write_image, write_json
+from synth.export.official import export_official
 from synth.posing import bone_frames, dual_quaternion_skinning, rotmat_to_unitquat, skinning_transforms
-from synth.readers.official import export_official
 
 
 def export_nerfstudio(capture: Capture, folder: Path, *, split: str = "train", frame: int | None = None) -> Path:
@@ -141,12 +141,20 @@ def _write_model(capture: Capture, folder: Path, *, cameras: Sequence[str], fram
     )
 
 
+def export_undistorted(capture: Capture, folder: Path) -> Path:
+    """A capture of pinhole cameras; see `synth.export.undistorted`."""
+    from synth.export.undistorted import undistort
+
+    return undistort(capture.folder, folder)
+
+
 FORMATS: dict[str, Callable[..., Path]] = {
     "ash": export_official,
     "nerfstudio": export_nerfstudio,
     "colmap": export_colmap,
     "plain": export_plain,
     "test-views": export_test_views,
+    "undistorted": export_undistorted,
 }
 OF_ONE_SPLIT = ("nerfstudio", "colmap")
 

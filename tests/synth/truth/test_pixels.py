@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ash.capture.dataset import Capture, pixels_path, plate_path
+from ash.capture.dataset import Capture, farthest_points, pixels_path, plate_path
 from ash.capture.formats import load_capture, read_cameras, write_cameras
 from ash.capture.manifest import verify_capture
 from ash.files import InputError, read_image, write_arrays
-from synth.camera.rig import held_out, make_cameras, rig_from_file, spread
+from synth.camera.rig import held_out, make_cameras, rig_from_file
 from synth.person.body import PARTS
-from synth.readers import truth
-from synth.readers.perturb import Perturbation, miscalibrate, mistrack, perturb
+from synth.perturbation.perturb import Perturbation, miscalibrate, mistrack, perturb
 from synth.scene import RIGS, Rig
+from synth.truth import pixels as truth
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +192,7 @@ def test_subsets_are_nested_and_spread():
     rng = np.random.default_rng(1)
     positions = rng.normal(size=(60, 3))
     positions /= np.linalg.norm(positions, axis=1, keepdims=True)
-    four, twelve = spread(positions, 4), spread(positions, 12)
+    four, twelve = farthest_points(positions, 4), farthest_points(positions, 12)
     assert twelve[:4] == four and len(set(twelve)) == 12
     apart = np.linalg.norm(positions[four][:, None] - positions[four], axis=-1)[~np.eye(4, dtype=bool)]
     assert apart.min() > 0.9
