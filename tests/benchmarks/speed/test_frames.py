@@ -166,7 +166,9 @@ def test_an_empty_image_does_not_agree(trained: Trained, monkeypatch: pytest.Mon
 
 def test_an_agreement_has_the_least_weight_of_the_decoders(trained: Trained, monkeypatch: pytest.MonkeyPatch) -> None:
     avatar, capture = trained
-    monkeypatch.setattr(TextureDrawer, "decoder_weight", lambda self, textures: 0.7 if self.novelty(textures) > 1e-3 else 1.0)
+    monkeypatch.setattr(
+        TextureDrawer, "decoder_weight", lambda self, textures: 0.7 if self.novelty(textures) > 1e-3 else 1.0
+    )
     new = agreements(avatar, capture)["new"]
     assert new.least_decoder_weight == 0.7
     assert f"of {len(NEW)} frames, decoder weight 0.70 or more" in new.line()
