@@ -104,9 +104,9 @@ int ash_rasterize(const double* vertices, const int* faces, int64_t face_count, 
         for (int band = t.top / BAND; band <= (t.bottom - 1) / BAND; ++band) members[band].push_back(int(f));
     }
     const Target target{width, triangle, barycentric, depth};
-    const int64_t stride = width + BEYOND, room = bands * BAND * stride;
-    const std::unique_ptr<double[]> all_nearest(new double[room]);
-    const std::unique_ptr<int64_t[]> all_seen(new int64_t[room]);
+    const int64_t stride = width + BEYOND, samples = bands * BAND * stride;
+    const std::unique_ptr<double[]> all_nearest(new double[samples]);
+    const std::unique_ptr<int64_t[]> all_seen(new int64_t[samples]);
     in_parallel(threads, bands, [&](int64_t number) {
         const int top = int(number) * BAND, bottom = std::min(height, top + BAND);
         const int64_t from = int64_t(top) * width, until = int64_t(bottom) * width;

@@ -76,7 +76,7 @@ def compare_samples(
         if min(len(first), len(second)) > 1:
             spread = math.sqrt((float(np.var(first, ddof=1)) + float(np.var(second, ddof=1))) / 2)
     mean = float(np.mean(first) - np.mean(second))
-    found = Comparison(
+    comparison = Comparison(
         mean=mean,
         spread=spread,
         captures=len(shared) if len(shared) > 1 else 0,
@@ -84,15 +84,15 @@ def compare_samples(
         higher_is_better=higher_is_better,
     )
     if math.isnan(spread):
-        return found
+        return comparison
     if spread <= ROUNDING * abs(mean) or spread == 0:
-        return replace(found, low=mean, high=mean, p=float(mean == 0), spread=0.0, detectable=0.0)
-    test = stats.ttest_rel(first, second) if found.captures else stats.ttest_ind(first, second, equal_var=False)
+        return replace(comparison, low=mean, high=mean, p=float(mean == 0), spread=0.0, detectable=0.0)
+    test = stats.ttest_rel(first, second) if comparison.captures else stats.ttest_ind(first, second, equal_var=False)
     interval = test.confidence_interval(level)
     quantile = float(stats.t.ppf((1 + level) / 2, test.df))
     error = (float(interval.high) - float(interval.low)) / (2 * quantile)
     return replace(
-        found,
+        comparison,
         low=float(interval.low),
         high=float(interval.high),
         p=float(test.pvalue),
@@ -102,8 +102,8 @@ def compare_samples(
 
 def corrected(comparisons: Sequence[Comparison]) -> list[Comparison]:
     """With p adjusted so that the chance of any false alarm among all of them is at most 5 % (Holm 1979)."""
-    known = [each.p for each in comparisons if not math.isnan(each.p)]
-    adjusted = iter(holm(known))
+    p_values = [each.p for each in comparisons if not math.isnan(each.p)]
+    adjusted = iter(holm(p_values))
     return [each if math.isnan(each.p) else replace(each, p=next(adjusted)) for each in comparisons]
 
 
@@ -149,17 +149,17 @@ def intervals(samples: Mapping[str, Samples]) -> dict[str, Interval]:
     Over several captures that all methods share, the common effect of a capture is removed first (Cousineau 2005, with
     the correction of Morey 2008), because subjects differ by more than methods do. Otherwise Student's interval.
     """
-    found = {method: mean_interval(independent(seeds)) for method, seeds in samples.items()}
+    by_method = {method: mean_interval(independent(seeds)) for method, seeds in samples.items()}
     first, *others = samples.values()
     shared = [capture for capture in first if all(capture in other for other in others)]
     if not others or len(shared) < 2:
-        return found
+        return by_method
     values = np.array([[np.mean(seeds[capture]) for capture in shared] for seeds in samples.values()])
     variances = (values - values.mean(0)).var(1, ddof=1) * len(samples) / len(others)
     halves = stats.t.ppf((1 + LEVEL) / 2, len(shared) - 1) * np.sqrt(variances / len(shared))
     return {
         method: Interval(mean=each.mean, low=each.mean - float(half), high=each.mean + float(half))
-        for (method, each), half in zip(found.items(), halves, strict=True)
+        for (method, each), half in zip(by_method.items(), halves, strict=True)
     }
 
 
