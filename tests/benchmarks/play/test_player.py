@@ -87,7 +87,8 @@ def test_methods_truth_errors_and_joints_are_chosen(player: PlayServer, viewer: 
     viewer.set("Camera", "cam0")
     viewer.press("Truth beside it")
     viewer.wait_for(lambda: "Against the truth" in viewer.words and "dB, FLIP" in viewer.words, PATIENCE)
-    viewer.set("Show the error", "FLIP")
+    viewer.set("Show the error", True)
+    viewer.wait_for(lambda: state_of(player).error)
     viewer.set("Joint", player.avatars.capture.skeleton.names[1])
     time.sleep(1.0)  # As a hand needs: the sliders take the joint's angles first.
     viewer.set("About x", 30)
