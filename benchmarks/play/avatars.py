@@ -110,9 +110,10 @@ class LoadedAvatar:
         return np.asarray(vertices) if len(vertices) else None
 
     @cached_property
-    def _decoders(self) -> Decode | None:
-        """The decoders on the engine that is fastest on this machine."""
-        assert isinstance(self.avatar, AshAvatar)
+    def decoders(self) -> Decode | None:
+        """The decoders on the engine that is fastest on this machine, which is measured once; None: the avatar's own."""
+        if not isinstance(self.avatar, AshAvatar):
+            return None
         engine = Player(self.avatar, self.motion, first_camera(self.capture)).engine
         return None if engine is None else engine.decode
 
@@ -121,7 +122,7 @@ class LoadedAvatar:
         key = (pose.motion.dofs[pose.window(8)].tobytes(), pose.frame)
         if key not in self._cache:
             if isinstance(self.avatar, AshAvatar):
-                posed = self.avatar.shared_gaussians(pose, clock=clock, decoders=self._decoders)
+                posed = self.avatar.shared_gaussians(pose, clock=clock, decoders=self.decoders)
             else:
                 posed = [(1.0, self.avatar.gaussians(pose))]
             self._cache[key] = posed

@@ -177,8 +177,8 @@ def test_a_new_viewer_sees_the_motion_that_was_asked_for(tube_run: Path) -> None
 
 
 def test_all_threads_end_with_the_player(tube_run: Path) -> None:
-    before = {thread.ident for thread in threading.enumerate()}
+    before = thread_names()
     with playing(tube_run) as player, browsers(player.url, 2, width=64, height=64) as two:
         for each in two:
             each.wait_for(lambda each=each: each.arrivals, PATIENCE)
-    wait_for(lambda: not {thread.ident for thread in threading.enumerate()} - before)
+    wait_for(lambda: thread_names() == before)
