@@ -10,6 +10,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from ash.bounded_cache import BoundedCache
 from ash.capture.dataset import Camera, Capture, Pose
 from ash.checkpoints import contiguous_state, load_module, read_safetensors
 from ash.config import AshConfig, ModelConfig
@@ -18,13 +19,12 @@ from ash.devices import device_named
 from ash.files import InputError, write_atomic
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.initialising import blank_gaussians, initial_gaussians, released_gaussians, texel_pitch
-from ash.kept import Kept
-from ash.model import AshModel, Decode, image_of
+from ash.model import AshModel, image_of
 from ash.protocol import StageClock, TrainingOutcome
 from ash.template.template import Template
 from ash.template_learning.learning import template_of, with_template
 from ash.template_learning.refining import refined_template
-from ash.textures import Conditions, TexelLattice, build_lattice, unsettled_frames
+from ash.textures import FrameInputs, TexelLattice, add_texture_noise_to_frames, build_lattice
 from ash.training.adam import Adam
 from ash.training.batches import draw_batch, over
 from ash.training.images import TrainingImages, load_training_images, training_part
@@ -33,7 +33,7 @@ from ash.training.loop import fit, view_loss
 RELEASED_OPACITY_WEIGHT = 0.1  # In the release's warm-up.
 FITTED_LOOK, FITTED_GAIN = 100, 0.01  # A frame is fitted until so many steps lower its loss by less than this share.
 
-DecodedFrame = tuple[Tensor, Conditions]  # raw parameters [n, o], and where they are posed
+DecodedFrame = tuple[Tensor, FrameInputs]  # raw parameters [n, o], and where they are posed
 MakeDecoders = Callable[[ModelConfig, TexelLattice], torch.nn.Module]
 
 
@@ -63,11 +63,11 @@ class AshAvatar:
             decoders = (make_decoders or Decoders)(config.model, self.lattice)
         self.module = AshModel(config.model, self.template, self.lattice, self._start(capture), decoders)
         if self.module.textures is not None:
-            self.module.textures.observe(self.template, capture.motion, capture.splits["train"].frames)
+            self.module.textures.fit_normalization(self.template, capture.motion, capture.splits["train"].frames)
         self.module.to(self.device)
         self.template, self.lattice = self.module.template, self.module.lattice
         self.analytic = self.analytic.to(self.device)
-        self._conditions = Kept(self._make_conditions)  # A template that images do not move is frozen.
+        self._inputs = BoundedCache(self._make_inputs)  # A template that images do not move is frozen.
         self._motion = capture.motion
         self._outcome: TrainingOutcome | None = None
 
@@ -90,13 +90,13 @@ class AshAvatar:
             before_start=lambda: self._warm_up(images),
         )
         self._outcome = replace(outcome, precision=self._precision)
-        self.template.forget()
+        self.template.clear_cache()
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Networks, and what is learned directly: static texels, light, a displacement of the template."""
         training, module = self.config.training, self.module
         nets = list(module.decoders.parameters()) if module.decoders is not None else []
-        slow, fast = [], [p for p in (module.base, module.static, module.light) if p is not None]
+        slow, fast = [], [p for p in (module.base_texels, module.fallback_texels, module.light) if p is not None]
         if module.refinement is not None:
             slow, shared = module.refinement.nets.networks(), module.refinement.shared.parameters()
             fast += shared
@@ -113,26 +113,26 @@ class AshAvatar:
 
     def decode_together(self, frames: Sequence[int], step: int) -> list[DecodedFrame]:
         """Stage 3 of a step's frames, on cached conditions; the base alone while the static warm-up lasts."""
-        training, conditions = self.config.training, [self._conditions_of(frame) for frame in frames]
+        training, conditions = self.config.training, [self._inputs_of(frame) for frame in frames]
         if step < training.static_steps:
-            return [(self.module.base, seen) for seen in conditions]
-        noisy = unsettled_frames(conditions, training.texture_noise, seed=self.config.seed, step=step)
+            return [(self.module.base_texels, seen) for seen in conditions]
+        noisy = add_texture_noise_to_frames(conditions, training.texture_noise, seed=self.config.seed, step=step)
         return list(zip(self._decode(noisy), conditions, strict=True))
 
     def draw_static_views(self, frame: int, cameras: list[Camera], background: Tensor) -> Tensor | None:
         """Views of the static avatar, which counts far from the training motion."""
-        static = self.module.static
+        static = self.module.fallback_texels
         if static is None:
             return None
-        return self._drawn(static, self._conditions_of(frame), cameras, background)
+        return self._drawn(static, self._inputs_of(frame), cameras, background)
 
     @torch.no_grad()
     def end_warmup(self) -> None:
         """Let the static avatar start from what the warm-up made."""
-        if self.module.static is not None:
-            self.module.static.copy_(self.module.base)
+        if self.module.fallback_texels is not None:
+            self.module.fallback_texels.copy_(self.module.base_texels)
 
-    def _drawn(self, raw: Tensor, conditions: Conditions, cameras: list[Camera], background: Tensor) -> Tensor:
+    def _drawn(self, raw: Tensor, conditions: FrameInputs, cameras: list[Camera], background: Tensor) -> Tensor:
         flat = background.ndim == 1
         try:
             drawn = self.module.draw(self.module.pose(raw, conditions), cameras, background if flat else None)
@@ -140,12 +140,12 @@ class AshAvatar:
         except InputError as error:  # Cameras and background come from the capture: the Gaussians are at fault.
             raise FloatingPointError(f"Gaussians that cannot be drawn ({error})") from error
 
-    def corrections(self, frame: int) -> Tensor | None:
+    def decoder_residual(self, frame: int) -> Tensor | None:
         """What the decoders add to the base in a training frame, raw parameters `[n, o]`."""
         decoders = self.module.decoders
-        return None if decoders is None else self.module.corrections(decoders(self._conditions_of(frame)))
+        return None if decoders is None else self.module.mask_offsets(decoders(self._inputs_of(frame)))
 
-    def _decode(self, frames: Sequence[Conditions]) -> list[Tensor]:
+    def _decode(self, frames: Sequence[FrameInputs]) -> list[Tensor]:
         """Stage 3 as it learns, in the precision of the configuration."""
         with decoding_in(self._precision, self.device):
             return [raw.float() for raw in self.module.decode_together(frames)]
@@ -154,15 +154,15 @@ class AshAvatar:
     def _precision(self) -> str:
         return decoding_precision(self.config.training.precision, self.device, self.config.model.width)
 
-    def _conditions_of(self, frame: int) -> Conditions:
+    def _inputs_of(self, frame: int) -> FrameInputs:
         if self.module.refinement is None:
-            return self._conditions[frame]
-        self.template.forget()  # It moves with every step: all that is drawn from it is drawn anew.
-        return self.module.conditions(Pose(self._motion, frame))
+            return self._inputs[frame]
+        self.template.clear_cache()  # It moves with every step: all that is drawn from it is drawn anew.
+        return self.module.frame_inputs(Pose(self._motion, frame))
 
     @torch.no_grad()
-    def _make_conditions(self, frame: int) -> Conditions:
-        return self.module.conditions(Pose(self._motion, frame))
+    def _make_inputs(self, frame: int) -> FrameInputs:
+        return self.module.frame_inputs(Pose(self._motion, frame))
 
     def _warm_up(self, images: TrainingImages) -> None:
         """ASH Eq. 8: regress the decoders to known Gaussians before anything is rendered through them."""
@@ -175,7 +175,7 @@ class AshAvatar:
             self._regress(chosen, fitted.__getitem__)
 
     def _released_target(self, frame: int) -> Tensor:
-        return released_gaussians(self.config.model, self.analytic, self._conditions_of(frame))
+        return released_gaussians(self.config.model, self.analytic, self._inputs_of(frame))
 
     def _fit_frame(self, images: TrainingImages, frame: int) -> Tensor:
         """Pseudo ground truth of one frame: positions stay on the template, everything else is fitted to its views."""
@@ -183,7 +183,7 @@ class AshAvatar:
         raw = self.analytic.clone().requires_grad_()
         optimiser = Adam([{"params": [raw], "lr": self.config.training.base_learning_rate}])
         with torch.no_grad():
-            conditions = self._conditions_of(frame)
+            conditions = self._inputs_of(frame)
         losses: list[float] = []
         while not _is_fitted(losses, self.config.training.fitted_steps):
             step = len(losses)
@@ -205,7 +205,7 @@ class AshAvatar:
         weights[10] = opacity
         for step in range(training.warmup_steps):
             frame = frames[step % len(frames)]
-            (raw,) = self._decode([self._conditions_of(frame)])
+            (raw,) = self._decode([self._inputs_of(frame)])
             loss = (weights * (raw - target(frame)) ** 2).mean()
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
@@ -235,15 +235,13 @@ class AshAvatar:
 
     @torch.no_grad()
     def gaussians(self, pose: Pose) -> Gaussians:
-        """The posed Gaussians: world, metres, on its device; of a mixed picture, those with the larger share."""
+        """The posed Gaussians: world, metres, on its device; of a blend, those with the larger share."""
         return max(self.shared_gaussians(pose), key=lambda found: found[0])[1]
 
     @torch.no_grad()
-    def shared_gaussians(
-        self, pose: Pose, *, clock: StageClock | None = None, decoders: Decode | None = None
-    ) -> list[tuple[float, Gaussians]]:
-        """All sets of posed Gaussians of which the picture is mixed, and their shares (`ash.model.mixed`)."""
-        return self.module.gaussians(pose, clock, decoders=decoders)
+    def shared_gaussians(self, pose: Pose, *, clock: StageClock | None = None) -> list[tuple[float, Gaussians]]:
+        """All sets of posed Gaussians whose renders are blended, and their weights (`ash.model.blend_renders`)."""
+        return self.module.gaussians(pose, clock)
 
     @property
     def dilation(self) -> float:
@@ -265,7 +263,7 @@ class AshAvatar:
     def load(self, path: Path) -> None:
         """Read the weights that `save` wrote."""
         load_module(self.module, read_safetensors(path)[0], path)
-        self.template.forget()
+        self.template.clear_cache()
 
 
 def _is_fitted(losses: Sequence[float], steps: int) -> bool:

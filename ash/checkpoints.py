@@ -9,6 +9,8 @@ from torch import Tensor
 
 from ash.files import InputError
 
+OLD_NAMES = {"base": "base_texels", "static": "fallback_texels"}  # in checkpoints of version 0.3 and earlier
+
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Tensors and metadata of a safetensors file, or an InputError that names it."""
@@ -28,6 +30,7 @@ def load_module(module: torch.nn.Module, tensors: dict[str, Tensor], path: Path)
     """Load parameters and check that they fit and are finite."""
     if not all(torch.isfinite(tensor).all() for tensor in tensors.values()):
         raise InputError(f"{path}: holds NaN or infinity")
+    tensors = {OLD_NAMES.get(name, name): tensor for name, tensor in tensors.items()}
     try:
         module.load_state_dict(tensors)
     except RuntimeError as error:

@@ -35,7 +35,7 @@ class AtlasConfig:
     standardise: bool = False  # decoders see deviations from the mean training texture, in its units; not in the paper
     bound: float = 3.0  # spreads at which those are cut off: what lies farther out was hardly ever learned from
     # novelty of a pose, in spreads, at which half of its picture is a static avatar's; 0: never; not in the paper
-    fade: float = 0.0
+    novelty_scale: float = 0.0
     light: bool = False  # colour times exp(SH2 of the posed normal), 27 numbers; not in the paper
     base: bool = False  # learned static texels with the decoders as residual; not in the paper
     global_features: bool = True  # Phi, from the root translation, at the bottleneck of the U-Net that makes colours
@@ -57,12 +57,12 @@ class AtlasConfig:
             raise InputError(f"window and width: expected at least 1, got {self.window} and {self.width}")
         if not self.bound > 0:
             raise InputError(f"bound: expected more than 0 spreads (inf: none), got {self.bound}")
-        if not 0 <= self.fade < math.inf:
-            raise InputError(f"fade: expected a finite novelty of at least 0, got {self.fade}")
-        if self.fade and not (self.standardise and self.decoded_texels % 4 == 0):
-            raise InputError("fade compares standardised textures: it needs standardise=True and 4 texels")
-        if self.fade and not self.base:
-            raise InputError("fade mixes in a static avatar: it needs base=True")
+        if not 0 <= self.novelty_scale < math.inf:
+            raise InputError(f"novelty_scale: expected a finite novelty of at least 0, got {self.novelty_scale}")
+        if self.novelty_scale and not (self.standardise and self.decoded_texels % 4 == 0):
+            raise InputError("novelty_scale compares standardised textures: it needs standardise=True and 4 texels")
+        if self.novelty_scale and not self.base:
+            raise InputError("novelty_scale mixes in a static avatar: it needs base=True")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

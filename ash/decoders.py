@@ -13,7 +13,7 @@ import ash.native.library
 import ash.native.unet
 from ash.config import ModelConfig
 from ash.gaussians.gaussians import GEOMETRY_CHANNELS, raw_channels
-from ash.textures import Conditions, SeenFrame, TexelLattice
+from ash.textures import DecoderInputs, FrameInputs, TexelLattice
 
 GLOBAL_FEATURES = 16
 OCTAVES = 6
@@ -200,7 +200,7 @@ def apart(batch: Tensor) -> Sequence[Tensor]:
 
 
 def seen_together(
-    frames: Sequence[SeenFrame], phi: GlobalFeatures | None
+    frames: Sequence[DecoderInputs], phi: GlobalFeatures | None
 ) -> tuple[Float[Tensor, "b c r r"], Float[Tensor, "*each 16"] | None]:
     """Frames as one batch for U-Nets: textures in their memory order, and Phi."""
     textures = as_batch([frame.textures for frame in frames]).contiguous(memory_format=torch.channels_last)
@@ -233,11 +233,11 @@ class Decoders(nn.Module):
         self.phi = GlobalFeatures(config.global_mlp) if config.global_features else None
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def forward(self, conditions: Conditions) -> Float[Tensor, "n o"]:
+    def forward(self, conditions: FrameInputs) -> Float[Tensor, "n o"]:
         """Decode one frame."""
         return self.together([conditions])[0]
 
-    def together(self, conditions: Sequence[Conditions]) -> Sequence[Float[Tensor, "n o"]]:
+    def together(self, conditions: Sequence[FrameInputs]) -> Sequence[Float[Tensor, "n o"]]:
         """Decode several frames as one batch."""
         x, phi = seen_together(conditions, self.phi)
         seen_by = [None] * (len(self.nets) - 1) + [phi]  # E_geo does not see Phi, unless the trunk is shared.

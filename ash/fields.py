@@ -15,9 +15,7 @@ from typeguard import TypeCheckError, check_type
 from ash.files import InputError
 
 Config = TypeVar("Config")
-Changes = tuple[
-    tuple[str, Any], ...
-]  # Dotted key and value, in order of the keys: what is replaced in a configuration.
+Changes = tuple[tuple[str, Any], ...]  # Dotted key and value, in order of the keys: what is changed in a configuration.
 INFINITE = ("inf", "-inf")  # JSON has no number for them.
 WRITTEN: dict[Any, str] = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
 
@@ -37,11 +35,11 @@ def changed(before: Any, after: Any) -> Changes:
 
 
 def for_json(changes: Changes) -> dict[str, Any]:
-    """Changes as a file or a hash takes them: where a number is infinite its name, which `replaced` takes as well."""
+    """Changes as a file or a hash takes them: an infinite number by its name, which `apply_overrides` reads."""
     return {key: str(value) if isinstance(value, float) and math.isinf(value) else value for key, value in changes}
 
 
-def replaced(config: Config, changes: Mapping[str, Any] | Changes, *, of: str) -> Config:
+def apply_overrides(config: Config, changes: Mapping[str, Any] | Changes, *, of: str) -> Config:
     """The dataclass with other values at dotted keys. A value that is a function is given the whole dataclass.
 
     All changes of one part come at once, so that fields that must agree are checked together.
@@ -62,7 +60,7 @@ def replaced(config: Config, changes: Mapping[str, Any] | Changes, *, of: str) -
     return _replaced(config, nested, "", of, tuple(flat(config)))
 
 
-def nearest(name: str, known: tuple[str, ...]) -> str:
+def suggest(name: str, known: tuple[str, ...]) -> str:
     """The known names that a wrong one may have meant, all of them where none is near; for an error's end."""
     ends = [key for key in known if key.rpartition(".")[2] == name.rpartition(".")[2]]
     close = list(dict.fromkeys([*ends, *get_close_matches(name, known, n=3, cutoff=0.5)]))[:4]
@@ -78,7 +76,7 @@ def _replaced(config: Any, changes: Mapping[str, Any], prefix: str, of: str, kno
     for name, value in changes.items():
         key = f"{prefix}{name}"
         if name not in parts:
-            raise InputError(f"{of}: unknown key {key!r}, {nearest(key, known)}")
+            raise InputError(f"{of}: unknown key {key!r}, {suggest(key, known)}")
         if isinstance(value, dict) and _has_parts(parts[name]):
             values[name] = _replaced(parts[name], value, f"{key}.", of, known)
         else:

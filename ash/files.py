@@ -297,7 +297,7 @@ def disk_problem(error: OSError) -> str | None:
 
 
 @contextlib.contextmanager
-def only_run_in(folder: Path) -> Iterator[None]:
+def run_lock(folder: Path) -> Iterator[None]:
     """Hold a folder for this process; the lock ends with the process, however that ends.
 
     Raises:
@@ -323,7 +323,7 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 @contextlib.contextmanager
-def only_one(path: Path) -> Iterator[None]:
+def file_lock(path: Path) -> Iterator[None]:
     """Hold the right to make a file; the lock goes with the process that holds it, however that ends."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.with_suffix(".lock").open("w") as lock:

@@ -1,6 +1,6 @@
 """The ASH avatar, in the paper's order: template, textures, decoders, skinning, splatting. START READING HERE."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from typing import Any
@@ -16,18 +16,19 @@ from ash.decoders import Decoders
 from ash.devices import MovingModule, finish
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted, splat
-from ash.gaussians.texels import LIGHT_COEFFICIENTS, place, pose
+from ash.gaussians.texels import LIGHT_COEFFICIENTS, pose, sample_surface
 from ash.protocol import StageClock
 from ash.template.motion import normalised_motion
 from ash.template.template import Template
 from ash.template_learning.refining import MotionRefinement, RefinedDeformation
-from ash.textures import Conditions, TexelLattice, TextureDrawer, build_lattice
-
-Decode = Callable[[Conditions], Tensor]  # to raw parameters [n, o]
+from ash.textures import FrameInputs, TexelLattice, TextureDrawer, build_lattice
 
 
 class AshModel(MovingModule):
-    """The learned part of ASH, and how the stages are joined. `base` and `light` are not in the paper."""
+    """The learned part of ASH, and how the stages are joined.
+
+    Not in the paper: learned `base_texels`, `fallback_texels` and `light`.
+    """
 
     def __init__(
         self,
@@ -39,7 +40,7 @@ class AshModel(MovingModule):
     ) -> None:
         """`initial`: raw parameters per texel, to which the decoders add theirs; no decoders: they are all there is.
 
-        Decoders map `Conditions` to `[n, o]`; those of the paper are `ash.decoders.Decoders`.
+        Decoders map `FrameInputs` to `[n, o]`; those of the paper are `ash.decoders.Decoders`.
         """
         super().__init__()
         self.config = config
@@ -53,29 +54,31 @@ class AshModel(MovingModule):
                 yaw_normalise=config.yaw_normalise,
                 standardise=config.standardise,
                 bound=config.bound,
-                fade=config.fade,
+                novelty_scale=config.novelty_scale,
             )
-        self.base = nn.Parameter(initial.clone(), requires_grad=config.base)
+        self.base_texels = nn.Parameter(initial.clone(), requires_grad=config.base)
         self.decoders = decoders
-        fades = config.fade and self.textures is not None
-        self.static = nn.Parameter(initial.clone()) if fades else None  # what counts far from the training motion
+        fades = config.novelty_scale and self.textures is not None
+        self.fallback_texels = (
+            nn.Parameter(initial.clone()) if fades else None
+        )  # what counts far from the training motion
         self.refinement: MotionRefinement | None = None
         if isinstance(template.deformation, RefinedDeformation):
             self.refinement = template.deformation.refinement
         self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.light else None
 
-    def conditions(self, pose: Pose, clock: StageClock | None = None, threads: int = 1) -> Conditions:
+    def frame_inputs(self, pose: Pose, clock: StageClock | None = None, threads: int = 1) -> FrameInputs:
         """Stg.1 and Stg.2: pose the template, and draw what the decoders see."""
-        device = self.base.device
+        device = self.base_texels.device
         with stage(clock, "stg1", device):
             learns = self.refinement is not None and torch.is_grad_enabled()
-            posed = self.template.pose_anew(pose) if learns else self.template.pose(pose)
+            posed = self.template.pose_uncached(pose) if learns else self.template.pose(pose)
         with stage(clock, "stg2", device):
-            canonical, normals, transforms = place(self.lattice, posed, self.config.anchor, threads=threads)
+            canonical, normals, transforms = sample_surface(self.lattice, posed, self.config.anchor, threads=threads)
             textures = self._textures(pose)
-            return Conditions(
+            return FrameInputs(
                 textures=textures,
-                trust=1.0 if self.textures is None else self.textures.trust(textures),
+                decoder_weight=1.0 if self.textures is None else self.textures.decoder_weight(textures),
                 motion=normalised_motion(pose, window=self.config.window).to(device),
                 root_translation=torch.from_numpy(pose.dofs[:3]).float().to(device),
                 canonical=canonical,
@@ -84,27 +87,29 @@ class AshModel(MovingModule):
             )
 
     def _textures(self, pose: Pose) -> Float[Tensor, "c r r"]:
-        return self.base.new_zeros(0, 1, 1) if self.textures is None else self.textures(self.template, pose)
+        return self.base_texels.new_zeros(0, 1, 1) if self.textures is None else self.textures(self.template, pose)
 
-    def decode(self, conditions: Conditions, *, decoders: Decode | None = None) -> Float[Tensor, "n o"]:
-        """Stg.3: raw Gaussian parameters per texel; by other `decoders` than the model's own where they are given."""
-        decoders = decoders or self.decoders
-        return self.base if decoders is None else self.base + self.corrections(decoders(conditions))
+    def decode(self, conditions: FrameInputs) -> Float[Tensor, "n o"]:
+        """Stg.3: raw Gaussian parameters per texel."""
+        return (
+            self.base_texels
+            if self.decoders is None
+            else self.base_texels + self.mask_offsets(self.decoders(conditions))
+        )
 
-    def decode_together(self, frames: Sequence[Conditions]) -> list[Float[Tensor, "n o"]]:
+    def decode_together(self, frames: Sequence[FrameInputs]) -> list[Float[Tensor, "n o"]]:
         """`decode` of several frames, by U-Nets in one batch; by what decodes in another way frame by frame."""
         if len(frames) == 1 or not isinstance(self.decoders, Decoders):
             return [self.decode(seen) for seen in frames]
-        decoded = zip(frames, self.decoders.together(frames), strict=True)
-        return [self.decode(seen, decoders=lambda _, of_frame=of_frame: of_frame) for seen, of_frame in decoded]
+        return [self.base_texels + self.mask_offsets(decoded) for decoded in self.decoders.together(frames)]
 
-    def corrections(self, decoded: Float[Tensor, "n o"]) -> Float[Tensor, "n o"]:
+    def mask_offsets(self, decoded: Float[Tensor, "n o"]) -> Float[Tensor, "n o"]:
         """What of the decoders' output counts: all of it, or all but the offsets."""
         if self.config.motion_offset:
             return decoded
         return torch.cat([torch.zeros_like(decoded[:, :3]), decoded[:, 3:]], 1)
 
-    def pose(self, raw: Float[Tensor, "n o"], conditions: Conditions, threads: int = 1) -> Gaussians:
+    def pose(self, raw: Float[Tensor, "n o"], conditions: FrameInputs, threads: int = 1) -> Gaussians:
         """Activate the raw parameters and carry them from canonical to posed space (Eq. 5)."""
         return pose(raw, conditions, self.config, self.light, threads=threads)
 
@@ -116,45 +121,38 @@ class AshModel(MovingModule):
             gaussians, **views_of(cameras), background=background, dilation=self.config.dilation, threads=threads
         )
 
-    def forward(
-        self,
-        pose: Pose,
-        camera: Camera,
-        clock: StageClock | None = None,
-        *,
-        decoders: Decode | None = None,
-    ) -> Splatted:
+    def forward(self, pose: Pose, camera: Camera, clock: StageClock | None = None) -> Splatted:
         """Motion and camera to image: the whole of ASH, over black, on as many threads as torch is given."""
-        shared = self.gaussians(pose, clock, decoders=decoders)
-        with stage(clock, "stg4", self.base.device):
+        shared = self.gaussians(pose, clock)
+        with stage(clock, "stg4", self.base_texels.device):
             threads = torch.get_num_threads()
-            return mixed([(share, self.draw(gaussians, [camera], None, threads)) for share, gaussians in shared])
+            return blend_renders(
+                [(share, self.draw(gaussians, [camera], None, threads)) for share, gaussians in shared]
+            )
 
-    def gaussians(
-        self, pose: Pose, clock: StageClock | None = None, *, decoders: Decode | None = None
-    ) -> list[tuple[float, Gaussians]]:
-        """Motion to posed Gaussians: everything that does not depend on the camera; sets as `shares` has them."""
+    def gaussians(self, pose: Pose, clock: StageClock | None = None) -> list[tuple[float, Gaussians]]:
+        """Motion to posed Gaussians: all that does not depend on the camera; one set per `blend_components`."""
         threads = torch.get_num_threads()
-        conditions = self.conditions(pose, clock, threads)  # Stg.1, Stg.2
-        with stage(clock, "stg3", self.base.device):
-            shares = self.shares(self.decode(conditions, decoders=decoders), conditions)
-        with stage(clock, "stg4", self.base.device):
+        conditions = self.frame_inputs(pose, clock, threads)  # Stg.1, Stg.2
+        with stage(clock, "stg3", self.base_texels.device):
+            shares = self.blend_components(self.decode(conditions), conditions)
+        with stage(clock, "stg4", self.base_texels.device):
             return [(share, self.pose(raw, conditions, threads)) for share, raw in shares]
 
-    def shares(self, decoded: Float[Tensor, "n o"], conditions: Conditions) -> list[tuple[float, Tensor]]:
-        """Raw parameters of which the picture is mixed, and their shares of it, the decoded ones first.
+    def blend_components(self, decoded: Float[Tensor, "n o"], conditions: FrameInputs) -> list[tuple[float, Tensor]]:
+        """Raw parameters whose renders are blended, with their weights, the decoded ones first.
 
-        Of a pose that is not trusted whole (`TextureDrawer.trust`) the static avatar is shown, too. Not in the paper.
+        Where `TextureDrawer.decoder_weight` is below 1 the rest is a static avatar. Not in the paper.
         """
-        if self.static is None or conditions.trust == 1:
+        if self.fallback_texels is None or conditions.decoder_weight == 1:
             return [(1.0, decoded)]
-        return [(conditions.trust, decoded), (1 - conditions.trust, self.static)]
+        return [(conditions.decoder_weight, decoded), (1 - conditions.decoder_weight, self.fallback_texels)]
 
 
-def mixed(drawn: Sequence[tuple[float, Splatted]]) -> Splatted:
-    """One picture of several, by their shares, which add up to 1.
+def blend_renders(drawn: Sequence[tuple[float, Splatted]]) -> Splatted:
+    """The weighted mean of renders; weights sum to 1.
 
-    Pictures are mixed, not parameters: two avatars that learned apart err apart, so that their mean is nearer to the
+    Renders are blended, not parameters: two avatars that learned apart err apart, so that their mean is nearer to the
     truth than either, while Gaussians halfway between theirs are worse than both (docs/tuning.md).
     """
     if len(drawn) == 1:

@@ -7,7 +7,7 @@ from typing import Any, Generic, TypeVar
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture
 from ash.config import AshConfig, ModelConfig, TemplateConfig, TrainingConfig
-from ash.fields import replaced
+from ash.fields import apply_overrides
 from ash.files import InputError
 from ash.protocol import Avatar
 
@@ -27,7 +27,7 @@ def ci() -> AshConfig:
         shuffle=2,
         sh_degree=0,
         standardise=True,
-        fade=0.7,
+        novelty_scale=0.7,
         base=True,
         anchor="surface",
         light=True,
@@ -157,7 +157,7 @@ def named(name: str) -> AshConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recipe(Generic[Config]):
+class MethodFactory(Generic[Config]):
     """A factory of avatars that offers its configuration (`ash.protocol.Configurable`)."""
 
     config: Callable[[str], Config]  # what a preset means
@@ -168,10 +168,12 @@ class Recipe(Generic[Config]):
         wanted: Any = self.config(preset) if config is None else config
         return self.build(replace(wanted, seed=seed), capture)
 
-    def but(self, changes: Mapping[str, Any]) -> "Recipe[Config]":
+    def with_overrides(self, changes: Mapping[str, Any]) -> "MethodFactory[Config]":
         """The same with other values at dotted keys; a function gives its value from the preset's configuration."""
-        return replace(self, config=lambda preset: replaced(self.config(preset), changes, of=preset))
+        return replace(self, config=lambda preset: apply_overrides(self.config(preset), changes, of=preset))
 
 
-ash = Recipe(config=named, build=AshAvatar)
-ash_truth = ash.but({"template": TemplateConfig(kind="exact")})  # An oracle: what the template's error costs.
+ash = MethodFactory(config=named, build=AshAvatar)
+ash_truth = ash.with_overrides(
+    {"template": TemplateConfig(kind="exact")}
+)  # An oracle: what the template's error costs.

@@ -78,16 +78,16 @@ def build_lattice(mesh: TemplateMesh, resolution: int) -> TexelLattice:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class SeenFrame:
+class DecoderInputs:
     """What U-Nets see of one frame; nothing in it is learned with the avatar."""
 
     textures: Float[Tensor, "c r r"]  # motion-aware textures
-    trust: float  # in 0..1: the share of the frame's picture that is decoded
+    decoder_weight: float  # in 0..1: the share of the frame's picture that is decoded
     root_translation: Float[Tensor, " 3"]  # metres
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Conditions(SeenFrame):
+class FrameInputs(DecoderInputs):
     """What Stg.1 and Stg.2 hand to the decoders for one frame."""
 
     motion: Float[Tensor, "k d"]  # the normalised motion window, newest frame first
@@ -96,7 +96,7 @@ class Conditions(SeenFrame):
     transforms: RigidTransforms  # texel-wise T of Eq. 5
 
 
-Seen = TypeVar("Seen", bound=SeenFrame)
+Seen = TypeVar("Seen", bound=DecoderInputs)
 
 
 @torch.no_grad()
@@ -138,18 +138,20 @@ def texture_statistics(
     return mean.float(), variance.sqrt().float().clamp(min=1e-3)[:, None, None]
 
 
-def unsettled(textures: Float[Tensor, "c r r"], sigma: float, *, seed: int, step: int) -> Float[Tensor, "c r r"]:
+def add_texture_noise(
+    textures: Float[Tensor, "c r r"], sigma: float, *, seed: int, step: int
+) -> Float[Tensor, "c r r"]:
     """Standardised textures with other noise in every step that learns: who sees it relies less on exact poses."""
     if sigma == 0 or not torch.is_grad_enabled():
         return textures
     return textures + sigma * smooth_noise(textures.shape, (seed, 3, step)).to(textures.device)
 
 
-def unsettled_frames(frames: Sequence[Seen], sigma: float, *, seed: int, step: int) -> list[Seen]:
-    """`unsettled` for the frames of a step, each with the noise that it would have in a step of its own."""
+def add_texture_noise_to_frames(frames: Sequence[Seen], sigma: float, *, seed: int, step: int) -> list[Seen]:
+    """`add_texture_noise` for the frames of a step, each with the noise that it would have in a step of its own."""
     own_steps = range(step * len(frames), (step + 1) * len(frames))
     return [
-        replace(seen, textures=unsettled(seen.textures, sigma, seed=seed, step=own))
+        replace(seen, textures=add_texture_noise(seen.textures, sigma, seed=seed, step=own))
         for seen, own in zip(frames, own_steps, strict=True)
     ]
 
@@ -177,26 +179,26 @@ class TextureDrawer(MovingModule):
         yaw_normalise: bool,
         standardise: bool,
         bound: float = 3.0,
-        fade: float = 0.0,
+        novelty_scale: float = 0.0,
     ) -> None:
-        """`fade`: see `trust`; 0: what is decoded always counts."""
+        """`novelty_scale`: see `decoder_weight`; 0: the decoders' weight is always 1."""
         super().__init__()
         self.lattice, self.window, self.yaw_normalise, self.standardise = lattice, window, yaw_normalise, standardise
-        self.bound, self.fade = bound, fade
+        self.bound, self.novelty_scale = bound, novelty_scale
         self.mean: Tensor
         self.spread: Tensor
         self.seen: Tensor  # [t, d]: the newest frame's textures of training frames, coarse
         if standardise:
             self.register_buffer("mean", torch.zeros(6 * window, lattice.resolution, lattice.resolution))
             self.register_buffer("spread", torch.ones(6 * window, 1, 1))
-        if fade:
+        if novelty_scale:
             self.register_buffer("seen", torch.zeros(0, 6 * (lattice.resolution // POOL) ** 2))
 
-    def observe(self, template: Template, motion: Motion, frames: tuple[int, ...]) -> None:
+    def fit_normalization(self, template: Template, motion: Motion, frames: tuple[int, ...]) -> None:
         """Take mean and spread from the frames of a training motion."""
         if self.standardise:
             self.mean, self.spread = texture_statistics(self._draw(template, Pose(motion, frame)) for frame in frames)
-        if self.fade:
+        if self.novelty_scale:
             some = frames[:: -(-len(frames) // COMPARED_FRAMES)]
             self.seen = torch.stack([self._coarse(self(template, Pose(motion, frame))) for frame in some])
 
@@ -214,15 +216,15 @@ class TextureDrawer(MovingModule):
         nearest = (self.seen - self._coarse(textures)).square().mean(1).min()
         return float((nearest / covered).sqrt())
 
-    def trust(self, textures: Float[Tensor, "c r r"]) -> float:
-        """The share of a picture that is decoded from these textures, the rest a static avatar's: 1 in training frames.
+    def decoder_weight(self, textures: Float[Tensor, "c r r"]) -> float:
+        """Weight of the decoded render in the blend with a static avatar: 1 in training frames. Not in the paper.
 
-        1 / (1 + (novelty / fade)^2): far from the training poses decoders are no better than a static avatar, and the
-        two err apart. Not in the paper.
+        1 / (1 + (novelty / novelty_scale)^2): far from the training poses decoders are no better than a static avatar,
+        and the errors of the two differ.
         """
-        if not self.fade:
+        if not self.novelty_scale:
             return 1.0
-        ratio = self.novelty(textures) / self.fade
+        ratio = self.novelty(textures) / self.novelty_scale
         return 1 / (1 + ratio * ratio)  # A power would overflow where a product is infinite.
 
     def _coarse(self, textures: Float[Tensor, "c r r"]) -> Float[Tensor, " d"]:

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 import ash.native.shading
+from ash.bounded_cache import BoundedCache
 from ash.capture.dataset import Camera, Capture, Pose, TemplateMesh
 from ash.checkpoints import contiguous_state, load_module, read_safetensors
 from ash.config import AshConfig, AtlasConfig, TemplateConfig, TrainingConfig, check_device, one_of
@@ -26,16 +27,15 @@ from ash.devices import CPU, MovingModule, device_named, moved
 from ash.files import InputError, write_atomic
 from ash.gaussians.initialising import initial_texture
 from ash.gaussians.texels import LIGHT_COEFFICIENTS
-from ash.kept import Kept
 from ash.mesh.drawing import MeshView, draw_seen, see_mesh, textured, topology_of
 from ash.model import stage
-from ash.presets import Recipe, named
+from ash.presets import MethodFactory, named
 from ash.protocol import Display, DressedMesh, StageClock, TrainingOutcome
 from ash.rotations import RigidTransforms
 from ash.template.template import PosedTemplate, Template
 from ash.template_learning.learning import template_of, with_template
 from ash.template_learning.refining import MotionRefinement, Refinement
-from ash.textures import SeenFrame, TextureDrawer, build_lattice, unsettled_frames
+from ash.textures import DecoderInputs, TextureDrawer, add_texture_noise_to_frames, build_lattice
 from ash.training.batches import over
 from ash.training.images import load_training_images, training_part
 from ash.training.loop import fit
@@ -90,7 +90,7 @@ def ddc_config(ash: AshConfig, *, seed: int, template: TemplateConfig) -> DdcCon
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class MeshConditions(SeenFrame):
+class MeshInputs(DecoderInputs):
     """What the networks see of a frame."""
 
     window: list[RigidTransforms]  # for the vertices' networks
@@ -109,7 +109,9 @@ class DdcModel(MovingModule):
         self.uvs = torch.from_numpy(mesh.uvs).float()
         self.topology = topology_of(template.faces)
         self.texture = nn.Parameter(initial.clone(), requires_grad=config.model.base)
-        self.static_texture = nn.Parameter(initial.clone()) if config.model.fade else None  # far from training motion
+        self.static_texture = (
+            nn.Parameter(initial.clone()) if config.model.novelty_scale else None
+        )  # far from training motion
         self.refinement: Refinement | MotionRefinement | None = None
         if config.refine == "motion":
             self.refinement = MotionRefinement(config.template, mesh, template.skeleton)
@@ -127,33 +129,33 @@ class DdcModel(MovingModule):
         self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.model.light else None
 
     @torch.no_grad()
-    def conditions(self, pose: Pose) -> MeshConditions:
+    def frame_inputs(self, pose: Pose) -> MeshInputs:
         """Stg.2: draw what the networks see."""
         textures = self.textures(self.template, pose)
-        return MeshConditions(
+        return MeshInputs(
             textures=textures,
-            trust=self.textures.trust(textures),
+            decoder_weight=self.textures.decoder_weight(textures),
             root_translation=torch.from_numpy(pose.dofs[:3]).float().to(self.texture.device),
             window=self.refinement.window(pose) if isinstance(self.refinement, MotionRefinement) else [],
         )
 
-    def dynamic_texture(self, conditions: MeshConditions) -> Float[Tensor, "3 t t"]:
-        """The texture of a frame; of a pose not trusted whole, mixed with a static one (`TextureDrawer.trust`)."""
+    def dynamic_texture(self, conditions: MeshInputs) -> Float[Tensor, "3 t t"]:
+        """The texture of a frame, blended with a static one by `TextureDrawer.decoder_weight`."""
         (texture,) = self.corrected_textures([conditions])
-        return texture if self.static_texture is None else self.static_texture.lerp(texture, conditions.trust)
+        return texture if self.static_texture is None else self.static_texture.lerp(texture, conditions.decoder_weight)
 
-    def corrected_textures(self, frames: Sequence[MeshConditions]) -> list[Float[Tensor, "3 t t"]]:
+    def corrected_textures(self, frames: Sequence[MeshInputs]) -> list[Float[Tensor, "3 t t"]]:
         """The texture with what the network adds in each frame; frames are decoded together."""
         factor, decoded = self.config.shuffle, self._decoded(frames)
         if self.texture.dtype == torch.float32 and self.texture.device.type == "cpu":
             return [ash.native.shading.add_shuffled(self.texture, added, factor) for added in decoded]
         return [self.texture + nn.functional.pixel_shuffle(added, factor) for added in decoded]
 
-    def correction(self, conditions: MeshConditions) -> Float[Tensor, "3 t t"]:
+    def correction(self, conditions: MeshInputs) -> Float[Tensor, "3 t t"]:
         """What the network adds: decoded at the resolution of the motion-aware textures and shuffled up."""
         return nn.functional.pixel_shuffle(self._decoded([conditions])[0], self.config.shuffle)
 
-    def _decoded(self, frames: Sequence[MeshConditions]) -> Sequence[Float[Tensor, "o r r"]]:
+    def _decoded(self, frames: Sequence[MeshInputs]) -> Sequence[Float[Tensor, "o r r"]]:
         return apart(self.network(*seen_together(frames, self.phi)))
 
     def see(self, posed: PosedTemplate, cameras: list[Camera]) -> list[MeshView]:
@@ -170,11 +172,11 @@ class DdcModel(MovingModule):
         shade = textured(texture, self.uvs, self.uv_faces, posed.normals, self.template.faces, self.light)
         return draw_seen(views, self.topology, shade, background, outlines=any(v.corners.requires_grad for v in views))
 
-    def refined(self, posed: PosedTemplate, conditions: MeshConditions) -> PosedTemplate:
+    def refined(self, posed: PosedTemplate, conditions: MeshInputs) -> PosedTemplate:
         """The template with its vertices where the images moved them. The light keeps the normals that it had."""
         if self.refinement is None:
             return posed
-        seen = (conditions.window, conditions.trust) if isinstance(self.refinement, MotionRefinement) else ()
+        seen = (conditions.window, conditions.decoder_weight) if isinstance(self.refinement, MotionRefinement) else ()
         canonical = posed.canonical + self.refinement(*seen)
         return replace(posed, canonical=canonical, vertices=posed.transforms.apply(canonical))
 
@@ -198,19 +200,21 @@ class DdcAvatar:
             yaw_normalise=config.model.yaw_normalise,
             standardise=config.model.standardise,
             bound=config.model.bound,
-            fade=config.model.fade,
+            novelty_scale=config.model.novelty_scale,
         )
-        textures.observe(self.template, capture.motion, capture.splits["train"].frames)
+        textures.fit_normalization(self.template, capture.motion, capture.splits["train"].frames)
         self.module = DdcModel(config, capture.template, self.template, textures, initial).to(self.device)
         self.template = self.module.template
         self._motion = capture.motion
         self._outcome: TrainingOutcome | None = None
         self._seen: tuple[Tensor, list[Camera], list[MeshView]] = (torch.empty(0), [], [])  # vertices drawn last
         # The template is frozen: each training frame is posed once, as far as there is room.
-        self._conditions: Kept[int, MeshConditions] = Kept(
-            lambda frame: self.module.conditions(Pose(capture.motion, frame))
+        self._inputs: BoundedCache[int, MeshInputs] = BoundedCache(
+            lambda frame: self.module.frame_inputs(Pose(capture.motion, frame))
         )
-        self._posed: Kept[int, PosedTemplate] = Kept(lambda frame: self.template.pose(Pose(capture.motion, frame)))
+        self._posed: BoundedCache[int, PosedTemplate] = BoundedCache(
+            lambda frame: self.template.pose(Pose(capture.motion, frame))
+        )
 
     def fit(self, capture: Capture, *, folder: Path) -> None:
         """Train texture and network on the training images; see `ash.training.loop.fit`."""
@@ -262,20 +266,20 @@ class DdcAvatar:
         drawn = self.module.draw(texture, posed, views, background if background.ndim == 1 else background.new_zeros(3))
         return drawn[..., :3] if background.ndim == 1 else over(drawn[..., :3], drawn[..., 3], background)
 
-    def corrections(self, frame: int) -> Tensor | None:
+    def decoder_residual(self, frame: int) -> Tensor | None:
         """What the network adds to the static texture in a training frame, `[3, t, t]`."""
-        return self.module.correction(self._conditions[frame])
+        return self.module.correction(self._inputs[frame])
 
     def _refined(self, frame: int) -> PosedTemplate:
-        return self.module.refined(self._posed[frame], self._conditions[frame])
+        return self.module.refined(self._posed[frame], self._inputs[frame])
 
     def decode_together(self, frames: Sequence[int], step: int) -> list[Float[Tensor, "3 t t"]]:
         """The textures of a step's frames; the static texture alone while the warm-up lasts."""
         training = self.config.training
         if step < training.static_steps:
             return [self.module.texture] * len(frames)
-        seen = [self._conditions[frame] for frame in frames]
-        noisy = unsettled_frames(seen, training.texture_noise, seed=self.config.seed, step=step)
+        seen = [self._inputs[frame] for frame in frames]
+        noisy = add_texture_noise_to_frames(seen, training.texture_noise, seed=self.config.seed, step=step)
         with decoding_in(self._precision, self.device):
             return [texture.float() for texture in self.module.corrected_textures(noisy)]
 
@@ -301,7 +305,7 @@ class DdcAvatar:
         with stage(clock, "stg1", self.device):
             posed = self.template.pose(pose)
         with stage(clock, "stg2", self.device):
-            conditions = self.module.conditions(pose)
+            conditions = self.module.frame_inputs(pose)
         with stage(clock, "stg3", self.device):
             return self.module.refined(posed, conditions), self.module.dynamic_texture(conditions).clamp(min=0)
 
@@ -330,7 +334,7 @@ class DdcAvatar:
         posed = self.template.pose(pose)
         if self.module.refinement is None:
             return posed.vertices.cpu().numpy()
-        return self.module.refined(posed, self.module.conditions(pose)).vertices.detach().cpu().numpy()
+        return self.module.refined(posed, self.module.frame_inputs(pose)).vertices.detach().cpu().numpy()
 
     def outcome(self) -> TrainingOutcome | None:
         """How training ended; None before it did."""
@@ -371,5 +375,5 @@ def _on_exact(preset: str) -> DdcConfig:
     return ddc_config(named(preset), seed=0, template=TemplateConfig(kind="exact"))
 
 
-ddc = Recipe(config=_of_preset, build=DdcAvatar)  # On the template that ASH gets.
-ddc_truth = Recipe(config=_on_exact, build=DdcAvatar)  # An oracle on the exact surface, to see when a mesh wins.
+ddc = MethodFactory(config=_of_preset, build=DdcAvatar)  # On the template that ASH gets.
+ddc_truth = MethodFactory(config=_on_exact, build=DdcAvatar)  # An oracle on the exact surface, to see when a mesh wins.

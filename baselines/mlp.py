@@ -8,8 +8,8 @@ from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture
 from ash.config import AshConfig, ModelConfig
 from ash.gaussians.gaussians import raw_channels
-from ash.presets import Recipe, named
-from ash.textures import Conditions
+from ash.presets import MethodFactory, named
+from ash.textures import FrameInputs
 
 LAYERS, WIDTH = 8, 256
 OCTAVES = 6
@@ -33,7 +33,7 @@ class MlpDecoder(nn.Module):
         nn.init.zeros_(head.bias)
         self.layers = nn.Sequential(*layers, head)
 
-    def forward(self, conditions: Conditions) -> Float[Tensor, "n o"]:
+    def forward(self, conditions: FrameInputs) -> Float[Tensor, "n o"]:
         """One Gaussian per row of the canonical positions."""
         position = encode(conditions.canonical)
         motion = conditions.motion.flatten().expand(len(position), -1)
@@ -52,6 +52,6 @@ def _with_mlp(config: AshConfig, capture: Capture) -> AshAvatar:
     return AshAvatar(config, capture, make_decoders=lambda model, _: MlpDecoder(model, dofs=dofs))
 
 
-mlp_base = Recipe(config=named, build=_with_mlp)  # In place of the 2D decoders, on ASH's learned texels.
+mlp_base = MethodFactory(config=named, build=_with_mlp)  # In place of the 2D decoders, on ASH's learned texels.
 # The paper's row: Gaussians straight from 3D, so no learned texels beneath; its limits of training as the preset says.
-mlp = mlp_base.but({"model.base": False, "model.fade": 0.0, "training.warmup": "fitted"})
+mlp = mlp_base.with_overrides({"model.base": False, "model.novelty_scale": 0.0, "training.warmup": "fitted"})

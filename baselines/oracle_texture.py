@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from ash.capture.dataset import Camera, Capture, Pose
 from ash.config import TemplateConfig
 from ash.model import stage
-from ash.presets import Recipe, named
+from ash.presets import MethodFactory, named
 from ash.protocol import StageClock
 from ash.template.template import PosedTemplate
 from baselines.ddc import DdcAvatar, DdcConfig, ddc_config
@@ -46,7 +46,7 @@ class OracleTexture(DdcAvatar):
         posed = self._surfaces[frame]
         return self._drawn(decoded, posed, self.module.see(posed, cameras), background)
 
-    def corrections(self, frame: int) -> None:
+    def decoder_residual(self, frame: int) -> None:
         """There is nothing that could differ between frames."""
 
     @torch.no_grad()
@@ -59,8 +59,8 @@ class OracleTexture(DdcAvatar):
 def _on_exact(preset: str) -> DdcConfig:
     config = named(preset)
     mesh = ddc_config(config, seed=0, template=TemplateConfig(kind="exact"))
-    model = replace(mesh.model, fade=0.0, global_features=False)
+    model = replace(mesh.model, novelty_scale=0.0, global_features=False)
     return replace(mesh, texture=TEXTURE_FACTOR * config.model.texels, model=model)
 
 
-oracle_texture = Recipe(config=_on_exact, build=OracleTexture)  # One texture, at the preset's budget.
+oracle_texture = MethodFactory(config=_on_exact, build=OracleTexture)  # One texture, at the preset's budget.

@@ -6,8 +6,8 @@ from pathlib import Path
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture
 from ash.config import AshConfig, TemplateConfig
+from baselines.ablations import wo_mot
 from baselines.nearest import central_frame
-from baselines.switches import wo_mot
 
 
 class StaticAvatar(AshAvatar):
@@ -29,4 +29,4 @@ def of_one_frame(capture: Capture) -> Capture:
 
 
 # One set of Gaussians from one frame, at the preset's budget; one frame teaches no deformation.
-static = replace(wo_mot, build=StaticAvatar).but({"template": TemplateConfig(kind="skinned")})
+static = replace(wo_mot, build=StaticAvatar).with_overrides({"template": TemplateConfig(kind="skinned")})

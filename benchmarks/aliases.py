@@ -3,9 +3,13 @@
 OLD_COMMANDS: dict[str, tuple[str, ...]] = {  # old command -> what is typed in its place; arguments follow unchanged
     "merge": ("report",),
     "rescore": ("eval", "--scores-only"),
+    "retarget": ("eval",),
+    "undistort": ("export", "--format", "undistorted"),
     "export-avatar": ("export",),
     "share": ("export", "--format", "html"),
     "video": ("export", "--format", "mp4"),
 }
 
 OLD_FORMATS = {"glb": "gltf"}  # of `export`, for avatars
+
+OLD_FIELDS = {"model.fade": "model.novelty_scale"}  # of configurations, as flags and as keys of a suite's file

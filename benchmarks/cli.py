@@ -27,7 +27,7 @@ def _set_threads() -> None:
 os.environ["PYTHONSAFEPATH"] = "1"
 _set_threads()  # Read as NumPy, torch and FLIP are loaded, the first of them by the imports below.
 
-from ash.fields import nearest
+from ash.fields import suggest
 from ash.files import InputError, disk_problem
 from benchmarks.aliases import OLD_COMMANDS
 from benchmarks.cell.children import METHOD_PATH, add_method_paths
@@ -44,18 +44,13 @@ COMMANDS = {
     "compare": "runs:CompareCommand",
     "eval": "runs:EvalCommand",
     "verify": "captures:VerifyCommand",
-    "undistort": "captures:UndistortCommand",
     "motions": "captures:MotionsCommand",
-    "sheets": "captures:SheetsCommand",
     "check-method": "methods:CheckMethodCommand",
-    "retarget": "methods:RetargetCommand",
-    "display": "methods:DisplayCommand",
     "play": "avatars:PlayCommand",
     "export": "avatars:ExportCommand",
     "gate": "gate:GateCommand",
     "speed": "checkout:SpeedCommand",
     "doctor": "checkout:DoctorCommand",
-    "docs": "checkout:DocsCommand",
     "test": "checkout:TestCommand",
 }
 
@@ -144,7 +139,7 @@ def _parse(tokens: Sequence[str]) -> Command | None:
     if first.startswith("--tyro-"):
         completion({name: _command(name) for name in COMMANDS}, tokens)
     if first not in COMMANDS:
-        raise InputError(f"unknown command {first!r}, {nearest(first, tuple(COMMANDS))}")
+        raise InputError(f"unknown command {first!r}, {suggest(first, tuple(COMMANDS))}")
     return read_command(_command(first), first, tokens[1:])
 
 

@@ -33,7 +33,6 @@ from synth.camera.render import Renderer, probe
 from synth.camera.rig import hull_of, make_cameras
 from synth.cloth import surface
 from synth.cloth.checks import Penetrations, penetrations, stretch
-from synth.code import code_version, source_version
 from synth.cost import require_space
 from synth.motion.clips import make_motion
 from synth.person import texture
@@ -43,6 +42,7 @@ from synth.person.cast import subject
 from synth.person.mannequin import mannequin
 from synth.scene import Scene, stream
 from synth.shooting import render_plates, render_views
+from synth.source_hash import code_version, source_version
 from synth.views import WantedView, by_frame, is_scanned, splits, wanted_views
 
 Progress = Callable[[int, int], None]

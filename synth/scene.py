@@ -114,7 +114,6 @@ class Rig:
     radius: float = 3.4  # metres
     pixel_aspect: float = 1.0  # fy / fx: 1 for square pixels
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # k1 k2 p1 p2 of every lens
-    shutter: float = 0.0  # how long it is open, as a share of the time between frames; 0: no motion blur
 
     def __post_init__(self) -> None:
         if self.kind not in RIGS:
@@ -129,10 +128,8 @@ class Rig:
             )
         if not (16 <= self.width <= 8192 and 16 <= self.height <= 8192):
             raise InputError(f"rig: images of {self.width}x{self.height}, expected 16 to 8192 pixels")
-        if not (0.1 <= self.pixel_aspect <= 10 and 0 <= self.shutter <= 1):
-            raise InputError(
-                f"rig: pixel aspect {self.pixel_aspect} and shutter {self.shutter}, expected 0.1 to 10 and 0 to 1"
-            )
+        if not 0.1 <= self.pixel_aspect <= 10:
+            raise InputError(f"rig: pixel aspect {self.pixel_aspect}, expected 0.1 to 10")
         if self.kind == "given" and (self.pixel_aspect != 1 or any(self.distortion)):
             raise InputError("a rig of kind 'given' has its own lenses, expected no other pixel aspect or distortion")
 
@@ -207,6 +204,7 @@ class Scene:
             del parameters["subject"]
         if not self.rig.part:
             del parameters["rig"]["part"]
+        parameters["rig"]["shutter"] = 0.0  # Of earlier versions, which had motion blur: the identity stays.
         for name in ("near", "far"):
             if not parameters[name]:
                 del parameters[name]

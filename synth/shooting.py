@@ -9,7 +9,6 @@ from ash.capture.formats import read_cameras
 from ash.files import read_arrays, read_image, write_arrays, write_image
 from synth.camera.render import Picture, Renderer, Studio, shoot_plates
 from synth.camera.scanning import scan
-from synth.camera.shutter import shutter_poses
 from synth.person.body import Surface
 from synth.scene import Scene, stream
 from synth.views import WantedView, is_scanned, splits
@@ -39,19 +38,12 @@ def render_views(scene: Scene, folder: Path, renderer: Renderer, views: list[Wan
     """Render the views of one frame and write them; the image last, so that its presence means that all is there."""
     studio = studio_of(scene, folder, renderer)
     cameras = read_cameras(folder / "cameras.json")
-    pose, during = _poses(scene, folder, views[0].frame)
+    pose = _pose(folder, views[0].frame)
     _scan(scene, folder, studio, cameras, pose, views[0].frame)
-    # With an open shutter the person moves once for all cameras; else every image is written as soon as it is there.
-    for group in [[view] for view in views] if len(during) == 1 else [views]:
-        pictures = studio.shoot(
-            pose,
-            [cameras[view.camera] for view in group],
-            samples=scene.samples,
-            seeds=[stream(scene, "pixels", view.camera, view.frame) for view in group],
-            during=during,
-        )
-        for view, picture in zip(group, pictures, strict=True):
-            _write_view(folder, view, picture)
+    for view in views:  # Written one by one: every image is kept as soon as it is there.
+        seed = stream(scene, "pixels", view.camera, view.frame)
+        (picture,) = studio.shoot(pose, [cameras[view.camera]], samples=scene.samples, seeds=[seed])
+        _write_view(folder, view, picture)
     return len(views)
 
 
@@ -74,18 +66,9 @@ def _scan(scene: Scene, folder: Path, studio: Studio, cameras: dict[str, Camera]
     write_arrays(scan_path(folder, frame), vertices=vertices, faces=faces)
 
 
-def _poses(scene: Scene, folder: Path, frame: int) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The surface in a frame, and while the shutter is open around it."""
-    first = 0
-    for clip in scene.clips:
-        if frame < first + clip.frames:
-            break
-        first += clip.frames
-    # The curve between two frames is bent by the frames beside them.
-    wanted = range(max(first, frame - 2), min(first + clip.frames, frame + 3)) if scene.rig.shutter else [frame]
-    surfaces = [read_arrays(surface_path(folder, k), expected=("vertices",))["vertices"] for k in wanted]
-    at = frame - wanted[0]
-    return surfaces[at], shutter_poses(np.stack(surfaces), at, shutter=scene.rig.shutter)
+def _pose(folder: Path, frame: int) -> np.ndarray:
+    """The surface in a frame, `[s, 3]` metres."""
+    return read_arrays(surface_path(folder, frame), expected=("vertices",))["vertices"]
 
 
 def _write_view(folder: Path, view: WantedView, picture: Picture) -> None:

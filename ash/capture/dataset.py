@@ -39,7 +39,7 @@ class Camera:
     """A calibrated camera. `K` is in pixels; `viewmat` maps world to camera (OpenCV axes, metres).
 
     Methods only ever see pinhole cameras: a capture whose lenses distort is undistorted first
-    (`synth.readers.undistorting`), and `Capture.training_only` refuses the others.
+    (`synth.export.undistorted`), and `Capture.training_only` refuses the others.
     """
 
     name: str
@@ -176,7 +176,9 @@ class Capture:
         """
         bent = [name for name, camera in self.cameras.items() if not camera.is_pinhole]
         if bent:
-            raise InputError(f"{self.folder}: the lens of {bent[0]} distorts; run ash-bench undistort on it first")
+            raise InputError(
+                f"{self.folder}: the lens of {bent[0]} distorts; first: ash-bench export --format undistorted"
+            )
         train = self.splits["train"]
         count = max(train.frames) + 1  # Training sequences come first, so indices stay as they are.
         motion = replace(self.motion, dofs=self.motion.dofs[:count], sequence=self.motion.sequence[:count])
@@ -215,7 +217,7 @@ def fewer_views(capture: Capture, *, cameras: float = 1.0, frames: float = 1.0) 
 def spread_cameras(capture: Capture, count: int) -> tuple[str, ...]:
     """`count` training cameras spread evenly, in the split's order.
 
-    Farthest-point sampling of their positions from the first camera on, so that a smaller choice is part of a larger.
+    Farthest-point sampling of their positions, so that a smaller choice is part of a larger.
 
     Raises:
         InputError: the capture has fewer training cameras.
@@ -224,11 +226,16 @@ def spread_cameras(capture: Capture, count: int) -> tuple[str, ...]:
     if not 1 <= count <= len(names):
         raise InputError(f"{capture.folder}: expected 1 to {len(names)} training cameras, got {count}")
     positions = np.stack([capture.cameras[name].position for name in names])
+    return tuple(names[index] for index in sorted(farthest_points(positions, count)))
+
+
+def farthest_points(positions: np.ndarray, count: int) -> list[int]:
+    """Indices of `count` of the positions `[n, 3]`: the first, then each time the farthest from those chosen."""
     chosen = [0]
     for _ in range(count - 1):
         distance = np.linalg.norm(positions[:, None] - positions[chosen], axis=-1).min(1)
         chosen.append(int(distance.argmax()))
-    return tuple(names[index] for index in sorted(chosen))
+    return chosen
 
 
 def image_path(folder: Path, camera: str, frame: int) -> Path:

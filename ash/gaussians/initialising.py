@@ -14,7 +14,7 @@ from ash.harmonics import SH_C0
 from ash.mesh.rasterizing import project_vertices, rasterize_mesh
 from ash.rotations import quat_conjugate, rotate, rotmat_to_unitquat
 from ash.template.template import PosedTemplate, Template, vertex_normals
-from ash.textures import Conditions, TexelLattice
+from ash.textures import FrameInputs, TexelLattice
 
 DISC_SCALE = 0.6  # Standard deviation in texel pitches: neighbours overlap without blurring each other.
 DISC_THICKNESS = 0.2
@@ -52,7 +52,7 @@ def initial_gaussians(
 
 
 def released_gaussians(
-    config: ModelConfig, analytic: Float[Tensor, "n o"], conditions: Conditions
+    config: ModelConfig, analytic: Float[Tensor, "n o"], conditions: FrameInputs
 ) -> Float[Tensor, "n o"]:
     """What the release regresses its decoders to in a frame, before it renders: no fit, but a guess from the mesh.
 

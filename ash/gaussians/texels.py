@@ -1,6 +1,7 @@
 """Eq. 4 and 5 at the texels: what a texel takes from its triangle, and from raw parameters to posed Gaussians.
 
-`place_naive` and `pose_naive` are the definitions in plain torch; `place` and `pose` are the same, by native kernels.
+`sample_surface_naive` and `pose_naive` are the definitions in plain torch; `sample_surface` and `pose` compute the same
+by native kernels.
 """
 
 import torch
@@ -15,7 +16,7 @@ from ash.harmonics import SH_C0, rotate_sh, sh_basis
 from ash.rotations import RigidTransforms, quat_multiply, rotate
 from ash.template.skinning import dual_parts
 from ash.template.template import PosedTemplate
-from ash.textures import Conditions, TexelLattice
+from ash.textures import FrameInputs, TexelLattice
 
 LIGHT_COEFFICIENTS = 9
 
@@ -23,7 +24,7 @@ LIGHT_COEFFICIENTS = 9
 Placed = tuple[Tensor, Tensor, RigidTransforms]
 
 
-def place_naive(lattice: TexelLattice, posed: PosedTemplate, anchor: str = "blended") -> Placed:
+def sample_surface_naive(lattice: TexelLattice, posed: PosedTemplate, anchor: str = "blended") -> Placed:
     """The template's surface at the texels: the definition, differentiable.
 
     Positions `[n, 3]` on the canonical template (metres, Eq. 4), unit normals `[n, 3]` in the world, and the
@@ -45,13 +46,13 @@ def _anchored(
     return RigidTransforms(quats=transforms.quats, translations=lattice.interpolate(posed.vertices) - turned)
 
 
-def place(lattice: TexelLattice, posed: PosedTemplate, anchor: str = "blended", *, threads: int = 1) -> Placed:
-    """`place_naive`, by native kernels where nothing needs a gradient."""
+def sample_surface(lattice: TexelLattice, posed: PosedTemplate, anchor: str = "blended", *, threads: int = 1) -> Placed:
+    """`sample_surface_naive`, by native kernels where nothing needs a gradient."""
     transforms = posed.transforms
     if not ash.native.skinning.can_use_native(
         posed.canonical, posed.normals, transforms.quats, transforms.translations
     ):
-        return place_naive(lattice, posed, anchor)
+        return sample_surface_naive(lattice, posed, anchor)
     dual = dual_parts(transforms)
     blank = dual.new_zeros(len(dual), 2)
     vertices = torch.cat([transforms.quats, dual, posed.canonical, posed.normals, blank], 1)
@@ -63,7 +64,7 @@ def place(lattice: TexelLattice, posed: PosedTemplate, anchor: str = "blended", 
 
 
 def pose_naive(
-    raw: Float[Tensor, "n o"], conditions: Conditions, config: ModelConfig, light: Float[Tensor, "9 3"] | None
+    raw: Float[Tensor, "n o"], conditions: FrameInputs, config: ModelConfig, light: Float[Tensor, "9 3"] | None
 ) -> Gaussians:
     """Activate raw parameters and carry them from canonical to posed space (Eq. 5): the definition.
 
@@ -88,7 +89,7 @@ def pose_naive(
 
 def pose(
     raw: Float[Tensor, "n o"],
-    conditions: Conditions,
+    conditions: FrameInputs,
     config: ModelConfig,
     light: Float[Tensor, "9 3"] | None,
     *,

@@ -181,12 +181,12 @@ class Template:
         key = (pose.motion.dofs[window].tobytes(), np.int64(pose.frame).tobytes())
         if key not in self._kept:
             with torch.no_grad():
-                self._kept[key] = self.pose_anew(pose)
+                self._kept[key] = self.pose_uncached(pose)
             if len(self._kept) > self.KEPT_FRAMES:
                 self._kept.popitem(last=False)
         return self._kept[key]
 
-    def forget(self) -> None:
+    def clear_cache(self) -> None:
         """Keep nothing of what was posed: the deformation has changed."""
         self._kept.clear()
 
@@ -208,7 +208,7 @@ class Template:
         other.deformation, other._kept = deformation, OrderedDict()
         return other
 
-    def pose_anew(self, pose: Pose) -> PosedTemplate:
+    def pose_uncached(self, pose: Pose) -> PosedTemplate:
         """The template in one frame, differentiable in what its deformation learns."""
         dofs = torch.from_numpy(pose.dofs)  # Joints are too few for a GPU.
         joints = forward_kinematics(self.skeleton, dofs)

@@ -12,7 +12,7 @@ from ash.capture.formats import read_template_truth
 from ash.checkpoints import load_module, read_safetensors
 from ash.config import TemplateConfig
 from ash.devices import CPU
-from ash.files import InputError, hash_of, hash_sources, only_one, write_atomic
+from ash.files import InputError, file_lock, hash_of, hash_sources, write_atomic
 from ash.protocol import TrainingOutcome
 from ash.template.graph import EmbeddedGraph
 from ash.template.template import (
@@ -57,7 +57,7 @@ def learned_template(config: TemplateConfig, capture: Capture, *, seed: int, dev
         facts = _learn(deformation, config, capture, seed, device)
     else:
         path = capture.store / f"{template_key(config, capture, seed=seed, device=device)}.safetensors"
-        with only_one(path):
+        with file_lock(path):
             if not path.exists():
                 facts = _learn(deformation, config, capture, seed, device)
                 write_atomic(path, safetensors.torch.save(_state(deformation), metadata=facts))

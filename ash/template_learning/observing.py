@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ash.capture.dataset import Camera
 from ash.training.batches import crop_camera
-from ash.training.images import Cutout
+from ash.training.images import ImageCrop
 
 MARGIN = 14  # Pixels around the subject, so that a template that sticks out is still seen whole.
 OPAQUE = 0.98  # Colours count where the subject fills a pixel and its neighbours at least so much.
@@ -35,7 +35,7 @@ class ObservedView:
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
 
-def observe(cutout: Cutout, camera: Camera, *, blur: float) -> ObservedView:
+def observe(cutout: ImageCrop, camera: Camera, *, blur: float) -> ObservedView:
     """Prepare a view. `blur`: standard deviation, pixels."""
     device, box = cutout.pixels.device, cutout.box
     x0, y0 = max(0, box[0] - MARGIN), max(0, box[1] - MARGIN)

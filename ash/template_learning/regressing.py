@@ -2,8 +2,8 @@
 
 A few dozen frames of a few clips do not pin down a network: Adam on the graph networks explains the training frames
 and is worse than plain skinning on another motion. A ridge regression per node of the embedded graph, on the joints
-near it, explains nearly as much and is better than skinning there; how much of it to trust is measured on training
-sequences that were left out.
+near it, explains nearly as much and is better than skinning there; the ridge weight is chosen by
+cross-validation over training sequences.
 """
 
 from collections.abc import Iterator, Sequence

@@ -29,7 +29,7 @@ class Batch:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Sampled:
+class BatchSpec:
     """What a step shows."""
 
     frame: int
@@ -42,7 +42,7 @@ class Sampled:
         return tuple((camera, self.frame) for camera in self.cameras)
 
 
-def sampled(images: TrainingImages, config: TrainingConfig, seed: int, step: int) -> Sampled:
+def sampled(images: TrainingImages, config: TrainingConfig, seed: int, step: int) -> BatchSpec:
     """What a step shows: frames in a new random order every epoch, cameras at random."""
     epoch, position = divmod(step, len(images.frames))
     frame = images.frames[_order(seed, epoch, len(images.frames))[position]]
@@ -51,7 +51,7 @@ def sampled(images: TrainingImages, config: TrainingConfig, seed: int, step: int
     count = min(config.views_per_step, len(cameras))
     names = tuple(cameras[i] for i in rng.choice(len(cameras), count, replace=False))
     colour = np.zeros(3) if config.background == "black" else rng.random(3)
-    return Sampled(frame=frame, cameras=names, colour=torch.from_numpy(colour).float())
+    return BatchSpec(frame=frame, cameras=names, colour=torch.from_numpy(colour).float())
 
 
 @lru_cache(maxsize=2)  # Of a capture of 20,000 frames it takes longer than a GPU's step.
@@ -62,7 +62,7 @@ def _order(seed: int, epoch: int, frames: int) -> np.ndarray:
 def draw_batch(images: TrainingImages, config: TrainingConfig, seed: int, step: int) -> Batch:
     """The batch of a step."""
     shown = sampled(images, config, seed, step)
-    batch = cut_batch(images, shown.frame, list(shown.cameras), shown.colour)
+    batch = make_batch(images, shown.frame, list(shown.cameras), shown.colour)
     return in_studio(batch, images) if config.background == "studio" else batch
 
 
@@ -107,7 +107,7 @@ def over(rgb: Float[Tensor, "c h w 3"], alpha: Float[Tensor, "c h w"], backgroun
     return rgb + (1 - alpha)[..., None] * background
 
 
-def cut_batch(images: TrainingImages, frame: int, names: list[str], background: Tensor) -> Batch:
+def make_batch(images: TrainingImages, frame: int, names: list[str], background: Tensor) -> Batch:
     """Crop views of one frame to boxes of one size, and move the principal points along."""
     boxes = [images.box((name, frame)) for name in names]
     full = images.cameras[names[0]]

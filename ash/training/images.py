@@ -15,12 +15,12 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
+from ash.bounded_cache import MAX_BYTES, BoundedCache
 from ash.capture.dataset import Camera, Capture, fewer_views
 from ash.capture.manifest import Split
 from ash.config import TrainingConfig
 from ash.devices import CPU
 from ash.files import InputError
-from ash.kept import MAX_BYTES, Kept
 
 RESERVED_VIEWS = 24  # Training views that no step sees, where there are enough: they tell when training may end.
 RESERVED_SHARE = 8  # No more than an eighth of the training views are reserved,
@@ -34,7 +34,7 @@ Box = tuple[int, int, int, int]  # x0, y0, x1, y1 in pixels, half open
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Cutout:
+class ImageCrop:
     """The part of a training image that shows the subject; beside it the image is empty."""
 
     pixels: UInt8[Tensor, "h w 4"]  # sRGB, straight alpha
@@ -60,9 +60,9 @@ class Cutout:
 
 @runtime_checkable
 class Views(Protocol):
-    """Cutouts by view: all of a capture, or those of a step."""
+    """Crops by view: all of a capture, or those of a step."""
 
-    def __getitem__(self, view: View) -> Cutout:
+    def __getitem__(self, view: View) -> ImageCrop:
         """Of a view."""
 
 
@@ -109,8 +109,8 @@ def load_training_images(
         InputError: an image is damaged, or shows nobody; one that is read later raises it then.
     """
     train = capture.splits["train"]  # An oracle's capture holds the held-out cameras too.
-    views: Kept[View, Cutout] = Kept(
-        lambda view: read_cutout(capture, *view, device), max_bytes=max_bytes or _room_on(device)
+    views: BoundedCache[View, ImageCrop] = BoundedCache(
+        lambda view: read_crop(capture, *view, device), max_bytes=max_bytes or _room_on(device)
     )
     for view in train.views:
         if views.is_full:
@@ -126,7 +126,7 @@ def load_training_images(
     )
 
 
-def read_cutout(capture: Capture, camera: str, frame: int, device: torch.device = CPU) -> Cutout:
+def read_crop(capture: Capture, camera: str, frame: int, device: torch.device = CPU) -> ImageCrop:
     """Read a view, and keep of it on the device what shows the subject.
 
     Raises:
@@ -138,7 +138,7 @@ def read_cutout(capture: Capture, camera: str, frame: int, device: torch.device 
         raise InputError(f"{capture.folder}: nobody is seen by camera {camera} in frame {frame}")
     top, left = int(rows[0]), int(columns[0])
     subject = np.ascontiguousarray(image[top : rows[-1] + 1, left : columns[-1] + 1])
-    return Cutout(pixels=torch.from_numpy(subject).to(device), left=left, top=top)
+    return ImageCrop(pixels=torch.from_numpy(subject).to(device), left=left, top=top)
 
 
 def reserved_views(train: Split) -> tuple[View, ...]:
@@ -170,7 +170,7 @@ def _room_on(device: torch.device) -> int:
 
 
 class ReadAhead:
-    """Cutouts of the coming steps, read by threads while a step is made; what is kept already is not read.
+    """Crops of the coming steps, read by threads while a step is made; what is kept already is not read.
 
     At most those of `STEPS_AHEAD` steps wait, besides what is kept. Without `readers` a step reads its own.
     """
@@ -178,7 +178,7 @@ class ReadAhead:
     def __init__(self, views: Views, *, readers: int = READERS) -> None:
         self._views = views
         self._pool = ThreadPoolExecutor(readers) if readers else None
-        self._coming: dict[int, dict[View, Future[Cutout]]] = {}
+        self._coming: dict[int, dict[View, Future[ImageCrop]]] = {}
 
     def of_step(self, step: int, needed: Callable[[int], tuple[View, ...]]) -> Views:
         """The views of a step, while those of the next ones are read; `needed` tells the views of any step.

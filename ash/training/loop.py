@@ -28,17 +28,17 @@ from ash.files import InputError, write_atomic
 from ash.native.library import keep_freed_memory
 from ash.protocol import TrainingOutcome
 from ash.training.adam import Adam
-from ash.training.batches import Batch, cut_batch, draw_step
+from ash.training.batches import Batch, draw_step, make_batch
 from ash.training.images import READERS, ReadAhead, TrainingImages
 from ash.training.losses import exact_target, l1_ssim_loss
 from ash.training.stopping import (
     ReservedScore,
-    TrainingCourse,
-    decided,
+    ScheduleState,
     gain_of_last_third,
-    is_mark,
+    is_eval_step,
     last_step,
     rate_factor,
+    update,
 )
 
 LOG_EVERY = 50
@@ -77,7 +77,7 @@ class Trainable(Protocol):
             FloatingPointError: what the weights make cannot be drawn, because it holds NaN or infinity, say.
         """
 
-    def corrections(self, frame: int) -> Tensor | None:
+    def decoder_residual(self, frame: int) -> Tensor | None:
         """What the decoders add to the static parameters in a training frame, in any shape; None without decoders."""
 
     def draw_static_views(self, frame: int, cameras: list[Camera], background: Tensor) -> Tensor | None:
@@ -105,7 +105,7 @@ def fit(
         Interrupted: SIGTERM came; the checkpoint holds everything up to the last whole step.
     """
     images = replace(images, whole=not config.crop)
-    run = _Run(learner, config, images, folder)
+    run = Trainer(learner, config, images, folder)
     if not run.resume():
         before_start()
         run.average_afresh()
@@ -144,7 +144,7 @@ def view_loss(
     return torch.stack(losses).mean()
 
 
-class _Run:
+class Trainer:
     """The state of one training: model, optimiser, step, CPU seconds, and what was decided so far."""
 
     def __init__(self, learner: Trainable, config: TrainingConfig, images: TrainingImages, folder: Path) -> None:
@@ -155,7 +155,7 @@ class _Run:
         self.initial_rates = [group["lr"] for group in groups]
         self.folder, self.path, self.log = folder, folder / "checkpoint.safetensors", folder / "log.jsonl"
         self.step, self.seconds, self.rate_scale = 0, 0.0, 1.0
-        self.course = TrainingCourse()
+        self.course = ScheduleState()
         self.average: dict[str, Tensor] = {}
         self.averaged: list[Tensor] = []  # the parameters, in the order of `average`
         self.average_afresh()
@@ -208,16 +208,16 @@ class _Run:
 
     def _look(self, loss: Tensor) -> None:
         """Score the reserved views where it is time to, decide what follows from it, and write the log."""
-        if self.images.reserved and (is_mark(self.step) or self.has_ended):
+        if self.images.reserved and (is_eval_step(self.step) or self.has_ended):
             self._score()
-        self.course = decided(self.course, self.config, step=self.step, seconds=self._elapsed())
+        self.course = update(self.course, self.config, step=self.step, seconds=self._elapsed())
         if self.step % LOG_EVERY == 1 or self.has_ended or self._score_of_this_step() is not None:
             self._write_log(loss)
         if self.config.snapshots:
             self._save_snapshots()
 
     def _score(self) -> None:
-        with self._as_used():
+        with self._ema_weights():
             score = ReservedScore(step=self.step, psnr=self._reserved_psnr())
         if math.isfinite(score.psnr):  # Else the next step meets the same, and deals with it.
             self.course = replace(self.course, scores=(*self.course.scores, score))
@@ -248,7 +248,7 @@ class _Run:
         """Foreground PSNR of the training views that no step sees, in dB."""
         errors = []
         for name, frame in self.images.reserved:
-            view = cut_batch(self.images, frame, [name], torch.zeros(3, device="cpu"))
+            view = make_batch(self.images, frame, [name], torch.zeros(3, device="cpu"))
             try:
                 (drawn,) = draw_training_step(self.learner, [view], self.step)
             except FloatingPointError:
@@ -282,20 +282,20 @@ class _Run:
         return True
 
     @contextmanager
-    def _as_used(self) -> Iterator[None]:
+    def _ema_weights(self) -> Iterator[None]:
         """With the weights as they would be used: averaged, if they are averaged at all."""
         own = {name: value.detach().clone() for name, value in self._averaged()}
-        self._take(self.average)
+        self._load_weights(self.average)
         try:
             yield
         finally:
-            self._take(own)
+            self._load_weights(own)
 
     def _averaged(self) -> list[tuple[str, torch.nn.Parameter]]:
         return list(self.learner.module.named_parameters()) if self.average else []
 
     @torch.no_grad()
-    def _take(self, weights: dict[str, Tensor]) -> None:
+    def _load_weights(self, weights: dict[str, Tensor]) -> None:
         for name, value in self._averaged():
             value.copy_(weights[name])
 
@@ -304,12 +304,12 @@ class _Run:
         for seconds in SNAPSHOT_SECONDS:
             path = self.folder / "snapshots" / f"{seconds:06d}.safetensors"
             if seconds <= self._elapsed() and not path.exists():
-                with self._as_used():
+                with self._ema_weights():
                     write_atomic(path, safetensors.torch.save(contiguous_state(self.learner.module)))
 
     def finish(self) -> TrainingOutcome:
         """Give the model the averaged weights, if they were averaged (the checkpoint keeps both), and tell the end."""
-        self._take(self.average)
+        self._load_weights(self.average)
         outcome = TrainingOutcome(
             steps=self.step,
             seconds=self._elapsed(),
@@ -327,7 +327,7 @@ class _Run:
     def _spread(self) -> float | None:
         """How far what the decoders add differs between training frames, rms; None without decoders."""
         frames = self.images.frames[:: -(-len(self.images.frames) // COMPARED_FRAMES)]
-        found = [added for frame in frames if (added := self.learner.corrections(frame)) is not None]
+        found = [added for frame in frames if (added := self.learner.decoder_residual(frame)) is not None]
         if not found:
             return None
         mean = torch.stack(found).mean(0)
@@ -344,12 +344,12 @@ class _Run:
         tensors, facts = read_safetensors(self.path)
         load_module(self.learner.module, {n[6:]: t for n, t in tensors.items() if n.startswith("model.")}, self.path)
         try:
-            self._take_up(tensors, facts)
+            self._load_state(tensors, facts)
         except (KeyError, ValueError, RuntimeError, OverflowError) as error:
             raise InputError(f"{self.path}: expected a whole checkpoint ({type(error).__name__}: {error})") from error
         return True
 
-    def _take_up(self, tensors: dict[str, Tensor], facts: dict[str, str]) -> None:
+    def _load_state(self, tensors: dict[str, Tensor], facts: dict[str, str]) -> None:
         """Moments, averages and the place in the course, as they were saved."""
         if not all(torch.isfinite(tensor).all() for tensor in tensors.values()):
             raise ValueError("NaN or infinity among its numbers")
@@ -363,7 +363,7 @@ class _Run:
         for name, value in self.average.items():
             value.copy_(tensors[f"average.{name}"])
         self.step, self.seconds = int(facts["step"]), float(facts["seconds"])
-        self.rate_scale, self.course = float(facts["rate_scale"]), TrainingCourse.from_json(facts["course"])
+        self.rate_scale, self.course = float(facts["rate_scale"]), ScheduleState.from_json(facts["course"])
         if self.step < 0 or not (0 <= self.seconds < math.inf and 0 < self.rate_scale <= 1):
             raise ValueError(f"step {self.step} after {self.seconds} s at {self.rate_scale} of the rate")
         self.started = time.process_time()

@@ -30,7 +30,7 @@ class ReservedScore:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class TrainingCourse:
+class ScheduleState:
     """What a training has decided so far. It is part of the checkpoint: a resumed run decides nothing anew."""
 
     scores: tuple[ReservedScore, ...] = ()
@@ -42,17 +42,17 @@ class TrainingCourse:
         return json.dumps(asdict(self))
 
     @classmethod
-    def from_json(cls, text: str) -> "TrainingCourse":
+    def from_json(cls, text: str) -> "ScheduleState":
         """What `to_json` wrote.
 
         Raises:
             ValueError: it is something else.
         """
-        course: TrainingCourse = from_json(cls, json.loads(text))
+        course: ScheduleState = from_json(cls, json.loads(text))
         return course
 
 
-def is_mark(step: int) -> bool:
+def is_eval_step(step: int) -> bool:
     """Whether views are scored after this step: 64, 78, 96, 118, ..., each 1.5 times the last but one."""
     if step < FIRST_MARK:
         return False
@@ -68,7 +68,7 @@ def gain_of_last_third(scores: tuple[ReservedScore, ...], *, since: int = 0) -> 
     return scores[-1].psnr - before[-1].psnr if before else None
 
 
-def decided(course: TrainingCourse, config: TrainingConfig, *, step: int, seconds: float) -> TrainingCourse:
+def update(course: ScheduleState, config: TrainingConfig, *, step: int, seconds: float) -> ScheduleState:
     """The course after a step: whether the rates begin to fall now, and for what.
 
     A plateau counts once the warm-up is less than half of the steps that are compared; where a limit is met on one, it
@@ -82,18 +82,18 @@ def decided(course: TrainingCourse, config: TrainingConfig, *, step: int, second
     scored = step >= LEAST_STEPS and course.scores and course.scores[-1].step == step
     if not (limits or scored):
         return course
-    if step >= LULL_STEPS and rests(course.scores, since=2 * config.warmup_steps):
+    if step >= LULL_STEPS and has_plateaued(course.scores, since=2 * config.warmup_steps):
         return replace(course, decay_from=step, ended_by="plateau")
     return replace(course, decay_from=step, ended_by=limits[0]) if limits else course
 
 
-def rests(scores: tuple[ReservedScore, ...], *, since: int) -> bool:
+def has_plateaued(scores: tuple[ReservedScore, ...], *, since: int) -> bool:
     """Whether less than `GAIN_DB` was gained twice in a row: one score alone strays by as much as that."""
     gains = [gain_of_last_third(scores[: len(scores) - back], since=since) for back in (0, 1)]
     return all(gain is not None and gain < GAIN_DB for gain in gains)
 
 
-def last_step(course: TrainingCourse, config: TrainingConfig) -> int:
+def last_step(course: ScheduleState, config: TrainingConfig) -> int:
     """After which step training ends, as far as that is known."""
     if course.decay_from is None:
         return config.steps
@@ -102,7 +102,7 @@ def last_step(course: TrainingCourse, config: TrainingConfig) -> int:
     return min(config.steps, course.decay_from + math.ceil(course.decay_from * DECAY))
 
 
-def rate_factor(course: TrainingCourse, config: TrainingConfig, *, step: int) -> float:
+def rate_factor(course: ScheduleState, config: TrainingConfig, *, step: int) -> float:
     """By what the learning rates are multiplied in a step; 1 throughout in the schedule of the release."""
     if config.schedule == "constant":
         return 1.0

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 import warp as wp
 
-from ash.files import only_one
+from ash.files import file_lock
 from ash.warp import blending, projecting, projecting_back, rasterizing
 from ash.warp.arrays import BLOCK, runs_on
 
@@ -23,7 +23,7 @@ def copy_compiled(device: torch.device, target: Path) -> None:
     What Warp's own cache lacks is compiled into it first; of several processes one compiles, and the others wait.
     """
     cache, where = Path(str(wp.config.kernel_cache_dir)), wp.device_from_torch(device)
-    with only_one(cache / "ash_bench"):
+    with file_lock(cache / "ash_bench"):
         for module in MODULES:
             wp.load_module(module, device=where, block_dim=BLOCK)
     for module in MODULES:

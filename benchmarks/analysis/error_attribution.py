@@ -20,7 +20,7 @@ from ash.files import read_arrays
 from benchmarks.cell import metrics
 from benchmarks.cell.cells import Cell, CellResult, ViewScore, stored_prediction
 from benchmarks.cell.views import View
-from synth.readers.truth import depth, normals, pixel_truth, points, surface_truth
+from synth.truth.pixels import depth, normals, pixel_truth, points, surface_truth
 
 REGION_COLOURS = ("#2f6fde", "#dd6b20", "#c2415c", "#b8860b", "#c9ced6")
 REGIONS = ("silhouette", "occlusion edge", "never seen in training", "grazing view", "interior")

@@ -1,4 +1,4 @@
-"""Our rows beside those of the ASH paper's tables, and how far the two orders agree.
+"""Our rows beside those of the ASH paper's tables, and our renders scored by the conventions of others.
 
 Numbers: Pang et al., CVPR 2024, Tables 1 to 3, and the supplement's tables on design and on SMPL; LPIPS times 1000.
 Captured data, 1285x940, GPU-weeks: levels cannot be compared with ours, orders can.
@@ -7,12 +7,11 @@ Captured data, 1285x940, GPU-weeks: levels cannot be compared with ours, orders 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
-import numpy as np
+import pandas as pd
 
-from benchmarks.analysis.scores import RANKED_SPLITS, Scores, foreground
-from benchmarks.analysis.statistics import kendall, redrawn
+from benchmarks.analysis.results import RANKED_SPLITS, Quantity, RunTables, foreground
+from benchmarks.analysis.statistics import kendall
 
-RESAMPLES = 2000
 SEEN = {  # by the paper's rows that were trained on a part of its views, under our names
     "cams_12": "12 of 120 cameras",
     "cams_30": "30 of 120 cameras",
@@ -101,34 +100,21 @@ PAPER_TABLES = (
 )
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Agreement:
-    """Kendall's tau of two orders of the same methods, with the interval that our spread leaves it."""
-
-    split: str
-    tau: float
-    low: float | None
-    high: float | None
-    methods: int
-
-    @property
-    def text(self) -> str:
-        """For a reader."""
-        interval = "" if self.low is None else f" [{self.low:+.2f}, {self.high:+.2f}]"
-        return f"{self.tau:+.2f}{interval} over {self.methods} methods"
-
-
-def tables_beside(scores: Scores) -> tuple[tuple[PaperTable, tuple[Agreement, ...]], ...]:
-    """The paper's tables of which at least two methods were run, and how far the orders by PSNR agree."""
+def tables_beside(tables: RunTables) -> tuple[tuple[PaperTable, dict[str, float]], ...]:
+    """The paper's tables of which at least two methods were run, and by split Kendall's tau of the orders by PSNR."""
     found = []
     for table in PAPER_TABLES:
-        run = scores.methods(table.scene)
-        rows = tuple(_as_run(row, run) for row in table.rows)
-        ours = [row for row in rows if row.method in run]
+        run = tables.methods(table.scene)
+        table = replace(table, rows=tuple(_as_run(row, run) for row in table.rows))
+        ours = [row for row in table.rows if row.method in run]
         if len(ours) > 1:
-            agreements = (_agreement(scores, table.scene, ours, split) for split in RANKED_SPLITS)
-            known = tuple(agreement for agreement in agreements if agreement is not None)
-            found.append((replace(table, rows=rows), known))
+            taus = {}
+            for split in RANKED_SPLITS:
+                means = tables.values(table.scene, foreground(split), [str(row.method) for row in ours])
+                if len(means) == len(ours):
+                    theirs = [row.view[0] if split == "novel_view" else row.pose[0] for row in ours]
+                    taus[split] = kendall(theirs, list(means.values()))
+            found.append((table, taus))
     return tuple(found)
 
 
@@ -140,19 +126,22 @@ def _as_run(row: PaperRow, run: Collection[str]) -> PaperRow:
     return replace(row, method=STAND_IN[row.method], note=note)
 
 
-def _agreement(scores: Scores, scene: str, rows: list[PaperRow], split: str) -> Agreement | None:
-    """Tau between the paper's PSNR and ours; the interval by drawing captures anew, or of a single one, seeds."""
-    paper = [row.view[0] if split == "novel_view" else row.pose[0] for row in rows]
-    methods = [str(row.method) for row in rows]
-    values = [scores.values(scene, method, foreground(split)) for method in methods]
-    if not all(values):
+CONVENTIONS = {  # region, and who scores so
+    "foreground": "ours: foreground",
+    "release_crop": "ASH release: masked crop on white",
+    "white_frame": "AnimatableGaussians: frame on white",
+    "full": "nerfbaselines: whole frame",
+}
+
+
+def conventions(tables: RunTables, scene: str, split: str, metric: str) -> tuple[pd.DataFrame, list[float]] | None:
+    """The same renders scored by the conventions of others: methods by `CONVENTIONS`, and Kendall's tau with ours.
+
+    Oracles are left out; None where fewer than two methods were scored so.
+    """
+    names = tables.methods(scene, oracles=False)
+    found = {region: tables.values(scene, Quantity(split, region, metric), names) for region in CONVENTIONS}
+    values = pd.DataFrame(found, index=list(names))
+    if len(names) < 2 or values.isna().any(axis=None):
         return None
-    tau, low, high = kendall(paper, [float(np.mean(own)) for own in values]), None, None
-    if all(len(own) > 1 for own in values):
-        samples, rng = (
-            [scores.samples(scene, method, foreground(split)) for method in methods],
-            np.random.default_rng(0),
-        )
-        drawn = [kendall(paper, redrawn(samples, rng=rng)) for _ in range(RESAMPLES)]
-        low, high = (float(q) for q in np.quantile(drawn, [0.025, 0.975]))
-    return Agreement(split=split, tau=tau, low=low, high=high, methods=len(rows))
+    return values, [kendall(list(values["foreground"]), list(values[region])) for region in values]

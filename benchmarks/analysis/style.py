@@ -1,4 +1,4 @@
-"""How methods are called and coloured in tables and charts; a method of someone else keeps its own name."""
+"""Titles and colours of methods in tables and charts; a method of a third party keeps its own name."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -14,7 +14,7 @@ from benchmarks.suites.files import our_rows
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class MethodStyle:
-    """A method's name for readers and its colour, which reads on white and on dark paper."""
+    """A method's title and its colour, readable on white and on dark pages."""
 
     title: str
     colour: str
@@ -22,7 +22,7 @@ class MethodStyle:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SplitName:
-    """What a split, or the place of costs, is called over a column, and in a sentence."""
+    """The title of a split above a column, and its name in a sentence."""
 
     title: str
     words: str
@@ -34,10 +34,10 @@ STYLES = {
     "ddc": MethodStyle(title="DDC", colour="#dd6b20"),
     "ddc_truth": MethodStyle(title="DDC, exact surface", colour="#dd6b20"),
     "wo_disp": MethodStyle(title="w/o disp.", colour="#2a9d8f"),
-    "wo_motion_offset": MethodStyle(title="w/o the motion's offset", colour="#2a9d8f"),
-    "wo_offset": MethodStyle(title="w/o any offset", colour="#5b8c2a"),
+    "wo_motion_offset": MethodStyle(title="no motion offset", colour="#2a9d8f"),
+    "wo_offset": MethodStyle(title="no offset", colour="#5b8c2a"),
     "wo_mot": MethodStyle(title="w/o mot.", colour="#9b59b6"),
-    "wo_mot_truncated": MethodStyle(title="w/o mot., 1/27 of the frames", colour="#7a869a"),
+    "wo_mot_truncated": MethodStyle(title="w/o mot., 1/27 of frames", colour="#7a869a"),
     "ash_wo_base": MethodStyle(title="ASH, no learned texels", colour="#008fb3"),
     "ddc_wo_base": MethodStyle(title="DDC, no learned texels", colour="#b8860b"),
     "res_128": MethodStyle(title="half texels", colour="#5b8c2a"),
@@ -45,12 +45,12 @@ STYLES = {
     "res_128_half_width": MethodStyle(title="half texels and width", colour="#008fb3"),
     "res_64": MethodStyle(title="quarter texels", colour="#a0522d"),
     "res_512": MethodStyle(title="double texels", colour="#008fb3"),
-    "cams_12": MethodStyle(title="1/10 of the cameras", colour="#a0522d"),
-    "cams_30": MethodStyle(title="1/4 of the cameras", colour="#b8860b"),
-    "cams_60": MethodStyle(title="1/2 of the cameras", colour="#7a869a"),
-    "ash_studio": MethodStyle(title="ASH, empty studio known", colour="#5b8c2a"),
+    "cams_12": MethodStyle(title="1/10 of cameras", colour="#a0522d"),
+    "cams_30": MethodStyle(title="1/4 of cameras", colour="#b8860b"),
+    "cams_60": MethodStyle(title="1/2 of cameras", colour="#7a869a"),
+    "ash_studio": MethodStyle(title="ASH, known background", colour="#5b8c2a"),
     "window_1": MethodStyle(title="window 1", colour="#008fb3"),
-    "unlearned": MethodStyle(title="template only skinned", colour="#b8860b"),
+    "unlearned": MethodStyle(title="skinned template", colour="#b8860b"),
     "wo_phi": MethodStyle(title="w/o Phi", colour="#c2415c"),
     "wo_light": MethodStyle(title="w/o light", colour="#b8860b"),
     "wo_phi_and_light": MethodStyle(title="w/o Phi and light", colour="#5b8c2a"),
@@ -61,7 +61,7 @@ STYLES = {
     "mlp": MethodStyle(title="w/ MLP", colour="#c2415c"),
     "mlp_base": MethodStyle(title="w/ MLP on learned texels", colour="#a0522d"),
     "smpl": MethodStyle(title="bare-body template", colour="#8d6e63"),
-    # The switches.
+    # Suite `switches`.
     "warm_up_paper": MethodStyle(title="warm-up as in the paper", colour="#5b8c2a"),
     "warm_up_released": MethodStyle(title="warm-up as released", colour="#7a869a"),
     "warm_up_none": MethodStyle(title="no warm-up", colour="#b8860b"),
@@ -69,31 +69,31 @@ STYLES = {
     "loss_released": MethodStyle(title="loss as released", colour="#c2415c"),
     "norm_released": MethodStyle(title="batch norm as released", colour="#5b8c2a"),
     "norm_instance": MethodStyle(title="instance norm", colour="#b8860b"),
-    "world_rotations": MethodStyle(title="rotations in the world", colour="#008fb3"),
+    "world_rotations": MethodStyle(title="world-frame rotations", colour="#008fb3"),
     "released_phi": MethodStyle(title="Phi as released", colour="#a0522d"),
-    "wide_dilation": MethodStyle(title="dilation of 0.3 square pixels", colour="#008fb3"),
-    "wo_base": MethodStyle(title="no learned texels, no warm-up", colour="#008fb3"),
+    "wide_dilation": MethodStyle(title="dilation 0.3 px²", colour="#008fb3"),
+    "wo_base": MethodStyle(title="no learned texels or warm-up", colour="#008fb3"),
     "blended_anchor": MethodStyle(title="texels on blended corners", colour="#5b8c2a"),
     "wo_light_and_motion": MethodStyle(title="w/o light and motion", colour="#8d6e63"),
-    "wo_standardise": MethodStyle(title="textures not standardised", colour="#c2415c"),
-    "wo_bound": MethodStyle(title="textures not cut off", colour="#9b59b6"),
+    "wo_standardise": MethodStyle(title="no standardisation", colour="#c2415c"),
+    "wo_bound": MethodStyle(title="no clipping", colour="#9b59b6"),
     "two_trunks": MethodStyle(title="two trunks", colour="#2a9d8f"),
     "noisy_textures": MethodStyle(title="noise on textures", colour="#7a869a"),
-    "last_weights": MethodStyle(title="last weights, no mean", colour="#a0522d"),
-    # What a template is learned from.
-    "by_scans": MethodStyle(title="template by scans", colour="#2a9d8f"),
-    "ddc_by_scans": MethodStyle(title="DDC, template by scans", colour="#b8860b"),
-    "by_graph": MethodStyle(title="template by a graph network", colour="#a0522d"),
-    "refined": MethodStyle(title="template refined by what is drawn", colour="#c2415c"),
+    "last_weights": MethodStyle(title="no weight averaging", colour="#a0522d"),
+    # Rows that differ in what the template is learned from.
+    "by_scans": MethodStyle(title="template from scans", colour="#2a9d8f"),
+    "ddc_by_scans": MethodStyle(title="DDC, template from scans", colour="#b8860b"),
+    "by_graph": MethodStyle(title="graph-network template", colour="#a0522d"),
+    "refined": MethodStyle(title="photometrically refined template", colour="#c2415c"),
     "static": MethodStyle(title="static", colour="#7a869a"),
     "nearest": MethodStyle(title="nearest image", colour="#7a869a"),
     "oracle_texture": MethodStyle(title="best texture, exact mesh", colour="#b8860b"),
 }
 SPLIT_NAMES = {
-    "novel_view": SplitName(title="Novel view", words="held-out views"),
-    "near_pose": SplitName(title="Held-out motion: near", words="near held-out motion"),
-    "novel_pose": SplitName(title="Held-out motion: new", words="held-out motion"),
-    "far_pose": SplitName(title="Held-out motion: far", words="far held-out motion"),
+    "novel_view": SplitName(title="Novel view", words="novel views"),
+    "near_pose": SplitName(title="Novel pose: near", words="near novel poses"),
+    "novel_pose": SplitName(title="Novel pose: new", words="novel poses"),
+    "far_pose": SplitName(title="Novel pose: far", words="far novel poses"),
     "train_view": SplitName(title="Training view", words="training views"),
     "speed": SplitName(title="Cost", words="cost"),
     "memory": SplitName(title="Cost", words="cost"),
@@ -111,7 +111,7 @@ _USER_ROWS: ContextVar[dict[str, str]] = ContextVar("_USER_ROWS")  # titles by n
 
 
 def user_rows(configs: Iterable[CellConfig]) -> frozenset[str]:
-    """Rows that have a name of ours but another factory or other changes than ours."""
+    """Rows with a name of ours but another factory or other changes."""
     ours = our_rows() | {(name, factory, hash_of(changes)) for name, factory, changes in FORMER_ROWS}
     found = set()
     for config in configs:
@@ -124,9 +124,9 @@ def user_rows(configs: Iterable[CellConfig]) -> frozenset[str]:
 
 @contextmanager
 def titles_of(configs: Iterable[CellConfig], titles: Mapping[str, str] | None = None) -> Iterator[None]:
-    """In its block, `style_of` and `is_ours` give our titles to our own rows only, not to the user's.
+    """In its block, `style_of` and `is_ours` give our titles to our own rows only.
 
-    `titles`: those that the suite gives. A title that another row has as well is followed by the row's name.
+    `titles`: those that the suite gives. A title that two rows share is followed by the row's name.
     """
     configs, titles = tuple(configs), titles or {}
     names = dict.fromkeys(config.method for config in configs)
@@ -146,7 +146,7 @@ def titles_of(configs: Iterable[CellConfig], titles: Mapping[str, str] | None = 
 
 
 def style_of(method: str) -> MethodStyle:
-    """The look of a method; unknown ones get a colour by the sum of their letters, the same in every report."""
+    """The style of a method; an unknown one gets a colour by the sum of its letters, the same in every report."""
     own = _USER_ROWS.get({})
     if method in STYLES and method not in own:
         return STYLES[method]
@@ -156,9 +156,9 @@ def style_of(method: str) -> MethodStyle:
 
 
 def is_ours(method: str) -> bool:
-    """Whether the method comes with the suite, installed or as a variant that has a look here.
+    """Whether the method comes with the suite, installed or as a variant that has a style here.
 
-    A user's own stand first in reports.
+    A user's methods stand first in reports.
     """
     if method in _USER_ROWS.get({}):
         return False

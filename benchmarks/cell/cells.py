@@ -23,7 +23,7 @@ import numpy as np
 from ash.capture.dataset import Capture
 from ash.capture.manifest import NAME as MANIFEST
 from ash.capture.typed import from_json
-from ash.fields import nearest
+from ash.fields import suggest
 from ash.files import InputError, hash_of, read_image, read_json, require_plain, sha256_of, write_json
 from ash.protocol import TrainingOutcome
 from benchmarks.cell.metrics import IMAGE_SPLITS, METRICS, PROTOCOL, VIEW_SCORES
@@ -308,7 +308,7 @@ def _result_from(content: Any) -> CellResult:
         require_plain(row.split, what="split")
         require_plain(row.region, what="region", may_be_empty=True)
         if row.metric not in METRICS:
-            raise ValueError(f"unknown metric {row.metric!r}, {nearest(row.metric, tuple(METRICS))}")
+            raise ValueError(f"unknown metric {row.metric!r}, {suggest(row.metric, tuple(METRICS))}")
     whole = [replace(view, scores=_by_region(s)) for view, s in zip(result.views, scores, strict=True)]
     return replace(result, views=tuple(whole))
 

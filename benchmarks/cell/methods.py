@@ -13,9 +13,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from ash.fields import Changes, nearest, replaced
+from ash.fields import Changes, apply_overrides, flat, suggest
 from ash.files import InputError, hash_sources
 from ash.protocol import Configurable
+from benchmarks.aliases import OLD_FIELDS
 from benchmarks.cell.sources import plugin_hash
 
 METHOD_GROUP = "ash_bench.methods"
@@ -90,7 +91,7 @@ def find_method(name: str) -> Method:
     known = methods()
     if name not in known:
         hint = "; --method-path DIR adds a folder where it is looked for" if ":" in name else ""
-        raise InputError(f"unknown method {name!r}, {nearest(name, tuple(known))}{hint}")
+        raise InputError(f"unknown method {name!r}, {suggest(name, tuple(known))}{hint}")
     return known[name]
 
 
@@ -124,9 +125,15 @@ def configured(name: str, preset: str, changes: Mapping[str, Any] | Changes) -> 
         key = next(iter(dict(changes)), "")
         raise InputError(f"{name}: offers no configuration, and so has no key {key!r} (docs/plugin.md)")
     try:
-        return replaced(config, changes, of=name)
+        return apply_overrides(config, current_fields(config, changes), of=name)
     except ValueError as error:  # A dataclass of someone else's may not know our kind of it.
         raise InputError(str(error)) from error
+
+
+def current_fields(config: Any, changes: Mapping[str, Any] | Changes) -> dict[str, Any]:
+    """Changes whose old keys (`benchmarks.aliases`) are replaced by today's, where the configuration has these."""
+    fields = flat(config)
+    return {OLD_FIELDS[key] if OLD_FIELDS.get(key) in fields else key: value for key, value in dict(changes).items()}
 
 
 def located(error: BaseException, target: str) -> str:

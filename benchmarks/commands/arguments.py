@@ -24,8 +24,9 @@ from tyro.conf import (
 )
 from tyro.constructors import PrimitiveConstructorSpec
 
-from ash.fields import Changes, changed, flat, nearest
+from ash.fields import Changes, changed, flat, suggest
 from ash.files import InputError
+from benchmarks.aliases import OLD_FIELDS
 
 Command = Callable[[], int]  # Does its work, and returns the exit code.
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -99,7 +100,15 @@ def read_command(command: type[Any], name: str, tokens: Sequence[str]) -> Comman
         known = _as_far_as_known(command, name, tokens)
         config = None if known is None else known.settings()
         wanted = command if config is None else _with_settings(command, config)
-    return cast(Command, _read(wanted, f"{own_name()} {name}", tokens, _flags(command, config)))
+    flags = _flags(command, config)
+    return cast(Command, _read(wanted, f"{own_name()} {name}", [_current_flag(t, flags) for t in tokens], flags))
+
+
+def _current_flag(token: str, flags: tuple[str, ...]) -> str:
+    """The token, by today's name where it is an old flag of a configuration (`benchmarks.aliases`)."""
+    flag, equals, value = token.partition("=")
+    new = "--" + OLD_FIELDS.get(flag[2:].replace("-", "_"), "").replace("_", "-")
+    return f"{new}{equals}{value}" if flag.startswith("--") and new in flags else token
 
 
 def changes_of(command: Any) -> Changes:
@@ -210,7 +219,7 @@ def _problem(event: _errors.ParseErrorEvent, known: tuple[str, ...]) -> str:
 
 def _unknown(tokens: Sequence[str], known: tuple[str, ...]) -> str:
     flag = tokens[0].partition("=")[0].replace("_", "-")
-    return f"unknown option {flag!r}, {nearest(flag, known)}" if flag.startswith("-") else f"unexpected {tokens[0]!r}"
+    return f"unknown option {flag!r}, {suggest(flag, known)}" if flag.startswith("-") else f"unexpected {tokens[0]!r}"
 
 
 def _name(argument: Any) -> str:

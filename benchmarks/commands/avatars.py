@@ -72,7 +72,7 @@ class ExportCommand:
     """Write a capture or a trained avatar for other programs.
 
     Captures: ash (the release's files), nerfstudio, colmap, plain (images, cameras and poses of the training part),
-    test-views (what is scored: cameras and poses, no images).
+    test-views (what is scored: cameras and poses, no images), undistorted (a capture of pinhole cameras).
 
     Avatars: ply, spz, gltf (one frame, or several in a folder; ends with .glb or .gltf), bvh (the skeleton in motion),
     mp4 (or .webp: a video, avatars and truth side by side), html (one page that plays a clip without a server).
@@ -101,7 +101,7 @@ class ExportCommand:
         from benchmarks.aliases import OLD_FORMATS
         from benchmarks.export.formats import FORMATS as OF_AVATARS
         from benchmarks.export.formats import suffix_of
-        from synth.readers.export import FORMATS as OF_CAPTURES
+        from synth.export.formats import FORMATS as OF_CAPTURES
 
         capture = is_capture(self.source)
         if not capture and self.form in OLD_FORMATS:
@@ -132,7 +132,7 @@ class ExportCommand:
     def _export_capture(self, folder: Path) -> int:
         from ash.capture.formats import load_capture
         from benchmarks.cell.views import evaluated_views
-        from synth.readers.export import export
+        from synth.export.formats import export
 
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise InputError(f"{folder}: expected an empty folder")

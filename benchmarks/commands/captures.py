@@ -1,4 +1,4 @@
-"""Commands that make and check captures: synth, verify, undistort, motions, sheets."""
+"""Commands that make and check captures: synth, verify, motions."""
 
 import contextlib
 import sys
@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import Positional, arg
 
-from ash.files import InputError
 from benchmarks.commands.arguments import DONE, WRONG_INPUT, Count, CountIfAny, File, Folder, Seed, changes_of
 
 if TYPE_CHECKING:
@@ -69,7 +68,6 @@ class SynthCommand:
     test_motion: File | None = None  # test on this motion
     excerpt: Excerpts = Excerpt()
     rig_file: Annotated[Path | None, arg(name="rig", metavar="FILE")] = None  # see the scene by its cameras
-    shutter: float = 0.0  # open for this share of a frame, as --rig.shutter
     workers: CountIfAny = None  # processes; default: all cores
     executor: str = "local"  # or dask://HOST:PORT, for a cluster
     shard: Annotated[str | None, arg(metavar="i/n")] = None  # every n-th frame only, from the i-th; for job arrays
@@ -81,7 +79,7 @@ class SynthCommand:
 
         plain = scene_of(self.scene, size=self.size, seed=self.seed, subject=self.subject)
         seen = plain if self.rig_file is None else with_rig(plain, self.rig_file)
-        return replace(seen, rig=replace(seen.rig, shutter=self.shutter)) if self.shutter else seen
+        return seen
 
     def __call__(self) -> int:
         """Render what is missing of it."""
@@ -115,12 +113,12 @@ class SynthCommand:
 
     def _described(self) -> tuple["Scene", str]:
         """The scene that is asked for, and its name among captures."""
-        from ash.fields import replaced
+        from ash.fields import apply_overrides
         from benchmarks.suites.scenes import scene_of
         from benchmarks.suites.suites import capture_name, varied_name
 
         changes = dict(changes_of(self))
-        wanted = replaced(self.settings(), changes, of=self.scene)
+        wanted = apply_overrides(self.settings(), changes, of=self.scene)
         if changes and "name" not in changes:
             wanted = replace(wanted, name=varied_name(self.scene, tuple(changes.items())))
         wanted = self._moved(wanted)
@@ -187,21 +185,6 @@ class VerifyCommand:
 
 
 @dataclass(frozen=True, kw_only=True)
-class UndistortCommand:
-    """Resample a capture whose lenses distort for pinhole cameras."""
-
-    folder: Positional[Path]  # of the capture
-    out: Folder  # of the new one
-
-    def __call__(self) -> int:
-        """Write the new capture."""
-        from synth.readers.undistorting import undistort as resample
-
-        print(resample(self.folder, self.out))
-        return DONE
-
-
-@dataclass(frozen=True, kw_only=True)
 class MotionsCommand:
     """Draw what a motion file becomes on our skeleton, in seconds: nothing is rendered."""
 
@@ -224,34 +207,4 @@ class MotionsCommand:
         print(describe(imported), file=sys.stderr)
         print(out)
         require_upright(imported)
-        return DONE
-
-
-@dataclass(frozen=True, kw_only=True)
-class SheetsCommand:
-    """Draw a contact sheet of all scenes and a turntable, or one of people."""
-
-    out: Folder | None = None  # where they go; default: reports/scenes, or reports/people
-    scene: UseAppendAction[tuple[str, ...]] = ()  # only this scene; may be repeated
-    subjects: CountIfAny = None  # draw the first so many subjects instead, each in both outfits
-
-    def __call__(self) -> int:
-        """Draw them."""
-        from benchmarks.suites.scenes import draw_views_of, scene_of
-        from synth.readers.sheets import SHOWN, draw_sheets
-
-        if self.subjects is not None:
-            from benchmarks.provenance import cores
-            from synth.readers.people import draw_cast
-
-            if self.scene:
-                raise InputError("--subjects shows people in both outfits: expected it or --scene")
-            print(draw_cast(self.out or Path("reports/people"), range(self.subjects), workers=cores()))
-            return DONE
-        names = self.scene or SHOWN
-        for path in draw_sheets(
-            self.out or Path("reports/scenes"),
-            [(name, scene_of(name, size="quick"), draw_views_of(name)) for name in names],
-        ):
-            print(path)
         return DONE

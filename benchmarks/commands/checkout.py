@@ -72,12 +72,12 @@ class SpeedCommand:
 
     def _measure_avatar(self, folder: Path) -> int:
         from benchmarks.play.avatars import open_avatars
-        from benchmarks.speed.playback import main as measure_playback
+        from benchmarks.speed.frames import main_of_avatar
 
         with open_avatars(folder, device=chosen_device(self.device), trust=self.trust) as avatars:
             loaded = avatars.only()
             config = loaded.cell.config
-            return measure_playback(loaded.avatar, avatars.capture, f"{config.method}:{config.preset}", self.json)
+            return main_of_avatar(loaded.avatar, avatars.capture, f"{config.method}:{config.preset}", self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,33 +101,15 @@ class SuitesCommand:
 
     def __call__(self) -> int:
         """Print them."""
-        from ash.fields import nearest
+        from ash.fields import suggest
         from benchmarks.suites.files import suite_files
 
         known = suite_files()
         if self.name and self.name not in known:
-            raise InputError(f"unknown suite {self.name!r}, {nearest(self.name, tuple(known))}")
+            raise InputError(f"unknown suite {self.name!r}, {suggest(self.name, tuple(known))}")
         for name, path in known.items():
             if self.name in ("", name):
                 print(f"# {name}.toml\n{path.read_text()}")
-        return DONE
-
-
-@dataclass(frozen=True, kw_only=True)
-class DocsCommand:
-    """Write the reference of the public names as HTML, from their docstrings; needs pdoc."""
-
-    out: Folder = Path("runs/docs")  # where the pages go
-
-    def __call__(self) -> int:
-        """Write it."""
-        try:
-            import pdoc
-        except ImportError:
-            raise InputError("the reference needs the package pdoc, of the extra dev") from None
-        pdoc.render.configure(docformat="google", show_source=True)
-        pdoc.pdoc(*PUBLIC, output_directory=self.out)
-        print(self.out / "index.html")
         return DONE
 
 

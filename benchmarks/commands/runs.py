@@ -15,7 +15,9 @@ from benchmarks.commands.arguments import (
     DONE,
     FAILED,
     INTERRUPTED,
+    Count,
     CountIfAny,
+    File,
     Folder,
     Names,
     Seed,
@@ -268,17 +270,27 @@ class TrainCommand:
 
 @dataclass(frozen=True, kw_only=True)
 class EvalCommand:
-    """Render and score a run's cells again from their checkpoints, or score their stored predictions again."""
+    """Render and score a run's cells again from their checkpoints, or score their stored predictions again.
+
+    With --motion, the avatars are driven by a motion file instead, and scored against its truth, which is rendered: the
+    results go to --out, those of the cells stay.
+    """
 
     run: Positional[Path]  # a run's folder or a cell's
     scores_only: FlagCreatePairsOff[bool] = False  # score the stored predictions: nothing is loaded or rendered
     device: DeviceNameIfAny = None  # where avatars draw that have a choice: cpu, cuda, ...; default: as they learned
+    motion: File | None = None  # BVH or AMASS .npz: drive the avatars by it
+    frames: Count = 12  # of that motion
+    out: Folder | None = None  # of the results on that motion; default: RUN/motion-FILE
+    workers: CountIfAny = None  # processes that render that motion; default: all cores
     lpips_weights: LpipsWeights = None  # AlexNet's, of torchvision; default: torch's cache; without them LPIPS is n/a
 
     def __call__(self) -> int:
         """Render where that is asked for, and score."""
         from benchmarks.cell.process import evaluate_cell, rescore_cell
 
+        if self.motion is not None:
+            return self._on_motion(self.motion)
         if self.scores_only and self.device is not None:
             raise InputError("--scores-only renders nothing: expected no --device")
         _use_lpips(self.lpips_weights)
@@ -286,6 +298,21 @@ class EvalCommand:
             return _again(self.run, rescore_cell)
         device = None if self.device is None else chosen_device(self.device)
         return _again(self.run, partial(evaluate_cell, device=device))
+
+    def _on_motion(self, motion: Path) -> int:
+        from benchmarks.provenance import cores
+        from benchmarks.studies.retarget import retarget
+        from benchmarks.suites.runs import read_run
+
+        if self.scores_only or self.device is not None:
+            raise InputError("--motion: expected no --scores-only and no --device")
+        out = self.out or self.run / f"motion-{motion.stem}"
+        cells, workers = list(read_run(self.run).cells), self.workers or cores()
+        for row in retarget(cells, motion, out, frames=max(2, self.frames), workers=workers):
+            own = "" if row.own_psnr is None else f" ({row.own_psnr:.2f} dB on its own test motion)"
+            print(f"{row.title}: {row.psnr:.2f} dB{own}, IoU {row.iou:.3f}, foreground PSNR on {motion.name}")
+        print(out)
+        return DONE
 
 
 def _use_lpips(weights: Path | None) -> None:

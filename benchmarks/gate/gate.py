@@ -1,8 +1,8 @@
 """The verdict on a change: a run against a committed baseline, with known error rates.
 
-Three levels. Identical predictions prove that nothing changed. Otherwise qualities are compared by seed means: a loss
-fails when it is larger than the metric's margin and is established (Welch's test, corrected by Holm over all
-comparisons); an equally established rise is flagged as well, for a leak looks like progress. Costs: exact work counts,
+Three levels. Identical predictions prove that nothing changed. Otherwise qualities are compared over seeds as in every
+report (`statistics.compare_samples`, corrected over all comparisons): worse fails, and better is flagged as well, for a
+leak looks like progress. Costs: exact work counts,
 and, on a processor like the baseline's, peak memory and times of frames and training, these as a ratio to a reference
 workload that was timed between the frames, because the machine's mood is in both. Noise only ever adds, so that a time
 that fails is measured again before it is believed. A training that became much shorter is flagged as well: it may have
@@ -18,7 +18,7 @@ from typing import Literal
 
 from ash.capture.typed import from_json
 from ash.files import InputError, read_json, write_json
-from benchmarks.analysis.statistics import Difference, holm, welch
+from benchmarks.analysis.statistics import Comparison, compare_samples, corrected
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS, PROTOCOL
 from benchmarks.report import escaping
@@ -39,7 +39,12 @@ GATED = (  # (split, region, metric): few, so that the correction for many compa
     ("novel_pose", "", "template_mm"),
 )
 EXACT_COUNTS = ("params", "gaussians")
-ALPHA = 0.05
+OF_VERDICT: dict[str, Verdict] = {
+    "worse": "fail",
+    "better": "unexplained improvement",
+    "equivalent": "pass",
+    "unclear": "pass",
+}
 SLOWER = 1.12  # ratio of minima over a baseline's thirteen cells and a run's three to thirteen
 TIMED_AGAIN = 10  # cells for times alone: for a baseline always, for a run one by one while a time fails
 OTHER_TRAINING = 1.25  # ratio of training times, either way
@@ -278,7 +283,7 @@ def _times(results: Sequence[CellResult]) -> dict[str, float]:
 
 def _quality_checks(compared: Sequence[tuple[BaselineEntry, BaselineEntry]]) -> list[Check]:
     checks: list[Check] = []
-    tests: list[tuple[BaselineEntry, str, Difference, Sequence[float], Sequence[float]]] = []
+    tests: list[tuple[BaselineEntry, str, Comparison, Sequence[float], Sequence[float]]] = []
     for base, now in compared:
         if base.truth != now.truth:
             detail = "the ground truth changed, so qualities cannot be compared; update the baseline"
@@ -289,11 +294,18 @@ def _quality_checks(compared: Sequence[tuple[BaselineEntry, BaselineEntry]]) -> 
             for name, before in base.qualities.items():
                 after = now.qualities.get(name, ())
                 if len(before) > 1 and len(after) > 1:
-                    tests.append((base, name, welch(after, before), before, after))
+                    metric = METRICS[name.split("/")[-1]]
+                    test = compare_samples(
+                        {"": after}, {"": before}, margin=metric.abs_tol, higher_is_better=metric.direction == "up"
+                    )
+                    tests += [(base, name, test, before, after)] if test else []
                 else:
                     checks.append(_single(base, name, before, after))
-    adjusted = holm([test.p for _, _, test, _, _ in tests])
-    return checks + [_quality_check(*test, p=p) for test, p in zip(tests, adjusted, strict=True)]
+    found = corrected([test for _, _, test, _, _ in tests])
+    return checks + [
+        _quality_check(base, name, test, before, after)
+        for (base, name, _, before, after), test in zip(tests, found, strict=True)
+    ]
 
 
 def _check(
@@ -318,17 +330,13 @@ def _means(name: str, before: Sequence[float], after: Sequence[float]) -> str:
 
 
 def _quality_check(
-    entry: BaselineEntry, name: str, test: Difference, before: Sequence[float], after: Sequence[float], *, p: float
+    entry: BaselineEntry, name: str, test: Comparison, before: Sequence[float], after: Sequence[float]
 ) -> Check:
-    margin = METRICS[name.split("/")[-1]].abs_tol
-    smallest = max(margin, test.detectable)
     detail = (
-        f"{_means(name, before, after)} ({test.mean:+.4g} [{test.low:+.4g}, {test.high:+.4g}], p {p:.2g}; "
-        f"a change from {smallest:.2g} on would be seen)"
+        f"{_means(name, before, after)} ({test.mean:+.4g} [{test.low:+.4g}, {test.high:+.4g}], p {test.p:.2g}, "
+        f"{test.verdict}; a change from {max(test.margin, test.detectable):.2g} on would be seen)"
     )
-    beyond = abs(test.mean) > margin and p < ALPHA
-    verdict: Verdict = _direction(name, test.mean) if beyond else "pass"
-    return _check(entry, name, verdict, detail, kind="quality", name=name)
+    return _check(entry, name, OF_VERDICT[test.verdict], detail, kind="quality", name=name)
 
 
 def _single(entry: BaselineEntry, name: str, before: Sequence[float], after: Sequence[float]) -> Check:

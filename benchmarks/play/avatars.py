@@ -14,7 +14,6 @@ from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -26,14 +25,12 @@ from ash.capture.formats import load_capture
 from ash.files import InputError, link_or_copy
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted, splat
-from ash.inference import Player
-from ash.model import Decode, image_of, mixed, views_of
+from ash.model import blend_renders, image_of, views_of
 from ash.protocol import Avatar, PosedGeometry, PosesGaussians, StageClock
 from benchmarks.analysis.style import style_of
 from benchmarks.cell.cells import CHECKPOINT, Cell, is_trained, read_cell
 from benchmarks.cell.methods import is_oracle
 from benchmarks.cell.process import load_avatar as open_avatar
-from benchmarks.play.cameras import first_camera
 from benchmarks.play.motions import motion_clip
 from benchmarks.suites.runs import RUN_FILE, read_run
 
@@ -109,20 +106,12 @@ class LoadedAvatar:
         vertices = self.avatar.template_vertices(pose) if isinstance(self.avatar, PosedGeometry) else ()
         return np.asarray(vertices) if len(vertices) else None
 
-    @cached_property
-    def decoders(self) -> Decode | None:
-        """The decoders on the engine that is fastest on this machine, which is measured once; None: the avatar's own."""
-        if not isinstance(self.avatar, AshAvatar):
-            return None
-        engine = Player(self.avatar, self.motion, first_camera(self.capture)).engine
-        return None if engine is None else engine.decode
-
     def _components(self, pose: Pose, clock: StageClock) -> Components:
         assert isinstance(self.avatar, PosesGaussians)
         key = (pose.motion.dofs[pose.window(8)].tobytes(), pose.frame)
         if key not in self._cache:
             if isinstance(self.avatar, AshAvatar):
-                posed = self.avatar.shared_gaussians(pose, clock=clock, decoders=self.decoders)
+                posed = self.avatar.shared_gaussians(pose, clock=clock)
             else:
                 posed = [(1.0, self.avatar.gaussians(pose))]
             self._cache[key] = posed
@@ -134,7 +123,9 @@ class LoadedAvatar:
     def _splat(self, components: Components, camera: Camera, background: torch.Tensor | None) -> Splatted:
         assert isinstance(self.avatar, PosesGaussians)
         options = {**views_of([camera]), "dilation": self.avatar.dilation, "threads": torch.get_num_threads()}
-        return mixed([(weight, splat(gaussians, background=background, **options)) for weight, gaussians in components])
+        return blend_renders(
+            [(weight, splat(gaussians, background=background, **options)) for weight, gaussians in components]
+        )
 
 
 def composite(premultiplied: np.ndarray, background: Colour) -> np.ndarray:

@@ -114,7 +114,7 @@ def playing(
     torch.set_num_threads(cores())
     try:
         with open_avatars(run, scene=scene, methods=methods, device=device, trust=trust) as avatars:
-            _ = avatars[avatars.titles[0]].decoders  # A run that cannot be played is refused before a browser opens.
+            avatars[avatars.titles[0]]  # A run that cannot be played is refused before a browser opens.
             player = PlayServer(avatars, motions, options or AuthOptions())
             try:
                 yield player

@@ -164,7 +164,7 @@ def _serve(folder: Path, connection: Connection) -> None:
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's; it ends us.
-    from synth.readers.any_pose import PoseTruth
+    from synth.truth.any_pose import PoseTruth
 
     truth: PoseTruth | None = None
     while True:

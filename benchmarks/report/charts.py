@@ -1,4 +1,4 @@
-"""The kinds of charts in a report: one declarative specification each (Vega-Lite, by Altair), in panels."""
+"""The kinds of charts in a report: a table in, panels of Vega-Lite (by Altair) out."""
 
 import json
 import math
@@ -10,98 +10,85 @@ import pandas as pd
 
 from benchmarks.report.vega import DIM, INK, LINE, PAPER, Series
 
-FEW = 6  # Up to so many series are named where they are drawn, if there is room.
-APART = 0.06  # of an axis, at least, between two of its ticks
+Panels = tuple[alt.LayerChart, ...]
+TICK_GAP = 0.06  # of an axis, at least, between two of its ticks
 WIDTH = 900  # pixels of a chart in a file
 REAL_TIME_MS = 1e3 / 30
-LEAST_REACH_DB = 2.0  # that a whisker may stand out beyond all points of a chart of speed
+LEAST_REACH_DB = 2.0  # of a whisker beyond all points of a chart of speed
+WRITING, FRAME = "#17202c", "#c2415c"  # in a matrix, whose cells keep their light colours on dark pages
+RANGE = ("#e8995a", "#f1f3f6", "#6f9ceb")
+CELL = (70, 40)  # pixels of a matrix's cell
+LEAST_SCALE = 0.7  # below which the numbers of a matrix are hardly readable
 
 
 def speed(
     points: pd.DataFrame, front: pd.DataFrame, links: pd.DataFrame, series: Sequence[Series], *, notes: dict[str, str]
-) -> tuple[tuple[alt.LayerChart, ...], bool]:
-    """Accuracy against speed: a panel per `panel` of `points`, which all share both axes; and whether points are named.
+) -> Panels:
+    """Accuracy against speed: a panel per `panel` of `points`; all share both axes.
 
-    `points`: panel, series, ms, psnr, low, high, ringed, and where it lies below the chart note and level, a count.
-    `front`: panel, ms, psnr of the staircase. `links`: panel, link, ms, psnr.
+    `points`: panel, series, ms, psnr, low, high, ringed. `front`: panel, ms, psnr of the staircase. `links`: panel,
+    link, ms, psnr. `notes`: subtitles by panel.
     """
-    size, x, y = (380, 330), _log_domain(points["ms"], 1.5), _domain(_cut(points), ["psnr", "low", "high"])
-    sides = [_sides(own, series, "ms", "psnr", x=x, y=y, size=size) for _, own in points.groupby("panel", sort=False)]
-    named = len(series) <= FEW and all(side is not None for side in sides)
-    placed = points.assign(side=pd.concat([side for side in sides if side is not None]) if named else "")
+    reach = max(LEAST_REACH_DB, float(points["psnr"].max() - points["psnr"].min()))
+    low, high = (
+        points["low"].clip(lower=points["psnr"].min() - reach),
+        points["high"].clip(upper=points["psnr"].max() + reach),
+    )
+    x = _log_domain(points["ms"], 1.5)
+    y = _domain(points.assign(low=low, high=high), ["psnr", "low", "high"])
+    at = {
+        "x": alt.X(
+            "ms:Q",
+            title="ms per frame, one core",
+            scale=alt.Scale(type="log", domain=x, nice=False),
+            axis=alt.Axis(values=_log_ticks(x), format="~s"),
+        ),
+        "y": alt.Y("psnr:Q", title="foreground PSNR [dB]", scale=_fixed(y)),
+    }
+    tips = [("series", "method", ""), ("ms", "ms per frame", ".1f"), ("psnr", "PSNR [dB]", ".2f")]
     panels = []
-    for panel, own in placed.groupby("panel", sort=False):
-        at = _xy("ms:Q", "psnr:Q", x, y, "ms per frame, one core", "foreground PSNR [dB]", log=True)
-        tips = [("series", "method", ""), ("ms", "ms per frame", ".1f"), ("psnr", "PSNR [dB]", ".2f")]
-        seen = alt.Chart(inline(own)).transform_filter("indexof(hidden, datum.series) < 0")
+    for panel, own in points.groupby("panel", sort=False):
+        shown = _shown(own)
         step = front[front["panel"] == panel]
         stair = pd.concat([step.head(1).assign(psnr=y[0]), step, step.tail(1).assign(ms=x[1])])
+        stroke: dict[str, Any] = {"color": LINE, "strokeWidth": 1, "clip": True}
         layers = [
-            alt.Chart(inline(stair))
-            .mark_line(interpolate="step-after", color=LINE, strokeWidth=1, clip=True)
-            .encode(**at),
+            alt.Chart(inline(stair)).mark_line(interpolate="step-after", **stroke).encode(**at),
             alt.Chart(inline(links[links["panel"] == panel]))
-            .mark_line(color=LINE, strokeDash=[3, 3], clip=True)
+            .mark_line(strokeDash=[3, 3], **stroke)
             .encode(**at, detail="link:N"),
-            _whiskers(seen, at, series),
-            seen.transform_filter("datum.ringed").mark_point(size=330, filled=False, color=INK, clip=True).encode(**at),
-            seen.mark_point(size=80, opacity=1, strokeWidth=2, clip=True).encode(
-                **at, **look(series), tooltip=tooltips(tips)
-            ),
-            *_labels(seen.transform_filter("!isValid(datum.level)"), at, own),
-            *(
-                _text(seen.transform_filter(f"datum.level === {level}"), at, "note:N", dy=-14 * level)
-                for level in sorted(own["level"].dropna().unique())
+            _whiskers(shown, at, series),
+            shown.transform_filter("datum.ringed")
+            .mark_point(size=330, filled=False, color=INK, clip=True)
+            .encode(**at),
+            shown.mark_point(size=80, opacity=1, strokeWidth=2, clip=True).encode(
+                **at, **style(series), tooltip=tooltips(tips)
             ),
         ]
         if x[0] < REAL_TIME_MS < x[1]:
-            mark = pd.DataFrame({"ms": [REAL_TIME_MS], "psnr": [y[0]], "text": ["30 frames/s"]})
-            layers.append(alt.Chart(inline(mark)).mark_rule(strokeDash=[2, 4]).encode(x=at["x"]))
-            late = math.log(REAL_TIME_MS / x[0]) > 0.8 * math.log(x[1] / x[0])  # No room is left on the right.
-            place: dict[str, Any] = {"dx": -4, "align": "right"} if late else {"dx": 4, "align": "left"}
-            layers.append(_text(alt.Chart(inline(mark)), at, "text:N", dy=-6, color=DIM, **place))
-        panels.append(layered(layers, f"{panel}", size, notes.get(str(panel), "")))
-    return tuple(panels), named
+            mark = alt.Chart(inline(pd.DataFrame({"ms": [REAL_TIME_MS], "psnr": [y[0]], "text": ["30 frames/s"]})))
+            layers.append(mark.mark_rule(strokeDash=[2, 4]).encode(x=at["x"]))
+            text = mark.mark_text(clip=True, dy=-6, dx=4, align="left", color=DIM)
+            layers.append(text.encode(**at, text="text:N"))
+        panels.append(layered(layers, f"{panel}", (380, 330), notes.get(str(panel), "")))
+    return tuple(panels)
 
 
-def curves(
-    points: pd.DataFrame, series: Sequence[Series], *, x: str, y: str, log: bool = True
-) -> tuple[tuple[alt.LayerChart, ...], bool]:
-    """Lines over time: `points` has series, x, y; each line is named at its end where there is room."""
-    size = (WIDTH - 80, 260)
-    names_at_ends = len(series) <= FEW
-    domain = _log_domain(points["x"], 1.02) if log else (float(points["x"].min()), float(points["x"].max()))
-    if names_at_ends:  # They are drawn inside, right of the last point.
-        domain = (domain[0], domain[1] * (domain[1] / domain[0]) ** 0.22)
-    span = _domain(points, ["y"], pad=0.06)
-    ends = points.groupby("series", sort=False).tail(1)
-    gaps = ends["y"].sort_values().diff().dropna() / (span[1] - span[0]) * size[1]
-    named = names_at_ends and bool((gaps > 14).all())
-    at = _xy("x:Q", "y:Q", domain, span, x, y, log=log)
-    seen = alt.Chart(inline(points)).transform_filter("indexof(hidden, datum.series) < 0")
-    last = alt.Chart(inline(ends)).transform_filter("indexof(hidden, datum.series) < 0")
-    tips = tooltips([("series", "method", ""), ("x", x, ".3~s"), ("y", y, ".2f")])
-    layers = [
-        seen.mark_line(strokeWidth=1.8, clip=True).encode(**at, **_stroke(series, dashes=True)),
-        seen.mark_point(size=22, opacity=1, clip=True).encode(**at, **look(series), tooltip=tips),
-        *([_text(last, at, "series:N", dx=9, align="left")] if named else []),
-    ]
-    return (layered(layers, "", size),), named
-
-
-def bars(rows: pd.DataFrame, series: Sequence[Series], *, x: str) -> tuple[alt.LayerChart, ...]:
+def bars(rows: pd.DataFrame, series: Sequence[Series], *, x: str) -> Panels:
     """Stacked bars: `rows` has row, series, value."""
     order = list(rows["row"].unique())
     totals = rows.groupby("row", sort=False, as_index=False)["value"].sum()
     y = alt.Y("row:N", sort=order, title=None, axis=alt.Axis(ticks=False, domain=False))
     limit = alt.Scale(domain=[0, float(totals["value"].max()) * 1.12])
-    seen = alt.Chart(inline(rows.assign(order=rows["series"].map({s.title: i for i, s in enumerate(series)}))))
-    drawn = seen.transform_filter("indexof(hidden, datum.series) < 0").mark_bar(clip=True)
+    shown = _shown(rows.assign(order=rows["series"].map({s.title: i for i, s in enumerate(series)})))
     tips = tooltips([("row", "method", ""), ("series", "stage", ""), ("value", x, ".2f")])
-    value = alt.X("value:Q", title=x, scale=limit)
     layers = [
-        drawn.encode(
-            y=y, x=value, order="order:Q", tooltip=tips, fill=_scale("fill", series, [s.colour for s in series])
+        shown.mark_bar(clip=True).encode(
+            y=y,
+            x=alt.X("value:Q", title=x, scale=limit),
+            order="order:Q",
+            tooltip=tips,
+            fill=_scale("fill", series, [s.colour for s in series]),
         ),
         alt.Chart(inline(totals))
         .mark_text(align="left", dx=5, color=DIM)
@@ -110,43 +97,42 @@ def bars(rows: pd.DataFrame, series: Sequence[Series], *, x: str) -> tuple[alt.L
     return (layered(layers, "", (WIDTH - 220, 30 * len(order))),)
 
 
-def forest(effects: pd.DataFrame, series: Sequence[Series], *, x: str) -> tuple[alt.LayerChart, ...]:
-    """Differences with their intervals, a row each: `effects` has panel, row, mean, low, high, series (who is ahead).
+def forest(effects: pd.DataFrame, series: Sequence[Series], *, x: str) -> Panels:
+    """Differences, a row each, with their intervals if any: `effects` has panel, row, mean, low, high, series.
 
-    Rows are in the order of the first panel's means, all of which are shown. One wide interval does not press the rest
-    together: it is cut.
+    Rows are in the order of the first panel's means. Wide intervals are cut, with an arrow.
     """
-    order = list(effects.sort_values("mean", ascending=False, kind="stable")["row"].drop_duplicates())
-    first = effects[effects["panel"] == effects["panel"].iloc[0]].sort_values("mean", ascending=False)
-    order = [*first["row"], *(row for row in order if row not in set(first["row"]))]
-    ends = effects[["low", "high"]].to_numpy()
+    first = effects[effects["panel"] == effects["panel"].iloc[0]].sort_values("mean", ascending=False, kind="stable")
+    order = list(dict.fromkeys([*first["row"], *effects.sort_values("mean", ascending=False)["row"]]))
+    ends = effects[["low", "high", "mean"]].to_numpy(float)
     most = float(effects["mean"].abs().max())
     usual = max(0.16, 1.6 * float(pd.Series(abs(ends).ravel()).quantile(0.8)), 1.06 * most)
-    low, high = max(-usual, min(0.0, float(ends.min()))), min(usual, max(0.0, float(ends.max())))
+    low, high = (
+        max(-usual, min(0.0, float(pd.Series(ends.ravel()).min()))),
+        min(usual, max(0.0, float(pd.Series(ends.ravel()).max()))),
+    )
     room = 0.03 * (high - low)
     cut = effects.assign(
         start=effects["low"].clip(low, high), end=effects["high"].clip(low, high), zero=0.0, left=low, right=high
     )
+    at = alt.X("mean:Q", title=x, scale=alt.Scale(domain=[low - room, high + room], nice=False))
+    y = alt.Y("row:N", sort=order, title=None, scale=alt.Scale(domain=order), axis=alt.Axis(ticks=False, domain=False))
+    tips = [("row", "", ""), ("series", "", ""), ("mean", "difference", "+.2f")]
+    tips += [("low", "from", "+.2f"), ("high", "to", "+.2f")]
+    arrow: dict[str, Any] = {"size": 40, "opacity": 1, "clip": True}
     panels = []
     for panel, own in cut.groupby("panel", sort=False):
-        at = alt.X("mean:Q", title=x, scale=alt.Scale(domain=[low - room, high + room], nice=False))
-        y = alt.Y(
-            "row:N", sort=order, title=None, scale=alt.Scale(domain=order), axis=alt.Axis(ticks=False, domain=False)
-        )
-        seen = alt.Chart(inline(own)).transform_filter("indexof(hidden, datum.series) < 0")
-        span = [("low", "from", "+.2f"), ("high", "to", "+.2f")]
-        tips = tooltips([("row", "", ""), ("mean", "difference", "+.2f"), *span])
-        arrow: dict[str, Any] = {"size": 40, "opacity": 1, "clip": True}
+        shown = _shown(own)
         layers = [
             alt.Chart(inline(own.head(1))).mark_rule().encode(x=alt.X("zero:Q")),
-            seen.mark_rule(strokeWidth=1.8, clip=True).encode(x=alt.X("start:Q"), x2="end:Q", y=y, **_stroke(series)),
-            seen.transform_filter("datum.mean >= datum.left && datum.mean <= datum.right")
-            .mark_point(size=60, opacity=1)
-            .encode(x=at, y=y, **look(series), tooltip=tips),
-            seen.transform_filter("datum.low < datum.left")
+            shown.transform_filter("isValid(datum.low)")
+            .mark_rule(strokeWidth=1.8, clip=True)
+            .encode(x=alt.X("start:Q"), x2="end:Q", y=y, **_stroke(series)),
+            shown.mark_point(size=60, opacity=1).encode(x=at, y=y, **style(series), tooltip=tooltips(tips)),
+            shown.transform_filter("datum.low < datum.left")
             .mark_point(shape="triangle-left", **arrow)
             .encode(x="left:Q", y=y, **_stroke(series)),
-            seen.transform_filter("datum.high > datum.right")
+            shown.transform_filter("datum.high > datum.right")
             .mark_point(shape="triangle-right", **arrow)
             .encode(x="right:Q", y=y, **_stroke(series)),
         ]
@@ -158,77 +144,107 @@ def lines(
     samples: pd.DataFrame,
     series: Sequence[Series],
     *,
+    x: str,
     y: str,
     size: tuple[int, int],
     rules: pd.DataFrame | None = None,
     log: bool = False,
-) -> tuple[alt.LayerChart, ...]:
-    """Small charts that share the scale of y: `samples` has panel, x_title, series, x, y, low, high and crossed.
+) -> Panels:
+    """Small charts that share the scale of y: `samples` has panel, series, x, y, low, high.
 
-    Where it has `scale`, too, panels of one value there share theirs. x is a number, or a text whose steps stand at
-    even distances. `rules`: panel, y, text.
+    Where it has `scale`, panels of one value there share theirs; where it has `crossed`, those points are crossed. x
+    is a number, or a text whose steps stand at even distances. `rules`: panel, y, text.
     """
     rules = pd.DataFrame(columns=["panel", "y", "text"]) if rules is None else rules
     panels = []
     for panel, own in samples.groupby("panel", sort=False):
         alike = samples[samples["scale"] == own["scale"].iloc[0]] if "scale" in samples else samples
-        span = _domain(pd.concat([alike, rules]), ["y", "low", "high"], pad=0.05)
         number = pd.api.types.is_numeric_dtype(samples["x"])
-        title = str(own["x_title"].iloc[0])
         at = {
-            "x": _number_axis(own["x"], title, log=log)
+            "x": _number_axis(own["x"], x, log=log)
             if number
-            else alt.X("x:O", title=title, sort=list(own["x"].unique()), axis=alt.Axis(labelAngle=0)),
-            "y": alt.Y("y:Q", title=y, scale=alt.Scale(domain=span, nice=False, zero=False)),
+            else alt.X("x:O", title=x, sort=list(own["x"].unique()), axis=alt.Axis(labelAngle=0)),
+            "y": alt.Y(
+                "y:Q", title=y, scale=_fixed(_domain(pd.concat([alike, rules]), ["y", "low", "high"], pad=0.05))
+            ),
         }
-        seen = alt.Chart(inline(own)).transform_filter("indexof(hidden, datum.series) < 0")
-        here = rules[rules["panel"] == panel]
-        tips = tooltips(
-            [("series", "", ""), ("x", title, ""), ("y", y, ".2f"), ("low", "from", ".2f"), ("high", "to", ".2f")]
-        )
+        shown = _shown(own)
+        here = alt.Chart(inline(rules[rules["panel"] == panel]))
+        tips = [("series", "", ""), ("x", x, ""), ("y", y, ".2f"), ("low", "from", ".2f"), ("high", "to", ".2f")]
         layers = [
-            alt.Chart(inline(here)).mark_rule(strokeDash=[2, 4]).encode(y=at["y"]),
-            seen.mark_line(strokeWidth=1.8, clip=True).encode(**at, **_stroke(series)),
-            _whiskers(seen, at, series),
-            seen.mark_point(size=50, opacity=1, clip=True).encode(**at, **look(series), tooltip=tips),
-            seen.transform_filter("datum.crossed")
+            here.mark_rule(strokeDash=[2, 4]).encode(y=at["y"]),
+            shown.mark_line(strokeWidth=1.8, clip=True).encode(**at, **_stroke(series)),
+            _whiskers(shown, at, series),
+            shown.mark_point(size=50, opacity=1, clip=True).encode(**at, **style(series), tooltip=tooltips(tips)),
+            shown.transform_filter("datum.crossed")
             .mark_point(shape="M-1,-1L1,1M1,-1L-1,1", size=110, strokeWidth=2, color=INK, opacity=1)
             .encode(**at),
-            alt.Chart(inline(here))
-            .mark_text(align="left", dx=4, dy=-6, color=DIM)
-            .encode(x=alt.value(0), y=at["y"], text="text:N"),
+            here.mark_text(align="left", dx=4, dy=-6, color=DIM).encode(x=alt.value(0), y=at["y"], text="text:N"),
         ]
         panels.append(layered(layers, str(panel), size))
     return tuple(panels)
 
 
-def frames(points: pd.DataFrame, series: Sequence[Series]) -> tuple[alt.LayerChart, ...]:
+def frames(points: pd.DataFrame, series: Sequence[Series]) -> Panels:
     """PSNR per frame: `points` has track, series, frame, psnr. The page sets the signals `track` and `frame`."""
-    span = _domain(points, ["psnr"], pad=0.06)
-    shown = alt.Chart(inline(points)).transform_filter("datum.track == track && indexof(hidden, datum.series) < 0")
+    shown = _shown(points).transform_filter("datum.track == track")
     at = {
         "x": alt.X(
             "frame:Q", title="frame", scale=alt.Scale(nice=False, zero=False), axis=alt.Axis(format="d", tickMinStep=1)
         ),
-        "y": alt.Y("psnr:Q", title="foreground PSNR [dB]", scale=alt.Scale(domain=span, nice=False, zero=False)),
+        "y": alt.Y("psnr:Q", title="foreground PSNR [dB]", scale=_fixed(_domain(points, ["psnr"], pad=0.06))),
     }
     now = alt.Chart(alt.Data(values=[{}])).transform_calculate(frame="frame")
     tips = tooltips([("series", "method", ""), ("frame", "frame", "d"), ("psnr", "PSNR [dB]", ".2f")])
     layers = [
         now.mark_rule(color=INK, strokeWidth=1.5).encode(x=at["x"]),
-        shown.mark_line(strokeWidth=1.6).encode(**at, **_stroke(series, dashes=True)),
-        shown.mark_point(size=24, opacity=1).encode(**at, **look(series), tooltip=tips),
+        shown.mark_line(strokeWidth=1.6).encode(**at, **_stroke(series)),
+        shown.mark_point(size=24, opacity=1).encode(**at, **style(series), tooltip=tips),
     ]
     signals = [alt.param(name="track", value=0), alt.param(name="frame", value=0)]
     return (layered(layers, "", (WIDTH - 80, 190)).add_params(*signals),)
 
 
+def heatmap(cells: pd.DataFrame, *, rows: Sequence[str], columns: Sequence[str], limit: float, title: str) -> Panels:
+    """`cells`: row, column, value, text, interval, verdict, framed. Colours end at the limit on both sides."""
+    top = alt.Axis(orient="top", labelAngle=-35, ticks=False, domain=False, labelPadding=6)
+    x_scale = alt.Scale(domain=list(columns), paddingInner=0.06, paddingOuter=0.03)
+    y_scale = alt.Scale(domain=list(rows), paddingInner=0.1, paddingOuter=0.05)
+    at = {
+        "x": alt.X("column:N", title=None, scale=x_scale, axis=top),
+        "y": alt.Y("row:N", title=None, scale=y_scale, axis=alt.Axis(ticks=False, domain=False)),
+    }
+    scale = alt.Scale(domain=[-limit, 0, limit], range=list(RANGE), clamp=True, interpolate="rgb")
+    tips = [("row", "", ""), ("column", "", ""), ("text", "dB lost", ""), ("interval", "95 %", ""), ("verdict", "", "")]
+    shown = alt.Chart(inline(cells))
+    known = "indexof(['better', 'worse'], datum.verdict)"
+    text: dict[str, Any] = {"dy": -6, "fontSize": 13, "color": WRITING}
+    layers = [
+        shown.mark_rect(cornerRadius=2).encode(
+            **at, fill=alt.Fill("value:Q", scale=scale, legend=None), tooltip=tooltips(tips)
+        ),
+        shown.transform_filter("datum.framed")
+        .mark_rect(filled=False, stroke=FRAME, strokeWidth=2.5, cornerRadius=2)
+        .encode(**at),
+        shown.transform_filter(f"{known} >= 0").mark_text(fontWeight="bold", **text).encode(**at, text="text:N"),
+        shown.transform_filter(f"{known} < 0").mark_text(**text).encode(**at, text="text:N"),
+        shown.mark_text(dy=9, fontSize=10, color=WRITING).encode(**at, text="interval:N"),
+    ]
+    return (layered(layers, title, (CELL[0] * len(columns), CELL[1] * len(rows))),)
+
+
+def least_width(columns: int) -> int:
+    """Pixels that a matrix of so many columns and the names of its rows needs at least."""
+    return round(LEAST_SCALE * CELL[0] * (columns + 2))
+
+
 def layered(layers: Sequence[alt.Chart], title: str, size: tuple[int, int], note: str = "") -> alt.LayerChart:
     """Layers as one panel, whose series the page can hide."""
     heading = alt.TitleParams(title, subtitle=note) if note else alt.TitleParams(title)
-    hidden = alt.param(name="hidden", value=[])
     drawn: Any = alt.layer(*layers)
-    chart: alt.LayerChart = drawn.properties(width=size[0], height=size[1]).add_params(hidden)
+    chart: alt.LayerChart = drawn.properties(width=size[0], height=size[1]).add_params(
+        alt.param(name="hidden", value=[])
+    )
     return chart.properties(title=heading) if title else chart
 
 
@@ -237,52 +253,13 @@ def inline(table: pd.DataFrame) -> alt.Data:
     return alt.Data(values=json.loads(table.to_json(orient="records", double_precision=6)))
 
 
-def _xy(
-    x: str,
-    y: str,
-    x_domain: tuple[float, float],
-    y_domain: tuple[float, float],
-    x_title: str,
-    y_title: str,
-    *,
-    log: bool,
-) -> dict[str, Any]:
-    scale = alt.Scale(type="log" if log else "linear", domain=x_domain, nice=False)
-    axis = alt.Axis(values=_log_ticks(x_domain), format="~s") if log else alt.Axis()
-    return {
-        "x": alt.X(x, title=x_title, scale=scale, axis=axis),
-        "y": alt.Y(y, title=y_title, scale=alt.Scale(domain=y_domain, nice=False, zero=False)),
-    }
-
-
-def _scale(channel: str, series: Sequence[Series], values: Sequence[Any]) -> Any:
-    scale = alt.Scale(domain=[s.title for s in series], range=list(values))
-    kind = {"fill": alt.Fill, "stroke": alt.Stroke, "shape": alt.Shape, "strokeDash": alt.StrokeDash}[channel]
-    legend = None if channel == "strokeDash" else alt.Legend(title=None)
-    return kind("series:N", scale=scale, legend=legend)
-
-
-def look(series: Sequence[Series]) -> dict[str, Any]:
+def style(series: Sequence[Series]) -> dict[str, Any]:
     """Fill, stroke and shape of marks, by the column `series`."""
     return {
         "fill": _scale("fill", series, [PAPER if s.hollow else s.colour for s in series]),
         "stroke": _scale("stroke", series, [s.colour for s in series]),
         "shape": _scale("shape", series, [s.shape for s in series]),
     }
-
-
-def _stroke(series: Sequence[Series], *, dashes: bool = False) -> dict[str, Any]:
-    found = {"stroke": _scale("stroke", series, [s.colour for s in series])}
-    if dashes:
-        found["strokeDash"] = _scale("strokeDash", series, [[5, 3] if s.hollow else [1, 0] for s in series])
-    return found
-
-
-def _whiskers(chart: alt.Chart, at: dict[str, Any], series: Sequence[Series]) -> alt.Chart:
-    with_interval = chart.transform_filter("isValid(datum.low)")
-    return with_interval.mark_rule(strokeWidth=1.4, clip=True).encode(
-        x=at["x"], y=alt.Y("low:Q"), y2="high:Q", **_stroke(series)
-    )
 
 
 def tooltips(fields: Sequence[tuple[str, str, str]]) -> list[alt.Tooltip]:
@@ -293,61 +270,30 @@ def tooltips(fields: Sequence[tuple[str, str, str]]) -> list[alt.Tooltip]:
     ]
 
 
-def _text(chart: alt.Chart, at: dict[str, Any], text: str, **mark: Any) -> alt.Chart:
-    return chart.mark_text(clip=True, **mark).encode(x=at["x"], y=at["y"], text=text)
+def _shown(rows: pd.DataFrame) -> alt.Chart:
+    """The rows of the series that the page does not hide."""
+    return alt.Chart(inline(rows)).transform_filter("indexof(hidden, datum.series) < 0")
 
 
-def _labels(chart: alt.Chart, at: dict[str, Any], points: pd.DataFrame) -> list[alt.Chart]:
-    """Names beside their points, a layer for each side that is used."""
-    places = {
-        "right": (10, 0, "left"),
-        "left": (-10, 0, "right"),
-        "above": (0, -14, "center"),
-        "under": (0, 15, "center"),
-    }
-    return [
-        _text(chart.transform_filter(f"datum.side == '{side}'"), at, "series:N", dx=dx, dy=dy, align=align)
-        for side, (dx, dy, align) in places.items()
-        if (points["side"] == side).any()
-    ]
+def _scale(channel: str, series: Sequence[Series], values: Sequence[Any]) -> Any:
+    scale = alt.Scale(domain=[s.title for s in series], range=list(values))
+    kind = {"fill": alt.Fill, "stroke": alt.Stroke, "shape": alt.Shape}[channel]
+    return kind("series:N", scale=scale, legend=alt.Legend(title=None))
 
 
-def _sides(
-    points: pd.DataFrame,
-    series: Sequence[Series],
-    x_name: str,
-    y_name: str,
-    *,
-    x: tuple[float, float],
-    y: tuple[float, float],
-    size: tuple[int, int],
-) -> pd.Series | None:
-    """On which side of each point its name has room, free of points and other names; None where one has none."""
-    across = (points[x_name].map(math.log) - math.log(x[0])) / (math.log(x[1]) - math.log(x[0])) * size[0]
-    down = (y[1] - points[y_name]) / (y[1] - y[0]) * size[1]
-    taken = [(px - 7, py - 7, px + 7, py + 7) for px, py in zip(across, down, strict=True)]
-    found = {}
-    for index, px, py, name in zip(points.index, across, down, points["series"], strict=True):
-        wide = 6.8 * len(name)
-        boxes = {
-            "right": (px + 8, py - 7, px + 10 + wide, py + 7),
-            "left": (px - 10 - wide, py - 7, px - 8, py + 7),
-            "above": (px - wide / 2, py - 21, px + wide / 2, py - 8),
-            "under": (px - wide / 2, py + 8, px + wide / 2, py + 22),
-        }
-        for side, box in boxes.items():
-            inside = box[0] >= 0 and box[2] <= size[0] and box[1] >= 0 and box[3] <= size[1]
-            if inside and not any(_touch(box, other) for other in taken):
-                taken.append(box)
-                found[index] = side
-                break
-        else:
-            return None
-    return pd.Series(found)
+def _stroke(series: Sequence[Series]) -> dict[str, Any]:
+    return {"stroke": _scale("stroke", series, [s.colour for s in series])}
 
 
-def _touch(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+def _whiskers(chart: alt.Chart, at: dict[str, Any], series: Sequence[Series]) -> alt.Chart:
+    with_interval = chart.transform_filter("isValid(datum.low)")
+    return with_interval.mark_rule(strokeWidth=1.4, clip=True).encode(
+        x=at["x"], y=alt.Y("low:Q"), y2="high:Q", **_stroke(series)
+    )
+
+
+def _fixed(domain: tuple[float, float]) -> alt.Scale:
+    return alt.Scale(domain=domain, nice=False, zero=False)
 
 
 def _domain(table: pd.DataFrame, columns: Sequence[str], pad: float = 0.1) -> tuple[float, float]:
@@ -355,13 +301,6 @@ def _domain(table: pd.DataFrame, columns: Sequence[str], pad: float = 0.1) -> tu
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
     room = pad * (high - low) or 1.0
     return low - room, high + room
-
-
-def _cut(points: pd.DataFrame) -> pd.DataFrame:
-    """With whiskers that stand out no farther than the points span, so that one failure hides no difference."""
-    low, high = points["psnr"].min(), points["psnr"].max()
-    reach = max(LEAST_REACH_DB, high - low)
-    return points.assign(low=points["low"].clip(lower=low - reach), high=points["high"].clip(upper=high + reach))
 
 
 def _log_domain(values: pd.Series, room: float) -> tuple[float, float]:
@@ -384,15 +323,9 @@ def _number_axis(values: pd.Series, title: str, *, log: bool) -> alt.X:
         domain = _log_domain(values, 1.1)
         scale = alt.Scale(type="log", domain=domain, nice=False)
         return alt.X("x:Q", title=title, scale=scale, axis=alt.Axis(values=_log_ticks(domain), format="~s"))
-    scale = alt.Scale(padding=8, nice=False, zero=False)  # Room for the marks at both ends.
-    return alt.X("x:Q", title=title, scale=scale, axis=alt.Axis(values=_ticks_apart(values), format=".3~g"))
-
-
-def _ticks_apart(values: pd.Series) -> list[float]:
-    """Values that a label each has room for; of two that are too close, the rounder one."""
-    least = APART * float(values.max() - values.min())
     ticks: list[float] = []
-    for value in sorted(values.unique(), key=lambda value: (len(f"{value:.3g}"), value)):
-        if all(abs(value - tick) >= least for tick in ticks):
+    for value in sorted(values.unique(), key=lambda value: (len(f"{value:.3g}"), value)):  # Rounder ones first.
+        if all(abs(value - tick) >= TICK_GAP * float(values.max() - values.min()) for tick in ticks):
             ticks.append(float(value))
-    return sorted(ticks)
+    scale = alt.Scale(padding=8, nice=False, zero=False)  # Room for the marks at both ends.
+    return alt.X("x:Q", title=title, scale=scale, axis=alt.Axis(values=sorted(ticks), format=".3~g"))

@@ -2,11 +2,9 @@
 
 import base64
 import io
-import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -14,8 +12,8 @@ from PIL import Image
 
 from ash.capture.formats import load_capture
 from ash.files import InputError, write_atomic
-from benchmarks.analysis.scores import RANKED_SPLITS
-from benchmarks.analysis.statistics import Difference, compared
+from benchmarks.analysis.results import RANKED_SPLITS, Quantity, foreground, load, samples_of
+from benchmarks.analysis.statistics import compare_samples, corrected
 from benchmarks.analysis.style import SPLIT_NAMES
 from benchmarks.cell.cells import Cell, CellResult, ViewScore, read_result, stored_prediction
 from benchmarks.cell.metrics import METRICS, on_black
@@ -24,37 +22,21 @@ from benchmarks.report.page import environment
 from benchmarks.report.pictures import crop_of, on_paper
 from benchmarks.suites.runs import Run, results_of
 
-Verdict = Literal["better", "worse", "identical", "no change seen", "too few", "only before", "only after"]
 QUANTITIES = (
-    ("novel_view", "foreground", "psnr"),
-    ("novel_pose", "foreground", "psnr"),
-    ("near_pose", "foreground", "psnr"),
-    ("far_pose", "foreground", "psnr"),
-    ("novel_view", "foreground", "flip"),
-    ("novel_pose", "foreground", "flip"),
-    ("novel_pose", "full", "iou"),
-    ("speed", "", "frame_ms"),
-    ("speed", "", "train_s"),
+    foreground("novel_view"),
+    foreground("novel_pose"),
+    foreground("near_pose"),
+    foreground("far_pose"),
+    foreground("novel_view", "flip"),
+    foreground("novel_pose", "flip"),
+    Quantity("novel_pose", "full", "iou"),
+    Quantity("speed", "", "frame_ms"),
+    Quantity("speed", "", "train_s"),
 )
-WORST = 2  # Frames of each run that are shown of a row.
+WORST = 2  # frames of each run that are shown of a row
+COLUMNS = ["scene", "method", "what", "unit", "before", "after", "change", "low", "high", "p", "verdict"]
 
 Rows = dict[tuple[str, str], list[tuple[Cell, CellResult]]]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Change:
-    """One quantity of one row, in both runs: means, and the 95 % interval of their difference."""
-
-    scene: str
-    method: str
-    what: str
-    unit: str
-    before: float | None
-    after: float | None
-    change: float | None
-    low: float | None
-    high: float | None
-    verdict: Verdict
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -78,41 +60,77 @@ def write_comparison(before: Run, after: Run, out: Path) -> str:
     old, new = _rows(before), _rows(after)
     if not set(old) & set(new):
         raise InputError(f"{before.folder} and {after.folder}: no scene and method in common, expected at least one")
-    found = changes(old, new)
-    table = pd.DataFrame([asdict(change) for change in found])
-    verdict = verdict_of(found)
+    table = changes(old, new)
     write_atomic(out / "compare.csv", table.to_csv(index=False, float_format="%.6g").encode())
+    shown, verdict = printed(table), verdict_of(table)
     frames = {key: list(_worst_frames(old[key][0], new[key][0])) for key in old if key in new}
     page = (
         environment("html")
         .get_template("compare.html")
-        .render(before=before, after=after, verdict=verdict, changes=[_told(change) for change in found], frames=frames)
+        .render(before=before, after=after, verdict=verdict, changes=shown.to_dict("records"), frames=frames)
     )
     write_atomic(out / "compare.html", page.encode())
-    return f"{verdict}\n\n{pd.DataFrame([_told(change) for change in found]).to_string(index=False)}"
+    return f"{verdict}\n\n{shown.to_string(index=False)}"
 
 
-def changes(before: Rows, after: Rows) -> list[Change]:
-    """Every quantity of every row of either run, in their order."""
-    rows = list(dict.fromkeys([*before, *after]))
-    return [
-        change
-        for row in rows
-        for quantity in QUANTITIES
-        if (change := _change(row, quantity, before.get(row, []), after.get(row, []))) is not None
-    ]
+def changes(before: Rows, after: Rows) -> pd.DataFrame:
+    """Every quantity of every row of either run: `COLUMNS`; p is corrected over all of them.
+
+    Verdict: on the run after; empty where one of the runs lacks the row.
+    """
+    rows, tests = [], []
+    for scene, method in dict.fromkeys([*before, *after]):
+        pair = [runs.get((scene, method), []) for runs in (before, after)]
+        tables = [_by_subject([result for _, result in cells]) for cells in pair]
+        for quantity in QUANTITIES:
+            metric = METRICS[quantity.metric]
+            old, new = (samples_of(table, quantity).get(method, {}) for table in tables)
+            if not old and not new:
+                continue
+            means = [float(np.mean([np.mean(seeds) for seeds in own.values()])) if own else None for own in (old, new)]
+            test = compare_samples(new, old, margin=metric.abs_tol, higher_is_better=metric.direction == "up")
+            same = quantity.split != "speed" and _predictions(pair[0]) == _predictions(pair[1]) != set()
+            what = f"{metric.title}, {SPLIT_NAMES[quantity.split].words}"
+            rows.append([scene, method, what, metric.unit, *means])
+            tests.append((test, same))
+    known = iter(corrected([test for test, _ in tests if test is not None]))
+    found = []
+    for row, (test, same) in zip(rows, tests, strict=True):
+        each = None if test is None else next(known)
+        numbers = [None] * 5 if each is None else [each.mean, each.low, each.high, each.p, each.verdict]
+        found.append([*row, *numbers[:4], "equivalent" if same else numbers[4] or ""])
+    return pd.DataFrame(found, columns=COLUMNS)
 
 
-def verdict_of(found: Sequence[Change]) -> str:
-    """What changed in one sentence."""
-    counts = {kind: [c for c in found if c.verdict == kind] for kind in ("worse", "better")}
-    if not any(counts.values()):
-        return "No change is sure."
+def verdict_of(table: pd.DataFrame) -> str:
+    """What changed, in one sentence."""
     parts = []
-    for kind, those in counts.items():
-        named = ", ".join(dict.fromkeys(f"{c.method} on {c.scene}" for c in those))
-        parts += [f"{len(those)} {'is' if len(those) == 1 else 'are'} {kind} ({named})"] if those else []
-    return f"Of {len(found)} quantities {' and '.join(parts)}."
+    for kind in ("worse", "better"):
+        rows = table[table["verdict"] == kind]
+        names = ", ".join(dict.fromkeys(f"{row.method} on {row.scene}" for row in rows.itertuples()))
+        parts += [f"{len(rows)} {'is' if len(rows) == 1 else 'are'} {kind} ({names})"] if len(rows) else []
+    return f"Of {len(table)} quantities {' and '.join(parts)}." if parts else "No quantity is better or worse."
+
+
+def printed(table: pd.DataFrame) -> pd.DataFrame:
+    """The table as texts."""
+
+    def text(value: float | None, sign: str = "") -> str:
+        return "n/a" if pd.isna(value) else f"{value:{sign}.4g}"
+
+    return pd.DataFrame(
+        {
+            "scene": row.scene,
+            "method": row.method,
+            "what": f"{row.what}{f' ({row.unit})' if row.unit else ''}",
+            "before": text(row.before),
+            "after": text(row.after),
+            "change": text(row.change, "+")
+            + ("" if pd.isna(row.low) else f" [{text(row.low, '+')}, {text(row.high, '+')}]"),
+            "verdict": row.verdict or "n/a",
+        }
+        for row in table.itertuples()
+    )
 
 
 def _rows(run: Run) -> Rows:
@@ -125,59 +143,14 @@ def _rows(run: Run) -> Rows:
     return rows
 
 
-def _change(
-    row: tuple[str, str],
-    quantity: tuple[str, str, str],
-    before: list[tuple[Cell, CellResult]],
-    after: list[tuple[Cell, CellResult]],
-) -> Change | None:
-    split, _, metric = quantity
-    old, new = (_samples(cells, quantity) for cells in (before, after))
-    if not old and not new:
-        return None
-    means = [float(np.mean([np.mean(own) for own in samples.values()])) if samples else None for samples in (old, new)]
-    test = compared(new, old)
-    sure = test is not None and not math.isnan(test.low)
-    same = split != "speed" and _pictures(before) == _pictures(after) != set()
-    return Change(
-        scene=row[0],
-        method=row[1],
-        what=f"{METRICS[metric].title}, {SPLIT_NAMES[split].words}",
-        unit=METRICS[metric].unit,
-        before=means[0],
-        after=means[1],
-        change=test.mean if test else None,
-        low=test.low if test and sure else None,
-        high=test.high if test and sure else None,
-        verdict="only before"
-        if not new
-        else "only after"
-        if not old
-        else "identical"
-        if same
-        else _verdict(metric, test),
-    )
+def _by_subject(results: Sequence[CellResult]) -> pd.DataFrame:
+    """The results with subjects for captures: the same subject may have another capture in the other run."""
+    rows = load(results)
+    return rows.assign(capture=rows["subject"].astype(str))
 
 
-def _samples(cells: list[tuple[Cell, CellResult]], quantity: tuple[str, str, str]) -> dict[str, list[float]]:
-    """A quantity for each seed, by subject."""
-    found: dict[str, list[float]] = {}
-    for cell, result in cells:
-        if (value := result.value(*quantity)) is not None:
-            found.setdefault(str(cell.config.subject), []).append(value)
-    return found
-
-
-def _verdict(metric: str, test: Difference | None) -> Verdict:
-    if test is None or math.isnan(test.low):
-        return "too few"
-    if test.low <= 0 <= test.high:
-        return "no change seen"
-    return "better" if (test.low > 0) == (METRICS[metric].direction == "up") else "worse"
-
-
-def _pictures(cells: list[tuple[Cell, CellResult]]) -> set[tuple[int, int, str, str, int, str]]:
-    """Every picture of a row, by subject, seed and view."""
+def _predictions(cells: list[tuple[Cell, CellResult]]) -> set[tuple[int, int, str, str, int, str]]:
+    """Every prediction of a row, by subject, seed and view."""
     return {
         (cell.config.subject, cell.config.seed, view.split, view.camera, view.frame, view.prediction)
         for cell, result in cells
@@ -185,28 +158,10 @@ def _pictures(cells: list[tuple[Cell, CellResult]]) -> set[tuple[int, int, str, 
     }
 
 
-def _told(change: Change) -> dict[str, str]:
-    """A change as it is read."""
-
-    def number(value: float | None, sign: str = "") -> str:
-        return "n/a" if value is None else f"{value:{sign}.4g}"
-
-    interval = "" if change.low is None else f" [{number(change.low, '+')}, {number(change.high, '+')}]"
-    return {
-        "scene": change.scene,
-        "method": change.method,
-        "what": f"{change.what}{f' ({change.unit})' if change.unit else ''}",
-        "before": number(change.before),
-        "after": number(change.after),
-        "change": number(change.change, "+") + interval,
-        "verdict": change.verdict,
-    }
-
-
 def _worst_frames(before: tuple[Cell, CellResult], after: tuple[Cell, CellResult]) -> Iterator[WorstFrame]:
     """The worst views of each run that the other has as well, of the first seed; none where pictures are gone."""
     scores = [{_key(view): view for view in result.views} for _, result in (before, after)]
-    shared = [key for key in scores[0] if key in scores[1] and key[0] in RANKED_SPLITS]  # Training views are no exam.
+    shared = [key for key in scores[0] if key in scores[1] and key[0] in RANKED_SPLITS]  # not training views
     chosen: dict[tuple[str, str, int], str] = {}
     for name, views in zip(("before", "after"), scores, strict=True):
         for key in sorted(shared, key=lambda key, views=views: _db(views[key]))[:WORST]:  # type: ignore[misc]

@@ -1,11 +1,13 @@
-"""What a report says, whatever it is written in: sections of texts, tables, charts and pictures.
+"""What a report holds, whatever it is written in: sections of texts, tables, charts and pictures.
 
-The page and the Markdown are two templates over these; a new section is a few of them, and appears in both.
+A table is a DataFrame of texts. The page and the Markdown are two templates over these classes.
 """
 
 import base64
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
+
+import pandas as pd
 
 from benchmarks.report.vega import Figure
 
@@ -29,98 +31,51 @@ class Bullets:
     items: tuple[str, ...]
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Head:
-    """A column's head: name, unit, direction that is better, and the group that heads it; `term` is in the glossary."""
-
-    title: str
-    unit: str = ""
-    arrow: str = ""
-    group: str = ""
-    term: str = ""
-
-    @property
-    def whole(self) -> str:
-        """Name, unit and direction on one line."""
-        return f"{self.title}{f' [{self.unit}]' if self.unit else ''} {self.arrow}".strip()
-
-    @property
-    def in_group(self) -> str:
-        """The same where groups have no line of their own."""
-        return f"{self.group}: {self.whole}" if self.group else self.whole
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Entry:
-    """One number as it is printed; `sort` is the number itself (None: not measured)."""
-
-    text: str
-    spread: str = ""  # half of the 95 % interval
-    sort: float | None = None
-    mark: Mark = ""
-
-    @property
-    def whole(self) -> str:
-        """The number with its spread."""
-        return f"{self.text} ± {self.spread}" if self.spread else self.text
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Row:
-    """A row. Those set apart (oracles, sums) stand below a line and are not ranked."""
-
-    name: str
-    entries: tuple[Entry, ...]
-    apart: bool = False
-    note: str = ""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class Table:
-    """A table; `corner` heads the rows' names."""
+    """A table of texts: the index names the rows; columns are titles, or pairs of a group and a title.
+
+    `marks`: by row and column number. The last `below` rows (oracles, sums) stand below a line and are not ranked.
+    """
 
     kind: ClassVar[str] = "table"
-    title: str
-    columns: tuple[Head, ...]
-    rows: tuple[Row, ...]
+    frame: pd.DataFrame
+    title: str = ""
     corner: str = "method"
-    note: str = ""
+    marks: dict[tuple[int, int], Mark] = field(default_factory=dict)
+    below: int = 0
+
+    @property
+    def heads(self) -> list[tuple[str, str]]:
+        """Group and title of every column."""
+        return [head if isinstance(head, tuple) else ("", str(head)) for head in self.frame.columns]
 
     @property
     def groups(self) -> list[tuple[str, int]]:
         """Column groups and how many columns each spans."""
         found: list[tuple[str, int]] = []
-        for column in self.columns:
-            if found and found[-1][0] == column.group:
-                found[-1] = (column.group, found[-1][1] + 1)
+        for group, _ in self.heads:
+            if found and found[-1][0] == group:
+                found[-1] = (group, found[-1][1] + 1)
             else:
-                found.append((column.group, 1))
+                found.append((group, 1))
         return found
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Chart:
-    """A chart."""
-
-    kind: ClassVar[str] = "chart"
-    figure: Figure
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Tile:
-    """A picture in a row; `key` is its place in the report's album."""
-
-    caption: str
-    score: str
-    key: int
+    @property
+    def rows(self) -> list[tuple[str, list[tuple[str, Mark]]]]:
+        """The name of every row, and its texts with their marks."""
+        return [
+            (str(name), [(str(text), self.marks.get((i, k), "")) for k, text in enumerate(texts)])
+            for i, (name, texts) in enumerate(zip(self.frame.index, self.frame.to_numpy(), strict=True))
+        ]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Strip:
-    """A row of pictures of one size, the truth first, and what it shows."""
+    """A row of pictures of one size, truth first: captions, scores and places in the album."""
 
     title: str
-    tiles: tuple[Tile, ...]
+    tiles: tuple[tuple[str, str, int], ...]
     width: int  # pixels
 
 
@@ -149,7 +104,7 @@ class Flipbook:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class KeptSheet:
+class Sheet:
     """A PNG of pictures that an earlier report left; `data` is the file's content."""
 
     kind: ClassVar[str] = "sheet"
@@ -159,16 +114,16 @@ class KeptSheet:
 
     @property
     def uri(self) -> str:
-        """The picture as an address that needs no other file."""
+        """The picture as a data URI."""
         return f"data:image/png;base64,{base64.b64encode(self.data).decode()}"
 
 
-Block = Text | Bullets | Table | Chart | Strips | Flipbook | KeptSheet
+Block = Text | Bullets | Table | Figure | Strips | Flipbook | Sheet
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Section:
-    """A part of the report. A folded one is opened by who wants it; a scene begins with a headline."""
+    """A part of the report; a folded one is closed at first. A scene begins with a headline."""
 
     title: str
     blocks: tuple[Block, ...]
@@ -182,8 +137,3 @@ class Report:
 
     title: str
     sections: tuple[Section, ...]
-
-
-def texts(*values: str) -> tuple[Entry, ...]:
-    """Entries of plain words."""
-    return tuple(Entry(text=value) for value in values)

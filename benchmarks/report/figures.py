@@ -1,14 +1,10 @@
-"""The charts of a scene: its numbers as the tables that `charts.py` draws, with their captions."""
-
-import math
-from collections import Counter
-from collections.abc import Sequence
+"""The charts of a scene: its numbers as the tables that `charts.py` draws, with captions."""
 
 import pandas as pd
 
-from benchmarks.analysis import contrasts, pareto
-from benchmarks.analysis.scores import FRAME_MS, RANKED_SPLITS, Quantity, Score, Scores, foreground
-from benchmarks.analysis.statistics import Difference, intervals
+from benchmarks.analysis import pareto
+from benchmarks.analysis.results import FRAME_MS, RANKED_SPLITS, Quantity, RunTables, foreground, samples_of
+from benchmarks.analysis.statistics import intervals
 from benchmarks.analysis.style import EXACT, SPLIT_NAMES, style_of
 from benchmarks.cell.methods import WRONG_BY_MM
 from benchmarks.report import charts, vega
@@ -22,185 +18,154 @@ STAGES = {
     "": Series(title="other", colour="#8a94a3"),
 }
 STAGE_METRICS = tuple(stage for stage in STAGES if stage)
-MANY_CONTRASTS = 5  # Rows from which contrasts are drawn as well as listed.
-UNKNOWN = "which has one seed on one capture: another seed moves a score by a few tenths of a dB."
+MANY_DIFFERENCES = 5  # rows from which on they are drawn as well as listed
 PLANTED = {method for mm, row in WRONG_BY_MM.items() if mm > 0 for method in row}  # They have a chart of their own.
-SPAN_DB = 9.0  # that a chart shows below its best point: what lies lower would press the rest together
+SPAN_DB = 9.0  # below the best point: lower points are named in the subtitle and not drawn
+VERDICTS = {
+    "better": Series(title="ASH is better", colour=vega.BLUE),
+    "worse": Series(title="ASH is worse", colour=vega.ORANGE),
+    "equivalent": Series(title="equivalent", colour="#2a9d8f"),
+    "unclear": Series(title="unclear", colour=vega.LINE),
+}
 
 
-def speed_figure(scores: Scores, scene: str) -> Figure | None:
-    """Foreground PSNR against milliseconds per frame, for held-out views and held-out motion."""
-    methods = [m for m in scores.methods(scene) if m not in PLANTED and scores.whole(scene, m)]
-    looks = dict(zip(methods, vega.series_of(methods), strict=True))
+def speed_figure(tables: RunTables, scene: str) -> Figure | None:
+    """Foreground PSNR against milliseconds per frame, for novel views and novel poses."""
+    methods = [m for m in tables.methods(scene) if m not in PLANTED and tables.whole(scene, m)]
+    styles = dict(zip(methods, vega.series_of(methods), strict=True))
+    frames = tables.values(scene, FRAME_MS, methods)
     points, front, links = [], [], []
     notes: dict[str, str] = {}
     for split in RANKED_SPLITS:
         panel = SPLIT_NAMES[split].words.capitalize()
-        competing = contrasts.candidates(scores, scene, split)
+        samples = samples_of(tables.of(scene), foreground(split))
+        spans = intervals({m: samples[m] for m in frames if m in samples}) if samples else {}
+        floor = max((span.mean for span in spans.values()), default=0.0) - SPAN_DB
+        shown = {m: span for m, span in spans.items() if span.mean >= floor}
+        competing = [each for each in pareto.candidates(tables, scene, split)]
         sufficient = pareto.smallest_sufficient(competing)
-        here = {
-            m: (frame, score) for m in methods for frame, score in [_pair(scores, scene, m, split)] if frame and score
-        }
-        spans = intervals({m: scores.samples(scene, m, foreground(split)) for m in here}) if here else {}
-        for method, (frame, score) in here.items():
-            ends = {"low": spans[method].low, "high": spans[method].high}
+        for method, span in shown.items():
             ringed = sufficient is not None and sufficient.name == method
-            where = {
-                "panel": panel,
-                "series": looks[method].title,
-                "ms": frame.mean,
-                "psnr": score.mean,
-                "ringed": ringed,
-            }
-            points.append({**where, **ends})
-        front += [{"panel": panel, "ms": here[m][0].mean, "psnr": here[m][1].mean} for m in pareto.front(competing)]
-        pairs = [pair for pair in EXACT.items() if set(pair) <= set(here)]
-        links += [
-            {"panel": panel, "link": pair[0], "ms": here[m][0].mean, "psnr": here[m][1].mean}
-            for pair in pairs
-            for m in pair
+            numbers = {"ms": frames[method], "psnr": span.mean, "low": span.low, "high": span.high}
+            points.append({"panel": panel, "series": styles[method].title, "ringed": ringed, **numbers})
+        for method in pareto.front([each for each in competing if each.name in shown]):
+            front.append({"panel": panel, "ms": frames[method], "psnr": shown[method].mean})
+        for pair in [pair for pair in EXACT.items() if set(pair) <= set(shown)]:
+            links += [{"panel": panel, "link": pair[0], "ms": frames[m], "psnr": shown[m].mean} for m in pair]
+        ceilings = tables.values(scene, foreground(split, "noise_ceiling"), methods)
+        said = [f"noise ceiling {value:.1f} dB" for value in [*ceilings.values()][:1]]
+        said += [
+            f"{styles[m].title} {span.mean:.1f} dB, below the chart" for m, span in spans.items() if m not in shown
         ]
-        ceilings = [c.mean for m in here if (c := scores.get(scene, m, foreground(split, "noise_ceiling")))]
-        notes |= {panel: f"noise ceiling {ceilings[0]:.1f} dB"} if ceilings else {}
+        notes[panel] = "; ".join(said)
     if not points:
         return None
-    columns = {"front": ["panel", "ms", "psnr"], "links": ["panel", "link", "ms", "psnr"]}
-    panels, named = charts.speed(
-        _lifted(pd.DataFrame(points)),
-        pd.DataFrame(front, columns=columns["front"]),
-        pd.DataFrame(links, columns=columns["links"]),
-        tuple(looks.values()),
-        notes=notes,
-    )
-    caption = _speed_caption(exact=bool(links), over=scores.unit(scene) if scores.repeated(scene) else "")
-    title = "Accuracy against speed"
-    return Figure(name=scene, title=title, caption=caption, panels=panels, series=tuple(looks.values()), named=named)
-
-
-def _speed_caption(*, exact: bool, over: str) -> str:
-    """What the chart shows, and no mark that it has not. `over`: what its whiskers are over; empty without them."""
-    caption = "Up and to the left is better."
-    if exact:
-        caption += (
-            " Hollow: given the exact surface, a bound and no competitor; the dashed line joins it with the honest "
-            "method, so its length is what the template's error costs."
-        )
-    caption += " Grey staircase: the front of those that no other beats in both."
-    if over:
-        apart = ", what these add to all methods taken out" if over == "captures" else ""
-        caption += f" Whiskers: 95 % interval over {over}{apart}; one that reaches the edge goes on beyond it."
+    series = tuple(styles.values())
+    front_table = pd.DataFrame(front, columns=["panel", "ms", "psnr"])
+    link_table = pd.DataFrame(links, columns=["panel", "link", "ms", "psnr"])
+    caption = "Up and to the left is better. Grey staircase: the front of the methods that no other beats in both."
+    if links:
+        caption += " Hollow: given the exact surface, a bound and no competitor; the dashed line joins it with the same"
+        caption += " method on its own template."
+    if over := tables.unit(scene):
+        apart = ", the common effect of a capture removed" if over == "captures" else ""
+        caption += f" Whiskers: 95 % interval over {over}{apart}; one that reaches the edge is cut."
         caption += " Ringed: the smallest sufficient method."
-    return caption
+    panels = charts.speed(
+        pd.DataFrame(points).astype({"low": float, "high": float}), front_table, link_table, series, notes=notes
+    )
+    return Figure(name=scene, title="Accuracy against speed", caption=caption, panels=panels, series=series)
 
 
-def _pair(scores: Scores, scene: str, method: str, split: str) -> tuple[Score | None, Score | None]:
-    return scores.get(scene, method, FRAME_MS), scores.get(scene, method, foreground(split))
-
-
-def _lifted(points: pd.DataFrame) -> pd.DataFrame:
-    """Points that lie far below all others, raised to the floor of the chart with their value in `note`.
-
-    `level` counts those of a panel from 1, so that no note is written over another.
-    """
-    floor = points["psnr"].max() - SPAN_DB
-    far = points["psnr"] < floor
-    note = points["series"] + points["psnr"].map(": {:.1f} ↓".format)
-    level = far.groupby(points["panel"]).cumsum().where(far)
-    lifted = points.assign(note=note.where(far), level=level, psnr=points["psnr"].clip(lower=floor))
-    return lifted.assign(**{end: points[end].where(~far) for end in ("low", "high")})
-
-
-AHEAD = (
-    Series(title="ASH is ahead", colour=vega.BLUE),
-    Series(title="the row is ahead", colour=vega.ORANGE),
-    Series(title="the interval holds zero", colour=vega.LINE),
-)
-UNTOLD = Series(title="one seed: no interval", colour=vega.LINE)
-
-
-def effects_figure(found: Sequence[tuple[str, str, Difference]], scene: str, *, over: str) -> Figure | None:
-    """What ASH is ahead by (split, method, difference), where rows are so many that a table is hard to read.
-
-    `over`: what intervals are taken over; where there are none, the differences alone are shown.
-    """
-    if max(Counter(split for split, _, _ in found).values(), default=0) < MANY_CONTRASTS:
+def differences_figure(table: pd.DataFrame, scene: str, *, over: str) -> Figure | None:
+    """`differences` of a scene, where they are so many that a table is hard to read. `over`: unit of the intervals."""
+    if not len(table) or table.groupby("split").size().max() < MANY_DIFFERENCES:
         return None
-    told = not any(math.isnan(test.p) for _, _, test in found)
-    rows = [
-        {
-            "panel": SPLIT_NAMES[split].title,
-            "row": style_of(method).title,
-            "mean": test.mean,
-            "low": test.low if told else test.mean,
-            "high": test.high if told else test.mean,
-            "series": _ahead(test).title,
-        }
-        for split, method, test in found
-    ]
-    series = AHEAD if told else (UNTOLD,)
-    known = f"with the 95 % interval over {over}. Arrows: it goes on beyond the scale." if told else UNKNOWN
+    rows = table.assign(
+        panel=table["split"].map(lambda split: SPLIT_NAMES[split].title),
+        row=table["method"].map(lambda method: style_of(method).title),
+        series=table["verdict"].map(lambda verdict: VERDICTS[verdict].title),
+    )
+    series = tuple(series for verdict, series in VERDICTS.items() if (table["verdict"] == verdict).any())
+    known = f"with the 95 % interval over {over}; arrows: it is cut" if over else "of one seed, without intervals"
     return Figure(
         name=f"effects_{scene}",
-        title="Differences with intervals" if told else "Differences of one seed",
-        caption=f"Foreground PSNR of ASH minus that of the row, {known}",
-        panels=charts.forest(pd.DataFrame(rows), series, x="ASH minus the row [dB]"),
+        title="Differences",
+        caption=f"Foreground PSNR of ASH minus that of the row, {known}.",
+        panels=charts.forest(
+            rows[["panel", "row", "mean", "low", "high", "series"]], series, x="ASH minus the row [dB]"
+        ),
         series=series,
     )
 
 
-def _ahead(test: Difference) -> Series:
-    if math.isnan(test.p):
-        return UNTOLD
-    return AHEAD[0 if test.low > 0 else 1 if test.high < 0 else 2]
-
-
-def training_figure(scores: Scores, curves: pd.DataFrame, scene: str) -> Figure | None:
-    """Foreground PSNR of reserved training views over seconds of training, first seed of the first capture.
-
-    `curves`: see `curves_of`.
-    """
+def training_figure(tables: RunTables, scene: str) -> Figure | None:
+    """Foreground PSNR of reserved training views over seconds of training, first seed of the first capture."""
+    curves = tables.curves[tables.curves["scene"] == scene]
     curves = curves[curves["capture"] == curves.groupby("method")["capture"].transform("first")]
     curves = curves[curves["seed"] == curves.groupby("method")["seed"].transform("min")]
-    methods = [m for m in scores.methods(scene) if (curves["method"] == m).sum() > 1]
+    methods = [m for m in tables.methods(scene) if (curves["method"] == m).sum() > 1]
     if not methods:
         return None
-    looks = vega.series_of(methods)
-    names = {method: look.title for method, look in zip(methods, looks, strict=True)}
-    points = curves[curves["method"].isin(methods)]
-    points = pd.DataFrame({"series": points["method"].map(names), "x": points["seconds"], "y": points["psnr"]})
-    panels, named = charts.curves(points, looks, x="seconds of training", y="PSNR of views that no step sees [dB]")
-    return Figure(
+    title = "Training"
+    caption = "Foreground PSNR of reserved training views, which no step sees, over seconds of training. First seed;"
+    return line_figure(
+        curves[curves["method"].isin(methods)].assign(panel=""),
+        methods,
         name=f"training_{scene}",
-        title="Training",
-        caption="Foreground PSNR of training views that are reserved, so that no step sees them, over seconds of "
-        "training: what stopping earlier would have given. First seed; warm-up included.",
-        panels=panels,
-        series=looks,
-        columns=1,
-        named=named,
+        title=title,
+        caption=f"{caption} warm-up included.",
+        x="seconds",
+        x_title="seconds of training",
+        y_title="PSNR of reserved views [dB]",
+        size=(charts.WIDTH - 80, 260),
+        log=True,
     )
 
 
-def stage_figure(scores: Scores, scene: str) -> Figure | None:
+def stage_figure(tables: RunTables, scene: str) -> Figure | None:
     """Milliseconds per frame by stage; what no stage claims is shown as other."""
     rows = []
-    for method in scores.methods(scene):
-        whole = scores.get(scene, method, FRAME_MS)
-        found = {stage: scores.get(scene, method, Quantity("speed", "", stage)) for stage in STAGE_METRICS}
-        if whole is None or scores.failed(scene, method) or not any(found.values()):
+    for method in tables.methods(scene):
+        whole = tables.get(scene, method, FRAME_MS)
+        stages = {stage: tables.get(scene, method, Quantity("speed", "", stage)) for stage in STAGE_METRICS}
+        if whole is None or tables.failed(scene, method) or all(row is None for row in stages.values()):
             continue
-        parts = {stage: score.mean if score else 0.0 for stage, score in found.items()}
-        parts[""] = max(0.0, whole.mean - sum(parts.values()))
+        parts = {stage: 0.0 if row is None else row.value for stage, row in stages.items()}
+        parts[""] = max(0.0, whole.value - sum(parts.values()))
         name = style_of(method).title
         rows += [{"row": name, "series": STAGES[stage].title, "value": value} for stage, value in parts.items()]
     if not rows:
         return None
-    series = tuple(STAGES.values())
     return Figure(
         name=f"stages_{scene}",
         title="Time per stage",
         caption="One frame on one core, median after warm-up, by the paper's stages.",
-        panels=charts.bars(pd.DataFrame(rows), series, x="ms per frame"),
-        series=series,
+        panels=charts.bars(pd.DataFrame(rows), tuple(STAGES.values()), x="ms per frame"),
+        series=tuple(STAGES.values()),
         columns=1,
+    )
+
+
+def line_figure(
+    table: pd.DataFrame,
+    methods: list[str],
+    *,
+    name: str,
+    title: str,
+    caption: str,
+    x: str,
+    x_title: str,
+    y_title: str = "foreground PSNR [dB]",
+    size: tuple[int, int] = (390, 240),
+    log: bool = False,
+) -> Figure:
+    """A line per method through `table` (panel, method, psnr, the column `x`, and low, high, scale where known)."""
+    series = vega.series_of(methods)
+    names = {method: each.title for method, each in zip(methods, series, strict=True)}
+    samples = table.assign(series=table["method"].map(names), x=table[x].astype(float), y=table["psnr"])
+    kept = [column for column in ("panel", "scale", "series", "x", "y", "low", "high") if column in samples]
+    panels = charts.lines(samples[kept], series, x=x_title, y=y_title, size=size, log=log)
+    return Figure(
+        name=name, title=title, caption=caption, panels=panels, series=series, columns=2 if len(panels) > 1 else 1
     )

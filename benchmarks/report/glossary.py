@@ -1,34 +1,7 @@
-"""What the words of a report mean: shown to the pointer wherever they stand, and listed at its end."""
+"""The terms of a report: explained to the pointer wherever they stand, and listed at its end."""
 
 import re
 
-METRIC_TERMS = {
-    "psnr": "PSNR",
-    "ssim": "SSIM",
-    "flip": "FLIP",
-    "lpips": "LPIPS",
-    "iou": "IoU",
-    "template_mm": "template error",
-    "surface_mm": "to surface",
-    "flicker": "flicker",
-    "noise_ceiling": "noise ceiling",
-    "novelty_deg": "novelty",
-    "frame_ms": "frame time",
-    "stg1_ms": "Stg.1",
-    "stg2_ms": "Stg.2",
-    "stg3_ms": "Stg.3",
-    "stg4_ms": "Stg.4",
-    "train_s": "training time",
-    "train_cpu_s": "CPU time",
-    "gap": "gap",
-    "settled_s": "settled",
-    "steps": "steps",
-    "train_cameras": "cameras seen",
-    "train_frames": "frames seen",
-    "params": "parameters",
-    "gaussians": "Gaussians",
-    "peak_rss_mb": "memory",
-}
 GLOSSARY = {
     "PSNR": "Peak signal-to-noise ratio in decibels: 10 log10 of one over the mean squared error. Higher is better; "
     "one decibel is an error smaller by a fifth.",
@@ -48,16 +21,14 @@ GLOSSARY = {
     "foreground": "The pixels that the subject truly covers by more than half: background would only dilute a score.",
     "release crop": "As the released ASH code validates: masked, on white, cut to a window, blind outside the "
     "silhouette.",
-    "held-out views": "Cameras that no method was trained on, in frames of the training motion.",
-    "held-out motion": "A motion that no method was trained on, seen by cameras that none was trained on.",
-    "near motion": "Held-out motion that is another take of a kind that was trained on.",
-    "far motion": "Held-out motion unlike all that was trained on: arms stretched up, a deep squat, a jump.",
+    "novel views": "Cameras that no method was trained on, in frames of the training motion.",
+    "novel poses": "A motion that no method was trained on, seen by cameras that none was trained on.",
+    "near novel poses": "Another take of a kind of motion that was trained on.",
+    "far novel poses": "Motion unlike all that was trained on: arms stretched up, a deep squat, a jump.",
     "novelty": "How far a pose lies from the nearest training pose, in degrees: the mean over the joints of the "
     "geodesic angle between their rotations in their parents' frames, the heading removed.",
-    "novel view": "Another name for held-out views.",
-    "novel pose": "Another name for held-out motion.",
     "training view": "Images that the method was trained on.",
-    "frame time": "Milliseconds to draw one frame of near motion on one core: the median over frames after warm-up.",
+    "frame time": "Milliseconds to draw a frame of near novel poses on one core: median over frames after warm-up.",
     "Stg.1": "The paper's first stage: the template is posed and deformed.",
     "Stg.2": "The paper's second stage: the motion-aware textures are made.",
     "Stg.3": "The paper's third stage: decoders turn textures into Gaussians, or into a texture.",
@@ -65,37 +36,38 @@ GLOSSARY = {
     "training time": "Seconds of training on one core, warm-up included.",
     "CPU time": "Seconds that the method's processes kept a processor busy during training, counted from outside. Less "
     "than the clock's where they were stopped or shared a core, more where they used several.",
-    "not isolated": "Trained where the system could not lock the method in: the truth was not given to it, and opening "
-    "it was watched, but code that means to could have reached it.",
-    "gap": "By how many decibels training views are better than these: what was learned by heart.",
+    "not isolated": "Trained where the system could not isolate the method's process: the truth was not given to it, "
+    "and access to it was watched, but not made impossible.",
+    "gap": "PSNR on training views minus PSNR here: overfitting.",
     "settled": "Seconds of training after which no score of reserved views differs by more than 0.3 dB from the last.",
     "steps": "How many steps of the optimiser training took.",
     "cameras seen": "How many of the capture's training cameras the method learned from.",
     "frames seen": "How many of the capture's training frames the method learned from.",
-    "plateau": "Training had stopped to help: its last third gained less than 0.1 dB on views that no step saw.",
+    "plateau": "The last third of training gained less than 0.1 dB on reserved training views.",
     "memory": "Peak resident memory of the process, Python and libraries included.",
     "parameters": "How many numbers the method learned.",
     "Gaussians": "How many splats are drawn; a mesh has none. Neither more nor fewer is better.",
-    "hypervolume": "The area that the best methods cover between accuracy and the logarithm of time, up to a frame per "
-    "second at 10 dB: one number for the whole field.",
-    "smallest sufficient": "The cheapest method whose loss to the best is surely below half a decibel.",
+    "smallest sufficient": "The cheapest method whose loss to the best has a one-sided 95 % bound below 0.5 dB.",
     "Welch": "Welch's t test: two means of unequal variance, here over the seeds of a single capture.",
     "paired t": "Student's t test of the differences between two methods, a mean over seeds for each capture.",
     "Holm": "Holm's correction (1979): keeps the chance of any false alarm among all rows at 5 %.",
-    "hierarchical bootstrap": "An interval from drawing captures and images anew, or the seeds of a single capture; a "
-    "little too narrow for three of them.",
-    "detectable": "The smallest true difference that this number of captures or seeds would find four times in five.",
+    "detectable": "The smallest true difference that this number of captures or seeds finds with 80 % power.",
     "Kendall's tau": "Agreement of two rankings: 1 the same order, -1 the opposite one.",
-    "breakdown point": "The least severity at which a method is surely worse than half way to the nearest "
-    "training image.",
-    "seed": "The random number from which a training starts: the spread over seeds is what chance decides.",
+    "breakdown point": "The least severity at which the interval of a method lies below the middle between its score "
+    "on the clean capture and that of the nearest training image.",
+    "seed": "The start of the random numbers of a training.",
     "preset": "A complete configuration by name: resolution, steps of training, sizes of networks.",
-    "capture": "What methods are trained and judged on: a synthetic person filmed by many cameras, with its exact "
+    "capture": "What methods are trained and scored on: a synthetic subject filmed by many cameras, with its exact "
     "truth.",
     "scene": "What a capture shows: a body, its clothes, its motion and its light.",
     "cell": "One method trained once on one capture.",
 }
-FORMS = {**{term.lower(): term for term in GLOSSARY}, "frame [ms]": "frame time", "held-out view": "held-out views"}
+FORMS = {
+    **{term.lower(): term for term in GLOSSARY},
+    "frame [ms]": "frame time",
+    "novel view": "novel views",
+    "novel pose": "novel poses",
+}
 LONGEST_FIRST = "|".join(re.escape(form) for form in sorted(FORMS, key=len, reverse=True))
 WORDS = re.compile(rf"(?<![\w.])({LONGEST_FIRST})(?!\w)", re.IGNORECASE)
 
@@ -105,12 +77,17 @@ def anchor(term: str) -> str:
     return "term-" + re.sub(r"\W+", "-", term.lower())
 
 
+def meaning(text: str) -> str:
+    """What the first term in a text means; empty without one."""
+    return next((GLOSSARY[term] for _, term in split_terms(text) if term), "")
+
+
 def split_terms(text: str) -> list[tuple[str, str]]:
-    """The text in pieces, each with the term that it is, or none; of several mentions only the first is one."""
+    """The text in pieces, each with its term or an empty string; of several mentions only the first is a term."""
     pieces: list[tuple[str, str]] = []
-    seen: set[str] = set()
+    used: set[str] = set()
     for index, piece in enumerate(WORDS.split(text)):
-        term = FORMS[piece.lower()] if index % 2 and FORMS[piece.lower()] not in seen else ""
-        seen.add(term)
+        term = FORMS[piece.lower()] if index % 2 and FORMS[piece.lower()] not in used else ""
+        used.add(term)
         pieces.append((piece, term))
     return pieces

@@ -3,18 +3,19 @@
 Everything comes from the results of the run's cells; the page needs no network and no other file.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Literal
 
+import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from ash.files import InputError, write_atomic
-from benchmarks.analysis.scores import Scores, csv_of, scores_of
+from benchmarks.analysis.results import RunTables, csv_of
 from benchmarks.analysis.style import titles_of
-from benchmarks.cell.cells import CellResult, printable
-from benchmarks.report import content, escaping, glossary, needs, sections, sentences, tables, vega
+from benchmarks.cell.cells import printable
+from benchmarks.report import content, escaping, glossary, sections, sentences, tables, vega
 from benchmarks.report.content import Report, Section
 from benchmarks.report.pictures import Album
 from benchmarks.report.scene import FEW_WORST, MANY, WORST, SceneData, SceneReport, scene_report
@@ -23,16 +24,16 @@ from benchmarks.suites.archive import write_archive
 from benchmarks.suites.runs import Run, results_of
 
 PUBLISHED = ("report.md", "results.csv", "tables.tex", "chart_*.svg", "pictures_*.png", "worst_*.png")
-PICTURED = (".svg", ".png")
+PICTURE_SUFFIXES = (".svg", ".png")
 CELLS = "cells.zip"
 PICTURE_BYTES = 10_000_000  # of all pictures that are stepped through; worst frames come on top
 LATEX_HEAD = "% Needs booktabs and colortbl, and \\definecolor{antiquebrass}{rgb}{0.98, 0.92, 0.84}\n"
 
 
 def write_report(run: Run, chosen_on: Run | None = None) -> list[str]:
-    """Write report.html, report.md, tables.tex, results.csv, charts and pictures; returns what to tell the user.
+    """Write report.html, report.md, tables.tex, results.csv, charts and pictures; returns lines for the terminal.
 
-    `chosen_on`: the same rows on people for validation, whose choice of the smallest that suffices is judged here.
+    `chosen_on`: the same rows on subjects for validation, whose choice of the smallest sufficient row is judged here.
 
     Raises:
         InputError: no cell is finished, or a result is damaged; nothing is written then.
@@ -43,40 +44,55 @@ def write_report(run: Run, chosen_on: Run | None = None) -> list[str]:
 
 def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
     results = results_of(run)
-    scores = scores_of(results, {cell.config.key: printable(cell.capture_folder.name) for cell in run.cells})
+    found = RunTables(results, {cell.config.key: printable(cell.capture_folder.name) for cell in run.cells})
     album = Album()
-    scenes = {scene: scene_report(_scene(run, results, scores, album, scene)) for scene in scores.scenes}
-    findings, novelties = [*sections.spent(results), *sections.margins(scores)], sections.novelties(scores)
+    many = sum(len(found.methods(scene)) for scene in found.scenes) > MANY
+    scenes = [
+        scene_report(
+            SceneData(
+                run=run,
+                tables=found,
+                results=tuple(r for r in results if r.config.scene == scene and not r.config.axis),
+                scene=scene,
+                album=album,
+                room=PICTURE_BYTES // len(found.scenes),
+                worst_frames=FEW_WORST if many else WORST,
+            )
+        )
+        for scene in found.scenes
+    ]
+    curves = [*sections.training_cost(found), *sections.template_errors(found)]
+    novelty = sections.novelty(found)
     report = Report(
         title=f"Report of suite {run.suite}",
         sections=(
             Section(title="", blocks=(content.Text(text=run.about[:1].upper() + run.about[1:] + "."),)),
-            *needs.sections(scores, None if chosen_on is None else scores_of(results_of(chosen_on))),
-            *sections.stabilities(scores),
-            *findings,
-            *(section for scene in scenes.values() for section in scene.sections),
-            *novelties,
-            *sections.beside_the_paper(scores, run.suite),
+            *sections.ablations(found, None if chosen_on is None else RunTables(results_of(chosen_on))),
+            *sections.stabilities(found),
+            *curves,
+            *(section for scene in scenes for section in scene.sections),
+            *novelty,
+            *sections.beside_the_paper(found, run.suite),
             *sections.failed_cells(results, len(run.cells) - len(results)),
             sections.provenance(results, run.command),
             sections.glossary(),
         ),
     )
-    files = {f"{figure.file}": figure.svg().encode() for figure in figures_of(report)}
-    files |= {name: png for scene in scenes.values() for name, png in scene.sheets.items()}
+    files = {figure.file: figure.svg().encode() for figure in figures_of(report)}
+    files |= {name: png for scene in scenes for name, png in scene.sheets.items()}
     files |= {
-        "results.csv": csv_of(_harmless(scores)).encode(),
-        "tables.tex": _latex(scenes.values()).encode(),
+        "results.csv": csv_of(_without_formulas(found.all_rows)).encode(),
+        "tables.tex": _latex(scenes).encode(),
         "report.md": render(report, "md").encode(),
         "report.html": render(report, "html", album).encode(),
     }
     for name, data in files.items():
         write_atomic(run.folder / name, data)
-    return [*_told(scores, [*findings, *novelties]), f"report: {run.folder / 'report.html'}"]
+    return [*_terminal(found, [*curves, *novelty]), f"report: {run.folder / 'report.html'}"]
 
 
 def publish(run: Run, folder: Path) -> None:
-    """Copy what a repository should keep of a report, in place of what an earlier one left there, and all its numbers.
+    """Copy what a repository should keep of a report, in place of an earlier one, and `cells.zip` with all numbers.
 
     Raises:
         InputError: the report was not written.
@@ -84,23 +100,20 @@ def publish(run: Run, folder: Path) -> None:
     report = run.folder / PUBLISHED[0]
     if not report.exists():
         raise InputError(f"{run.folder}: expected {PUBLISHED[0]}, which `ash-bench report` writes")
-    told = report.read_text()
-    found = [path for pattern in PUBLISHED for path in sorted(run.folder.glob(pattern))]
-    found = [path for path in found if path.suffix not in PICTURED or path.name in told]  # Not an earlier report's.
+    text = report.read_text()
+    paths = [path for pattern in PUBLISHED for path in sorted(run.folder.glob(pattern))]
+    paths = [path for path in paths if path.suffix not in PICTURE_SUFFIXES or path.name in text]  # of this report
     for pattern in PUBLISHED:
         for old in folder.glob(pattern):
             old.unlink()
-    for path in found:
+    for path in paths:
         write_atomic(folder / path.name, path.read_bytes())
     write_archive(run, folder / CELLS)
 
 
 def figures_of(report: Report) -> Iterator[Figure]:
     """Every chart that becomes a file."""
-    for section in report.sections:
-        for block in section.blocks:
-            if isinstance(block, content.Chart):
-                yield block.figure
+    return (block for section in report.sections for block in section.blocks if isinstance(block, Figure))
 
 
 def render(report: Report, form: Literal["html", "md"], album: Album | None = None) -> str:
@@ -124,22 +137,17 @@ def environment(form: Literal["html", "md"]) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found.filters |= {"md": escaping.markdown, "terms": _terms, "anchor": glossary.anchor}
-    found.globals |= {"glossary": glossary.GLOSSARY}
+    found.filters |= {
+        "md": escaping.markdown,
+        "terms": _terms,
+        "anchor": glossary.anchor,
+        "meaning": glossary.meaning,
+    }
     return found
 
 
-def _scene(run: Run, found: Sequence[CellResult], scores: Scores, album: Album, scene: str) -> SceneData:
-    results = tuple(r for r in found if r.config.scene == scene and not r.config.axis)
-    many = sum(len(scores.methods(each)) for each in scores.scenes) > MANY
-    room = PICTURE_BYTES // len(scores.scenes)
-    worst = FEW_WORST if many else WORST
-    return SceneData(run=run, scores=scores, results=results, scene=scene, album=album, room=room, worst_frames=worst)
-
-
-def _harmless(scores: Scores):
-    texts = {name: scores.rows[name].map(escaping.csv_text) for name in ("scene", "method", "capture")}
-    return scores.rows.assign(**texts)
+def _without_formulas(rows: pd.DataFrame) -> pd.DataFrame:
+    return rows.assign(**{name: rows[name].map(escaping.csv_text) for name in ("scene", "method", "capture")})
 
 
 def _latex(scenes: Iterable[SceneReport]) -> str:
@@ -147,21 +155,21 @@ def _latex(scenes: Iterable[SceneReport]) -> str:
     return LATEX_HEAD + "\n\n".join(f"% {escaping.one_line(t.title)}\n{tables.latex(t)}" for t in found) + "\n"
 
 
-def _told(scores: Scores, findings: list[Section]) -> list[str]:
-    """What the terminal shows: findings, remarks and a short table of each scene."""
+def _terminal(found: RunTables, curves: list[Section]) -> list[str]:
+    """Findings, remarks and a short table of each scene."""
     lines = [
         item
-        for section in findings
+        for section in curves
         for block in section.blocks
         if isinstance(block, content.Bullets)
         for item in block.items
     ]
     lines += [""] if lines else []
-    for scene in scores.scenes:
+    for scene in found.scenes:
         columns = [*tables.quality_columns(("psnr", "flip")), *tables.cost_columns(("frame_ms", "train_s"))]
-        short = tables.build(scores, scene, columns, title="")
-        remarks = (f"- {remark}" for remark in sentences.remarks(scores, scene))
-        lines += [sentences.headline(scores, scene), *remarks, "", tables.plain(short), ""]
+        short = tables.build(found, scene, columns, title="")
+        remarks = (f"- {remark}" for remark in sentences.remarks(found, scene))
+        lines += [sentences.headline(found, scene), *remarks, "", tables.plain(short), ""]
     return lines
 
 

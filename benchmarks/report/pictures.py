@@ -16,14 +16,14 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ash.capture.dataset import Capture
 from benchmarks.analysis.error_attribution import REGION_COLOURS, psnr_of, worst_frames
-from benchmarks.analysis.scores import RANKED_SPLITS
+from benchmarks.analysis.results import RANKED_SPLITS
 from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell import metrics
 from benchmarks.cell.cells import Cell, CellResult, ViewScore, stored_prediction
 from benchmarks.cell.views import View, spread
-from benchmarks.report.content import Strip, Tile
+from benchmarks.report.content import Strip
 
-PAPER = 236  # Grey behind the subject: dark hair and light cloth both stand out on it.
+PAPER = 236  # grey behind the subject: dark hair and light cloth are both visible
 MARGIN = 0.06
 FLIP_WHITE = 0.7  # The error at which the error map's colours end.
 QUALITY = 88  # of WebP; what is scored are the stored PNGs.
@@ -78,7 +78,7 @@ class Frames:
 
     def strip(self, album: Album) -> Strip:
         """The row for the page."""
-        tiles = tuple(Tile(caption=f.caption, score=f.score, key=album.add(f.pixels)) for f in self.images)
+        tiles = tuple((frame.caption, frame.score, album.add(frame.pixels)) for frame in self.images)
         return Strip(title=self.title, tiles=tiles, width=self.images[0].pixels.shape[1])
 
 
@@ -118,13 +118,13 @@ def choose_views(result: CellResult, split: str, count: int = 2) -> list[ViewSco
 
 
 def comparisons(capture: Capture, shown: Sequence[Shown]) -> list[Frames]:
-    """Two held-out views and two of held-out motion, chosen by the first method's scores."""
+    """Two novel views and two novel poses, chosen by the first method's scores."""
     views = [view for split in RANKED_SPLITS for view in choose_views(shown[0].result, split)]
     return [compare(capture, shown, view) for view in views]
 
 
 def worst(capture: Capture, shown: Shown, *, count: int) -> list[Frames]:
-    """A method's worst frames of the held-out motion: truth, prediction, FLIP error, and what explains it."""
+    """A method's worst novel poses: truth, prediction, FLIP error and regions."""
     found = []
     for attribution in worst_frames(capture, shown.cell, shown.result, count=count):
         view, truth, prediction = attribution.view, attribution.truth, attribution.predicted

@@ -1,4 +1,4 @@
-"""What a report says of one scene: findings, tables, charts and pictures, computed from the tables of results."""
+"""What a report says of one scene: findings, tables, charts and pictures."""
 
 from dataclasses import dataclass
 
@@ -7,41 +7,19 @@ import pandas as pd
 from ash.capture.dataset import Capture
 from ash.capture.formats import load_capture
 from ash.files import InputError
-from benchmarks.analysis import contrasts, conventions
+from benchmarks.analysis import differences, paper
 from benchmarks.analysis.error_attribution import REGIONS
-from benchmarks.analysis.scores import (
-    HELD_OUT_SPLITS,
-    MOTION_SPLITS,
-    RANKED_SPLITS,
-    Quantity,
-    Scores,
-    curves_of,
-    foreground,
-)
+from benchmarks.analysis.results import HELD_OUT_SPLITS, MOTION_SPLITS, RANKED_SPLITS, Quantity, RunTables, foreground
 from benchmarks.analysis.style import EXACT, SPLIT_NAMES, is_ours, style_of
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS
-from benchmarks.report import charts, differences, figures, people, pictures, sentences, tables, vega
-from benchmarks.report.content import (
-    Block,
-    Bullets,
-    Chart,
-    Entry,
-    Flipbook,
-    Head,
-    KeptSheet,
-    Row,
-    Section,
-    Strips,
-    Table,
-    Text,
-    texts,
-)
+from benchmarks.report import charts, figures, people, pictures, sentences, tables, vega
+from benchmarks.report.content import Block, Bullets, Flipbook, Mark, Section, Sheet, Strips, Table, Text
 from benchmarks.report.pictures import Album, Shown
 from benchmarks.report.vega import Figure
 from benchmarks.suites.runs import Run
 
-IMAGE_SPLITS = (*RANKED_SPLITS, "train_view")  # In the order of the columns.
+IMAGE_SPLITS = (*RANKED_SPLITS, "train_view")  # in the order of the columns
 COSTS = (
     "frame_ms",
     *figures.STAGE_METRICS,
@@ -59,18 +37,49 @@ ON_SHEETS = ("ash", "ddc", "ash_truth", "ddc_truth")
 AT_MOST_ON_SHEETS = 5
 WORST, FEW_WORST, MANY = 3, 1, 24  # worst frames of each method; of more than so many methods on all scenes, one
 COLOURS = ("blue", "orange", "red", "ochre", "grey")  # of the regions
-SHEETS = {"pictures": "Truth, methods and errors", "pictures_people": "Everybody", "worst": "The worst frames"}
-KEPT = "Sheets of an earlier report of this run: the capture or the pictures of its cells are not here any more."
-SMALL = ("ci",)  # sizes and presets of smoke tests
+SHEETS = {"pictures": "Truth, methods and errors", "pictures_people": "All subjects", "worst": "The worst frames"}
+EARLIER = "Sheets of an earlier report of this run: the capture or the pictures of its cells are missing now."
+SMOKE_TESTS = ("ci",)  # sizes and presets
+QUALITY_NOTE = (
+    "Quality on the foreground, LPIPS on the whole frame, IoU on the silhouette. Best and second best are marked among "
+    "the methods that see only training views."
+)
+APART_NOTE = "Those below the line were given the exact surface, and are not ranked."
+VALUES_NOTE = (
+    "n/a: not measured (LPIPS needs the user's AlexNet weights). Where an interval would reach below zero, the range "
+    "of the values stands instead."
+)
+COST_NOTE = (
+    "A frame and its stages: median over frames of near novel poses (of new ones, where a capture has no near ones) "
+    "after warm-up, one core, while other cells may run beside it. Training on one core: seconds by the clock, and CPU "
+    "time measured from outside. Memory: the peak of the cell's process, Python and libraries included."
+)
+DIFFERENCES_NOTE = (
+    "Foreground PSNR. p: Holm's correction over all rows of the table. Verdict on ASH: better or worse if p is below "
+    f"5 % and the difference above {METRICS['psnr'].abs_tol:g} dB; equivalent if the interval lies within that margin; "
+    "unclear otherwise. Detectable: the smallest true difference that this design finds with 80 % power."
+)
+DETECTABLE_NOTE = (
+    "The smallest true difference that so many captures (subjects in this outfit) show with 80 % power, from the "
+    "spread of the differences over the captures here: of the median row, and of the row that spreads most."
+)
+EXACT_NOTE = (
+    "Foreground PSNR. Gaussians can leave a wrong template, a textured mesh cannot: the difference between the two "
+    "depends on the template's error, and can change its sign."
+)
+CONVENTIONS_NOTE = (
+    "One set of predictions, scored in four ways. The release scores only inside the eroded mask; whole frames are "
+    "diluted by background that every method gets right. A rank in bold differs from ours."
+)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SceneData:
-    """One scene of a run, with what its pictures may take."""
+    """One scene of a run, and the bytes that its pictures may take."""
 
     run: Run
-    scores: Scores
-    results: tuple[CellResult, ...]  # of the unspoilt captures of the scene
+    tables: RunTables
+    results: tuple[CellResult, ...]  # of the unperturbed captures of the scene
     scene: str
     album: Album
     room: int  # bytes
@@ -87,167 +96,214 @@ class SceneReport:
 
 
 def scene_report(data: SceneData) -> SceneReport:
-    """Compute the part of one scene."""
-    scores, scene = data.scores, data.scene
+    """The part of one scene."""
+    found, scene = data.tables, data.scene
     capture, shown, trouble = _pictured(data)
     exposed = sentences.exposed(data.results)
-    notes = [Text(text=doubt, note=True) for doubt in sentences.doubts(data.results)]
-    seen = [Text(text=sentence, note=True) for sentence in sentences.views_seen(scores, scene)]
-    quality = tables.build(scores, scene, _quality_quantities(), title=f"Accuracy on {scene}", exposed=exposed)
-    cost = tables.build(scores, scene, tables.cost_columns(COSTS), title=f"Cost on {scene}", exposed=exposed)
-    more = _more_tables(scores, scene)
-    compared = contrasts.contrasts(scores, scene)
-    beside = contrasts.contrasts(scores, scene, splits=tuple(s for s in MOTION_SPLITS if s not in RANKED_SPLITS))
-    apart = (APART_NOTE,) if any(row.apart for row in quality.rows) else ()
-    quality_note = " ".join((QUALITY_NOTE, *apart, VALUES_NOTE, differences.note(scores, scene, compared)))
+    doubts = [Text(text=doubt, note=True) for doubt in sentences.doubts(data.results)]
+    seen = [Text(text=each, note=True) for each in sentences.training_views(found, scene)]
+    asked = [foreground("train_view"), *tables.quality_columns(("psnr", "gap", "ssim", "flip", "lpips", "iou"))]
+    quality = tables.build(found, scene, asked, title=f"Accuracy on {scene}", exposed=exposed)
+    cost = tables.build(found, scene, tables.cost_columns(COSTS), title=f"Cost on {scene}", exposed=exposed)
+    more = _more_tables(found, scene)
+    ranked = differences.differences(found, scenes=(scene,))
+    note = " ".join(
+        (QUALITY_NOTE, *((APART_NOTE,) if quality.below else ()), VALUES_NOTE, detectable(found, scene, ranked))
+    )
     picture_sections, sheets = _picture_sections(data, capture, shown, trouble)
+    drawn = [figures.training_figure(found, scene), figures.stage_figure(found, scene)]
     sections = [
-        Section(title=scene, headline=sentences.headline(scores, scene), blocks=tuple(_opening(data, capture))),
-        Section(title=quality.title, blocks=(_untitled(quality), *seen, Text(text=quality_note, note=True), *notes)),
-        Section(title=cost.title, blocks=(_untitled(cost), Text(text=COST_NOTE, note=True), *notes)),
-        *differences.sections(scores, scene, compared, beside),
-        *people.sections(scores, scene),
-        *_exact(scores, scene),
+        Section(title=scene, headline=sentences.headline(found, scene), blocks=tuple(_opening(data, capture))),
+        Section(title=quality.title, blocks=(_untitled(quality), *seen, Text(text=note, note=True), *doubts)),
+        Section(title=cost.title, blocks=(_untitled(cost), Text(text=COST_NOTE, note=True), *doubts)),
+        Section(title=f"Differences to ASH on {scene}", blocks=tuple(difference_blocks(found, scene, ranked))),
+        Section(title=f"Subject by subject on {scene}", blocks=people.blocks(found, scene)),
+        Section(title=f"Given the exact surface on {scene}", blocks=tuple(_exact(found, scene))),
         *picture_sections,
-        *_time(data),
+        Section(title=f"Time on {scene}", blocks=tuple(figure for figure in drawn if figure)),
         Section(title=f"All other numbers of {scene}", blocks=more, folded=True),
-        *_conventions(scores, scene),
+        Section(
+            title=f"The same renders of {scene} by other conventions", blocks=_conventions(found, scene), folded=True
+        ),
     ]
     return SceneReport(sections=tuple(s for s in sections if s.blocks), tables=(quality, cost, *more), sheets=sheets)
 
 
-QUALITY_NOTE = (
-    "Quality on the foreground, LPIPS on the whole frame, IoU on the silhouette. Best and second best are marked "
-    "among the methods that see only training views."
-)
-APART_NOTE = "Those below the line were given the exact surface, and are not ranked."
-VALUES_NOTE = (
-    "n/a: not measured (LPIPS needs the user's AlexNet weights). Where an interval would reach below zero, the range "
-    "of the values stands instead."
-)
-COST_NOTE = (
-    "A frame and its stages: median over frames of near held-out motion (of new motion, where a capture has no near "
-    "one) after warm-up, one core, while other cells may run beside it. "
-    "Training on one core: seconds by the clock, and the CPU time that was counted from outside. Memory: the peak of "
-    "the cell's process, Python and libraries included."
-)
-
-
 def what_was_compared(data: SceneData, capture: Capture | None) -> str:
-    """One paragraph for a stranger: methods, scene, subject, images, cameras, frames, preset and budget."""
-    scores, scene, config = data.scores, data.scene, data.results[0].config
-    rows = scores.clean.query("scene == @scene")
-    names = [style_of(method).title for method in scores.methods(scene)]
+    """One paragraph: methods, scene, subjects, images, cameras, frames, preset and budget."""
+    found, scene, config = data.tables, data.scene, data.results[0].config
+    rows = found.of(scene)
+    methods = found.methods(scene)
     presets = ", ".join(dict.fromkeys(result.config.preset for result in data.results))
     folders, subjects = (list(map(str, rows[name].unique())) for name in ("capture", "subject"))
     shown = f"capture {folders[0]}" if len(folders) == 1 else f"{len(folders)} captures, {folders[0]} to {folders[-1]}"
-    who = f"subject {subjects[0]}" if len(subjects) == 1 else f"subjects {', '.join(subjects)}"
-    text = f"{_count(len(names), 'method')} ({'; '.join(names)}) were trained with preset {presets} on scene {scene}"
+    who = f"subject{'s' if subjects[1:] else ''} {', '.join(subjects)}"
+    names = "; ".join(style_of(method).title for method in methods)
+    text = f"{_count(len(methods), 'method')} ({names}) were trained with preset {presets} on scene {scene}"
     text += f" ({shown}; {who})"
     if capture is not None:
         camera, train = next(iter(capture.cameras.values())), capture.splits["train"]
         text += f": {_count(len(train.cameras), 'camera')}, {_count(len(train.frames), 'frame')}"
-        text += f", each seen by {len(train.parts[0])} of the cameras by turns," if train.parts else ""
+        text += f", each seen by {len(train.parts[0])} of the cameras in turn," if train.parts else ""
         text += f" of {camera.width}x{camera.height} pixels"
     text += "."
-    judged = []
-    seen = scores.images.query("scene == @scene")[["split", "camera", "frame"]].drop_duplicates()
-    for split, images in seen[seen["split"].isin(HELD_OUT_SPLITS)].groupby("split", sort=False):
-        cameras, frames = (_count(images[name].nunique(), name) for name in ("camera", "frame"))
-        judged.append(f"{len(images)} images of {SPLIT_NAMES[str(split)].words} ({cameras}, {frames})")
-    if judged:
-        text += f" They are judged on {', '.join(judged[:-1])}{' and ' if judged[1:] else ''}{judged[-1]}."
-    seconds = rows.query("metric == 'train_s' and status == 'done'")["value"]
+    tests = []
+    images = found.images[found.images["scene"] == scene][["split", "camera", "frame"]].drop_duplicates()
+    for split, own in images[images["split"].isin(HELD_OUT_SPLITS)].groupby("split", sort=False):
+        cameras, frames = (_count(own[name].nunique(), name) for name in ("camera", "frame"))
+        tests.append(f"{len(own)} images of {SPLIT_NAMES[str(split)].words} ({cameras}, {frames})")
+    if tests:
+        text += f" They are scored on {', '.join(tests[:-1])}{' and ' if tests[1:] else ''}{tests[-1]}."
+    seconds = rows[(rows["metric"] == "train_s") & (rows["status"] == "done")]["value"]
     if len(seconds):
         text += f" A training took {seconds.min():.0f} to {seconds.max():.0f} s on one core,"
-        text += f" {_count(scores.seeds, 'seed')} each."
-    if config.size in SMALL or set(presets.split(", ")) & set(SMALL):
-        text += " This is a smoke test: it shows that every part works, and says nothing about which method is better."
+        text += f" {_count(found.seeds, 'seed')} each."
+    if config.size in SMOKE_TESTS or set(presets.split(", ")) & set(SMOKE_TESTS):
+        text += " This is a smoke test: it shows that every part works, not which method is better."
     return text
 
 
+def detectable(found: RunTables, scene: str, ranked: pd.DataFrame) -> str:
+    """The smallest difference that a table of the scene can show, in one sentence."""
+    known = ranked.dropna(subset=["detectable"]).groupby("split", sort=False)["detectable"]
+    smallest = [f"{own.quantile(interpolation='higher'):.2f} dB on {SPLIT_NAMES[split].words}" for split, own in known]
+    if not smallest:
+        return "One value per row: differences between rows have no verdict."
+    text = f"Smallest detectable difference to ASH, median row: {' and '.join(smallest)}"
+    if found.captures(scene) > 1:
+        return f"{text} ({found.captures(scene)} captures, compared in pairs)."
+    return f"{text} (seeds of one capture: it holds for this subject)."
+
+
+def difference_blocks(found: RunTables, scene: str, ranked: pd.DataFrame) -> list[Block]:
+    """The differences with intervals and verdicts, and what more captures would show."""
+    figure = figures.differences_figure(ranked, scene, over=found.unit(scene))
+    blocks: list[Block] = [figure] if figure else []
+    if not ranked["p"].notna().any():
+        return blocks
+    others = tuple(split for split in MOTION_SPLITS if split not in RANKED_SPLITS)
+    beside = differences.differences(found, splits=others, scenes=(scene,))
+    test = "captures, paired t" if found.captures(scene) > 1 else "seeds, Welch"
+    for title, table in (("", ranked), ("Near and far novel poses", beside)):
+        if len(table):
+            frame = pd.DataFrame(
+                {
+                    "split": table["split"].map(lambda split: SPLIT_NAMES[split].title),
+                    "difference [dB]": table["mean"].map("{:+.2f}".format),
+                    f"95 % interval [{test}]": [f"[{r.low:+.2f}, {r.high:+.2f}]" for r in table.itertuples()],
+                    "p [Holm]": table["p"].map("{:.2g}".format),
+                    "detectable [dB]": table["detectable"].map("{:.2f}".format),
+                    "verdict": table["verdict"],
+                }
+            ).set_axis(table["method"].map(lambda method: style_of(method).title))
+            marks: dict[tuple[int, int], Mark] = {(i, 1): "strong" for i, p in enumerate(table["p"]) if p < 0.05}
+            blocks.append(Table(title=title, corner="ASH minus", frame=frame, marks=marks))
+    blocks.append(Text(text=DIFFERENCES_NOTE, note=True))
+    effects = differences.detectable_effects(ranked)
+    if len(effects):
+        span = [f"{r.median:.2f} to {r.worst:.2f}" if r.captures > 1 else "none" for r in effects.itertuples()]
+        wide = effects.assign(span=span).pivot(index="split", columns="captures", values="span")
+        wide = wide.loc[effects["split"].unique()]
+        frame = wide.set_axis([f"{n} capture{'' if n == 1 else 's'} [dB]" for n in wide.columns], axis=1)
+        frame = frame.rename(index=lambda split: SPLIT_NAMES[split].title)
+        blocks += [Table(title="Detectable with more captures", corner="split", frame=frame)]
+        blocks += [Text(text=DETECTABLE_NOTE, note=True)]
+    return blocks
+
+
 def _opening(data: SceneData, capture: Capture | None) -> list[Block]:
-    scores, scene = data.scores, data.scene
-    figure = figures.speed_figure(scores, scene)
+    figure = figures.speed_figure(data.tables, data.scene)
     blocks: list[Block] = [Text(text=what_was_compared(data, capture))]
-    blocks.append(Bullets(items=tuple(sentences.remarks(scores, scene))))
-    blocks += [Chart(figure=figure)] if figure else []
-    front = sentences.frontier(scores, scene)
+    blocks.append(Bullets(items=tuple(sentences.remarks(data.tables, data.scene))))
+    blocks += [figure] if figure else []
+    front = sentences.frontier(data.tables, data.scene)
     return [*blocks, Bullets(items=front)] if front else blocks
 
 
 def _untitled(table: Table) -> Table:
-    return Table(title="", columns=table.columns, rows=table.rows, corner=table.corner, note=table.note)
+    return Table(frame=table.frame, marks=table.marks, below=table.below)
 
 
-def _quality_quantities() -> list[Quantity]:
-    return [foreground("train_view"), *tables.quality_columns(("psnr", "gap", "ssim", "flip", "lpips", "iou"))]
-
-
-def _more_tables(scores: Scores, scene: str) -> tuple[Table, ...]:
+def _more_tables(found: RunTables, scene: str) -> tuple[Table, ...]:
     geometry = [Quantity(split, "", metric) for split in HELD_OUT_SPLITS for metric in ("template_mm", "surface_mm")]
     geometry.append(foreground("novel_pose", "flicker"))
     regions = (("full", "psnr"), ("release_crop", "psnr"), ("full", "ssim"), ("full", "flip"))
     whole = [Quantity(split, region, metric) for split in IMAGE_SPLITS for region, metric in regions]
-    training = [foreground("train_view", metric) for metric in ("psnr", "ssim", "flip")]
-    ceiling = [foreground(split, "noise_ceiling") for split in (*HELD_OUT_SPLITS, "train_view")]
-    novelty = [Quantity(split, "", "novelty_deg") for split in MOTION_SPLITS]
+    rest = [foreground("train_view", metric) for metric in ("psnr", "ssim", "flip")]
+    rest += [foreground(split, "noise_ceiling") for split in (*HELD_OUT_SPLITS, "train_view")]
+    rest += [Quantity(split, "", "novelty_deg") for split in MOTION_SPLITS]
     asked = {
         "Geometry against the truth, and flicker beyond the truth's own": geometry,
         "Whole frame, and the crop of the released ASH code": whole,
-        "Training views, the noise ceiling of the renders, and how far poses are from training's": [
-            *training,
-            *ceiling,
-            *novelty,
-        ],
+        "Training views, the noise ceiling of the renders, and the novelty of poses": rest,
     }
-    found = [tables.build(scores, scene, quantities, title=title) for title, quantities in asked.items()]
-    return tuple(table for table in found if table.columns)
+    built = [tables.build(found, scene, quantities, title=title) for title, quantities in asked.items()]
+    return tuple(table for table in built if table.heads)
 
 
-def _exact(scores: Scores, scene: str) -> list[Section]:
-    """The pair of methods with the honest template and with the exact surface, on each split."""
+def _exact(found: RunTables, scene: str) -> list[Block]:
+    """ASH and DDC with their own template and with the exact surface, on each split."""
     blocks: list[Block] = []
-    if not scores.whole(scene, *EXACT, *EXACT.values()):
-        return []
-    for split in RANKED_SPLITS:
-        means = {m: s.mean for m in (*EXACT, *EXACT.values()) if (s := scores.get(scene, m, foreground(split)))}
-        if len(means) < 2 * len(EXACT):
-            continue
-        pairs = {style_of(method).title: (means[method], means[exact]) for method, exact in EXACT.items()}
-        rows = [
-            Row(name=name, entries=texts(f"{honest:.2f}", f"{exact:.2f}", f"{exact - honest:+.2f}"))
-            for name, (honest, exact) in pairs.items()
-        ]
-        (ash, ash_exact), (ddc, ddc_exact) = pairs.values()
-        margins = [Entry(text=f"{margin:+.2f}", mark="strong") for margin in (ash - ddc, ash_exact - ddc_exact)]
-        rows.append(Row(name="ASH minus DDC", entries=(*margins, Entry(text="")), apart=True))
-        heads = tuple(Head(title=title, unit="dB") for title in ("honest template", "exact surface", "gain"))
-        blocks.append(Table(title=SPLIT_NAMES[split].title, columns=heads, rows=tuple(rows)))
-    note = (
-        "Foreground PSNR. Splats can leave a wrong template, a textured mesh cannot: the margin between the two "
-        "is a function "
-        "of the template's error, and can change its sign."
-    )
-    blocks += [Text(text=note, note=True)] if blocks else []
-    return [Section(title=f"What the template's error decides on {scene}", blocks=tuple(blocks))]
+    rows = (*EXACT, *EXACT.values())
+    for split in RANKED_SPLITS if found.whole(scene, *rows) else ():
+        means = found.values(scene, foreground(split), rows)
+        if len(means) == len(rows):
+            own, exact = [means[m] for m in EXACT], [means[m] for m in EXACT.values()]
+            gain = [f"{b - a:+.2f}" for a, b in zip(own, exact, strict=True)]
+            columns = {"own template [dB]": own, "exact surface [dB]": exact}
+            texts = {
+                name: [*(f"{v:.2f}" for v in values), f"{values[0] - values[1]:+.2f}"]
+                for name, values in columns.items()
+            }
+            index = [*(style_of(method).title for method in EXACT), "ASH minus DDC"]
+            frame = pd.DataFrame(texts | {"gain [dB]": [*gain, ""]}, index=index)
+            title = SPLIT_NAMES[split].title
+            blocks.append(Table(title=title, frame=frame, marks={(2, 0): "strong", (2, 1): "strong"}, below=1))
+    return [*blocks, Text(text=EXACT_NOTE, note=True)] if blocks else []
+
+
+def _conventions(found: RunTables, scene: str) -> tuple[Block, ...]:
+    blocks: list[Block] = []
+    for split, metric in [(split, metric) for split in RANKED_SPLITS for metric in ("psnr", "ssim")]:
+        if (scored := paper.conventions(found, scene, split, metric)) is not None:
+            values, taus = scored
+            ranks, measure = values.rank(ascending=False, method="min").astype(int), METRICS[metric]
+            texts = {
+                paper.CONVENTIONS[region]: [
+                    *(f"{v:.{measure.decimals}f} #{r}" for v, r in zip(values[region], ranks[region], strict=True)),
+                    f"{tau:.2f}",
+                ]
+                for region, tau in zip(values, taus, strict=True)
+            }
+            moved = ranks.ne(ranks["foreground"], axis=0).to_numpy()
+            index = [*(style_of(method).title for method in values.index), "agreement with ours (Kendall's tau)"]
+            title = f"{SPLIT_NAMES[split].title}, {measure.title}"
+            marks: dict[tuple[int, int], Mark] = {
+                (int(i), int(k)): "strong" for i, k in zip(*moved.nonzero(), strict=True)
+            }
+            blocks.append(Table(title=title, frame=pd.DataFrame(texts, index=index), marks=marks, below=1))
+    return (*blocks, Text(text=CONVENTIONS_NOTE, note=True)) if blocks else ()
 
 
 def _pictured(data: SceneData) -> tuple[Capture | None, list[Shown], str]:
-    """The capture and the first finished cell of each method on it, the user's own first; or why there are none."""
+    """The capture and the first finished cell of each method on it, the user's first; or why there are none."""
     done = {result.config.key: result for result in data.results if result.status == "done"}
     first: dict[str, Shown] = {}
     for cell in data.run.cells:
         if cell.config.key in done:
             first.setdefault(cell.config.method, Shown(cell=cell, result=done[cell.config.key]))
-    shown = [first[method] for method in data.scores.methods(data.scene) if method in first]
+    shown = [first[method] for method in data.tables.methods(data.scene) if method in first]
     shown = [each for each in shown if each.cell.config.capture == shown[0].cell.config.capture]
     if not shown:
         return None, [], "No pictures: every cell failed."
     try:
         return load_capture(shown[0].cell.capture_folder), shown, ""
     except InputError as error:
-        return None, [], f"No pictures: {error}. The numbers come from {data.run.folder} and do not need it."
+        return None, [], _no_pictures(data, error)
+
+
+def _no_pictures(data: SceneData, error: InputError) -> str:
+    return f"No pictures: {error}. The numbers come from {data.run.folder} and do not need it."
 
 
 def _picture_sections(
@@ -258,65 +314,58 @@ def _picture_sections(
         if capture is None:
             raise InputError(trouble)
         flipbook, sheets = _flipbook(data, capture, shown)
-        everybody, cast_sheet = people.pictured(data.run, data.results, data.scores, data.scene, data.album)
+        subjects, subject_sheet = people.pictured(data.run, data.results, data.tables, data.scene, data.album)
         strips, worst_sheet = _worst(data, capture, shown)
     except InputError as error:
-        reason = trouble or f"No pictures: {error}. The numbers come from {data.run.folder} and do not need it."
-        kept = _kept_sheets(data)
-        told = Text(text=KEPT if kept else reason, note=True)
-        return [Section(title=title, blocks=(*kept, told))], {sheet.file: sheet.data for sheet in kept}
+        earlier = _earlier_sheets(data)
+        reason = Text(text=EARLIER if earlier else trouble or _no_pictures(data, error), note=True)
+        return [Section(title=title, blocks=(*earlier, reason))], {sheet.file: sheet.data for sheet in earlier}
     note = (
-        "Cropped to the subject, on grey; compressed for this page, while scores come from the stored pictures. "
-        "First seed. "
-        "Difference: that to the truth, four times enlarged."
+        "Cropped to the subject, on grey; compressed for this page, while scores come from the stored pictures. First "
+        "seed. Difference: that to the truth, four times enlarged."
     )
     sections = [Section(title=title, blocks=(flipbook, Text(text=note, note=True)))]
-    if everybody is not None:
-        typical = "Of held-out cameras and of new motion the view whose score by ASH is the person's median."
-        sections.append(Section(title=everybody.title, blocks=(everybody, Text(text=typical, note=True))))
+    if subjects is not None:
+        typical = "Of novel views and of novel poses the view whose score by ASH is the subject's median."
+        sections.append(Section(title=subjects.title, blocks=(subjects, Text(text=typical, note=True))))
     if strips is not None:
-        regions = (
-            "Held-out motion, worst foreground PSNR first, each from another frame. FLIP error from black (0) to "
-            "light yellow "
-            f"(0.7). Regions: {', '.join(f'{region} ({name})' for region, name in zip(REGIONS, COLOURS, strict=True))}."
-        )
-        sections.append(
-            Section(title=f"The worst frames on {data.scene}, and why", blocks=(strips, Text(text=regions, note=True)))
-        )
-    return sections, sheets | cast_sheet | worst_sheet
+        regions = ", ".join(f"{region} ({name})" for region, name in zip(REGIONS, COLOURS, strict=True))
+        text = "Novel poses, worst foreground PSNR first, each from another frame. FLIP error from black (0) to light "
+        text += f"yellow (0.7). Regions: {regions}."
+        blocks = (strips, Text(text=text, note=True))
+        sections.append(Section(title=f"The worst frames on {data.scene}, by image region", blocks=blocks))
+    return sections, sheets | subject_sheet | worst_sheet
 
 
-def _kept_sheets(data: SceneData) -> tuple[KeptSheet, ...]:
-    """What an earlier report left in the run's folder, for cells whose pictures are not here."""
+def _earlier_sheets(data: SceneData) -> tuple[Sheet, ...]:
+    """What an earlier report left in the run's folder, for cells whose pictures are missing."""
     places = {title: data.run.folder / f"{kind}_{data.scene}.png" for kind, title in SHEETS.items()}
     return tuple(
-        KeptSheet(file=path.name, title=title, data=path.read_bytes())
-        for title, path in places.items()
-        if path.is_file()
+        Sheet(file=path.name, title=title, data=path.read_bytes()) for title, path in places.items() if path.is_file()
     )
 
 
 def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Flipbook, dict[str, bytes]]:
     tracks = pictures.tracks(capture, shown, data.album, room=data.room)
-    looks = vega.series_of([each.cell.config.method for each in shown])
+    series = vega.series_of([each.cell.config.method for each in shown])
     points = [
-        {"track": index, "series": look.title, "frame": frame, "psnr": psnr}
+        {"track": index, "series": each.title, "frame": frame, "psnr": psnr}
         for index, track in enumerate(tracks)
-        for look, scores in zip(looks, track["psnr"], strict=True)
+        for each, scores in zip(series, track["psnr"], strict=True)
         for frame, psnr in zip(track["frames"], scores, strict=True)
     ]
     chart = Figure(
         name=f"frames_{data.scene}",
         title="PSNR per frame",
         caption="PSNR of every frame shown; a click goes there.",
-        panels=charts.frames(pd.DataFrame(points), looks),
-        series=looks,
+        panels=charts.frames(pd.DataFrame(points), series),
+        series=series,
     )
     file = f"pictures_{data.scene}.png"
     wanted = [each for each in shown if not is_ours(each.cell.config.method)]
     wanted += [each for each in shown if each.cell.config.method in ON_SHEETS]
     sheet = pictures.sheet(pictures.comparisons(capture, (wanted or shown)[:AT_MOST_ON_SHEETS]))
-    names = tuple(look.title for look in looks)
+    names = tuple(each.title for each in series)
     return Flipbook(file=file, tracks=tuple(tracks), names=names, chart=chart), {file: sheet}
 
 
@@ -327,48 +376,8 @@ def _worst(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Strip
         return None, {}
     file = f"worst_{data.scene}.png"
     groups = tuple((title, tuple(row.strip(data.album) for row in rows)) for title, rows in found.items())
-    return Strips(file=file, title="The worst frames", groups=groups), {
-        file: pictures.sheet(next(iter(found.values())))
-    }
-
-
-def _time(data: SceneData) -> list[Section]:
-    training = figures.training_figure(data.scores, curves_of(data.results), data.scene)
-    found = [figure for figure in (training, figures.stage_figure(data.scores, data.scene)) if figure]
-    return [Section(title=f"Time on {data.scene}", blocks=tuple(Chart(figure=figure) for figure in found))]
-
-
-def _conventions(scores: Scores, scene: str) -> list[Section]:
-    asked = [(split, metric) for split in RANKED_SPLITS for metric in ("psnr", "ssim")]
-    found = [comparison for pair in asked if (comparison := conventions.compare(scores, scene, *pair)) is not None]
-    note = (
-        "One set of predictions, four ways to score it. The release looks only inside the eroded mask; whole "
-        "frames are "
-        "diluted by background that everybody gets right. A rank in bold differs from ours."
-    )
-    title = f"The same renders of {scene} by the conventions of others"
-    blocks: tuple[Block, ...] = (*map(_convention_table, found), Text(text=note, note=True)) if found else ()
-    return [Section(title=title, blocks=blocks, folded=True)]
-
-
-def _convention_table(found: conventions.Comparison) -> Table:
-    measure = METRICS[found.metric]
-    rows = []
-    for method, values in found.values.iterrows():
-        ranks = found.ranks.loc[method]
-        entries = [
-            Entry(
-                text=f"{value:.{measure.decimals}f} #{ranks[region]}",
-                sort=float(value),
-                mark="strong" if ranks[region] != ranks["foreground"] else "",
-            )
-            for region, value in values.items()
-        ]
-        rows.append(Row(name=style_of(str(method)).title, entries=tuple(entries)))
-    taus = tuple(Entry(text=f"{tau:.2f}", sort=tau) for tau in found.agreement)
-    rows.append(Row(name="agreement with ours (Kendall's tau)", entries=taus, apart=True))
-    heads = tuple(Head(title=title) for title in conventions.CONVENTIONS.values())
-    return Table(title=f"{SPLIT_NAMES[found.split].title}, {measure.title}", columns=heads, rows=tuple(rows))
+    sheet = pictures.sheet(next(iter(found.values())))
+    return Strips(file=file, title="The worst frames", groups=groups), {file: sheet}
 
 
 def _count(number: int, word: str) -> str:

@@ -1,4 +1,4 @@
-"""Charts in Vega-Lite: how all of them look, and a figure as a file and alive in the page.
+"""A figure in Vega-Lite: common configuration, the SVG file, and the interactive version of the page.
 
 A `Figure` is made of panels. `svg` sets them side by side in a file for Markdown; the page shows the same panels below
 each other where it is narrow, with values on hover, zoom, and a legend whose entries hide and show a series. Colours of
@@ -8,7 +8,7 @@ paper, ink and grid are replaced on dark pages by those of `DARK`, in the file a
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, ClassVar
 
 import altair as alt
 import vl_convert
@@ -52,7 +52,7 @@ CONFIG: dict[str, Any] = {
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Series:
-    """How one series looks. A hollow one is a bound and no competitor."""
+    """How one series is drawn. A hollow one is a bound and no competitor."""
 
     title: str
     colour: str
@@ -62,18 +62,15 @@ class Series:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Figure:
-    """A chart: its file is `chart_NAME.svg`. `named`: the series are named in the drawing, and need no legend there.
+    """A chart: its file is `chart_NAME.svg`. `least`: the width in pixels below which the page scrolls it."""
 
-    `least`: the pixels of a page below which it would be unreadable; on a narrower page it is moved with the finger.
-    """
-
+    kind: ClassVar[str] = "chart"
     name: str
     title: str
     caption: str
     panels: tuple[alt.LayerChart, ...]
     series: tuple[Series, ...] = ()
     columns: int = 2
-    named: bool = False
     least: int = 0
 
     @property
@@ -84,27 +81,26 @@ class Figure:
     def svg(self) -> str:
         """The drawing as a file: the same bytes each time, without any network."""
         chart = alt.concat(*self.panels, columns=self.columns, spacing=24).resolve_scale(
-            fill="shared", stroke="shared", shape="shared", strokeDash="shared"
+            fill="shared", stroke="shared", shape="shared"
         )
-        whole: dict[str, Any] = chart.to_dict(validate=False)
-        spec = (_without_legends(whole) if self.named else whole) | {"config": CONFIG}
+        spec: dict[str, Any] = chart.to_dict(validate=False) | {"config": CONFIG}
         drawn = vl_convert.vegalite_to_svg(spec, vl_version=VERSION, allowed_base_urls=[])
         return drawn.replace(">", f"><title>{_plain(self.title)}</title><style>{dark_rules()}</style>", 1)
 
     def specs(self) -> list[dict[str, Any]]:
         """The panels as the page shows them."""
-        return [_alive(panel) for panel in self.panels]
+        return [_interactive(panel) for panel in self.panels]
 
 
 def series_of(methods: Sequence[str]) -> tuple[Series, ...]:
-    """The looks of methods; those of one colour differ in shape."""
+    """The series of methods; those of one colour differ in shape."""
     found: list[Series] = []
     for method in methods:
-        look, hollow = style_of(method), is_oracle(method)
-        alike = sum((other.colour, other.hollow) == (look.colour, hollow) for other in found)
-        title = method if any(other.title == look.title for other in found) else look.title
+        style, hollow = style_of(method), is_oracle(method)
+        alike = sum((other.colour, other.hollow) == (style.colour, hollow) for other in found)
+        title = method if any(other.title == style.title for other in found) else style.title
         shape = SHAPES[alike % len(SHAPES)]
-        found.append(Series(title=title, colour=look.colour, hollow=hollow, shape=shape))
+        found.append(Series(title=title, colour=style.colour, hollow=hollow, shape=shape))
     return tuple(found)
 
 
@@ -123,7 +119,7 @@ def library() -> str:
     return bundle
 
 
-def _alive(panel: alt.LayerChart) -> dict[str, Any]:
+def _interactive(panel: alt.LayerChart) -> dict[str, Any]:
     """A panel for the page: as wide as its box, on the page's paper, with zoom, its legend left to the page."""
     spec: dict[str, Any] = _without_legends(panel.properties(width="container").to_dict(validate=False))
     zoom = {"type": "interval", "zoom": "wheel![event.ctrlKey || event.metaKey]"}

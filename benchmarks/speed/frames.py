@@ -1,40 +1,45 @@
-"""How long a frame takes, stage by stage, and a step of training, beside their definitions: `ash-bench speed frame`."""
+"""How long a frame takes, stage by stage, and a step of training, beside their definitions: `ash-bench speed frame`.
 
-import math
-import time
-from collections import defaultdict
-from collections.abc import Iterable, Iterator
+Frames follow each other as in playback: the template was posed in the frames before, and not yet in the timed one.
+"""
+
+import statistics
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ash.avatar import AshAvatar
-from ash.capture.dataset import Camera, Capture, Motion, Pose
+from ash.capture.dataset import Camera, Capture, Pose
 from ash.capture.formats import load_capture
 from ash.config import AshConfig
-from ash.devices import CPU, finish, moved
-from ash.files import write_json
+from ash.devices import CPU, moved
+from ash.files import InputError, write_json
 from ash.gaussians.splatting import Splatted, splat_naive
-from ash.gaussians.texels import place_naive, pose_naive
-from ash.inference import Player, psnr
-from ash.model import AshModel, image_of, mixed, views_of
+from ash.gaussians.texels import pose_naive, sample_surface_naive
+from ash.model import AshModel, blend_renders, image_of, views_of
 from ash.presets import named
-from ash.protocol import StageClock
+from ash.protocol import Avatar, StageClock
 from ash.training.adam import Adam
 from ash.training.batches import Batch, draw_batch
 from ash.training.images import load_training_images
 from ash.training.loop import draw_training_step
 from ash.training.losses import l1_ssim_loss, l1_ssim_loss_naive, ssim_target
-from benchmarks.speed.rows import SpeedRow, as_json, row_of
+from benchmarks.cell.metrics import psnr
+from benchmarks.speed.timing import (
+    Candidate,
+    SpeedRow,
+    as_json,
+    print_head,
+    print_rows,
+    rows_of,
+    time_interleaved,
+    torch_threads_restored,
+)
 
-# Milliseconds of a stage, or of the whole "frame", by threads.
-Samples = dict[tuple[str, int], list[float]]
-
-STAGES = ("stg1", "stg2", "stg3", "stg4")
 # ASH, appendix "Runtime Analysis": milliseconds on an A100 at 1285x940, by texels per side.
 PAPER_MS = {
     128: {"stg1": 20.28, "stg2": 1.93, "stg3": 5.57, "stg4": 1.91, "frame": 29.69},
@@ -42,11 +47,15 @@ PAPER_MS = {
     512: {"stg1": 24.25, "stg2": 16.34, "stg3": 18.45, "stg4": 4.31, "frame": 63.35},
 }
 CAPTURE = Path("data/mannequin-ci-0")
+SPLITS = {"near": "near_pose", "new": "novel_pose"}  # held-out motion of a trained avatar
+SIZE = (512, 512)  # in which it is timed, besides that of the capture's images
+THREADS = (1, 2)  # of the CPU; one thread feeds a GPU
+DEFINITION_RUNS = 3  # frames that an untrained avatar draws by the definitions
 
 
 @dataclass(frozen=True, kw_only=True)
-class TimedAvatar:
-    """A configuration to be timed."""
+class Subject:
+    """A configuration to be timed, untrained: a network takes its time whatever its weights are."""
 
     name: str
     config: AshConfig
@@ -55,82 +64,109 @@ class TimedAvatar:
     trains: bool = False  # time steps of training, too
 
 
-def subjects() -> tuple[TimedAvatar, ...]:
+@dataclass(frozen=True, kw_only=True)
+class Clip:
+    """Frames of a motion to be timed, seen by one camera."""
+
+    title: str
+    poses: tuple[Pose, ...]
+    camera: Camera
+    compared: int  # so many of the frames are also drawn by the definitions
+
+    @property
+    def size(self) -> str:
+        """Pixels of its images."""
+        return f"{self.camera.width}x{self.camera.height}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Agreement:
+    """How far drawn images are from those by the definitions; its fields are those of the JSON."""
+
+    candidate: str
+    size: str
+    gaussians: int
+    frames: int
+    least_decoder_weight: float  # 0..1
+    least_db: float  # foreground PSNR of the worst frame on any number of threads
+    median_db: float  # over the frames
+
+    def line(self) -> str:
+        """In one line."""
+        return (
+            f"{self.candidate}, {self.size}: {self.gaussians:,} Gaussians; agrees with the definitions"
+            f" to {self.least_db:.1f} dB at least, {self.median_db:.1f} dB in the median of {self.frames} frames,"
+            f" decoder weight {self.least_decoder_weight:.2f} or more"
+        )
+
+
+def subjects() -> tuple[Subject, ...]:
     """`cpu` at four resolutions of the texel lattice, and the paper's."""
     cpu = named("cpu")
     lattices = {texels: replace(cpu, model=replace(cpu.model, texels=texels)) for texels in (64, 128, 256, 512)}
     small = [
-        TimedAvatar(
+        Subject(
             name="cpu" if config == cpu else f"cpu@{texels}", config=config, width=512, height=512, trains=config == cpu
         )
         for texels, config in lattices.items()
     ]
-    return (*small, TimedAvatar(name="paper", config=named("paper"), width=1285, height=940))
-
-
-@runtime_checkable
-class AgreementLine(Protocol):
-    """How far the images that are played are from those by the definitions; its fields are those of the JSON."""
-
-    def told(self) -> str:
-        """In one line."""
-        ...
-
-
-@dataclass(frozen=True, kw_only=True)
-class PictureAgreement:
-    """How far the image that is played is from the one by the definitions, which the avatar was trained against."""
-
-    preset: str
-    gaussians: int
-    psnr_db: float
-    engine: str  # of the decoders, on one thread
-
-    def told(self) -> str:
-        """In one line."""
-        about = f"{self.gaussians:,} Gaussians, decoders in {self.engine}"
-        return f"{self.preset}: {about}; agrees with the definitions to {self.psnr_db:.1f} dB"
+    return (*small, Subject(name="paper", config=named("paper"), width=1285, height=940))
 
 
 def speed_frame(
     capture: Capture,
     *,
-    timed: tuple[TimedAvatar, ...] | None = None,
-    threads: tuple[int, ...] = (1, 2),
+    timed: tuple[Subject, ...] | None = None,
+    threads: tuple[int, ...] = THREADS,
     rounds: int = 15,
     device: torch.device = CPU,
-) -> Iterator[list[SpeedRow] | PictureAgreement]:
-    """Time frames and steps on a capture; yields results as they come. `timed`: all `subjects()` where none are given.
+) -> Iterator[list[SpeedRow] | Agreement]:
+    """Time frames and steps of untrained avatars on a capture; yields results as they come. Large ones: fewer rounds.
 
-    Nothing is trained for long, the template's graph networks for a step: a network takes its time whatever its weights
-    are, and texels start as they are drawn.
-    Frames follow each other as in playback. Large presets are timed a tenth as often.
+    `timed`: all `subjects()` where none are given.
     """
-    before = torch.get_num_threads()
-    threads = threads if device == CPU else (1,)  # A GPU is fed by one.
-    try:
-        for subject in timed or subjects():
-            config = replace(subject.config, device=str(device))
-            few = max(2, rounds // 10) if config.model.width >= 64 else rounds
-            avatar = AshAvatar(replace(config, template=replace(config.template, steps=1)), capture)
-            _wake(avatar)
-            camera = scaled_camera(next(iter(capture.cameras.values())), subject.width, subject.height)
-            players = players_of(avatar, capture.motion, camera, threads)
-            yield agreement(avatar, players[threads[0]], subject.name, capture, camera)
-            yield _time_frames(avatar, players, subject.name, capture, camera, rounds=few)
-            if subject.trains:
-                yield _time_steps(avatar, subject.name, capture, rounds=rounds)
-    finally:
-        torch.set_num_threads(before)
+    frames = capture.splits["train"].frames
+    for subject in timed or subjects():
+        config = replace(subject.config, device=str(device))
+        avatar = AshAvatar(replace(config, template=replace(config.template, steps=1)), capture)
+        _fill_heads(avatar)
+        large = config.model.width >= 64
+        count = max(2, rounds // 10) if large else rounds
+        clip = Clip(
+            title=subject.name,
+            poses=tuple(Pose(capture.motion, frames[number % len(frames)]) for number in range(1, 1 + count)),
+            camera=scaled_camera(next(iter(capture.cameras.values())), subject.width, subject.height),
+            compared=1 if large else DEFINITION_RUNS,
+        )
+        yield from time_clip(avatar, clip, threads=threads)
+        if subject.trains:
+            yield time_steps(avatar, subject.name, capture, rounds=max(1, rounds // 5))
 
 
-def players_of(avatar: AshAvatar, motion: Motion, camera: Camera, threads: tuple[int, ...]) -> dict[int, Player]:
-    """A player for each number of threads, whose engines were measured on as many."""
-    players = {}
-    for count in threads:
-        torch.set_num_threads(count)
-        players[count] = Player(avatar, motion, camera)
-    return players
+def held_out_clips(capture: Capture, title: str) -> list[Clip]:
+    """The held-out near motion and the new motion of a capture, each at 512x512 and at the size of its images.
+
+    Raises:
+        InputError: the capture has neither.
+    """
+    clips = []
+    for name, split in SPLITS.items():
+        if split not in capture.splits:
+            continue
+        poses = tuple(Pose(capture.motion, frame) for frame in sorted(capture.splits[split].frames))
+        camera = capture.cameras[capture.splits[split].cameras[0]]
+        clips += [
+            Clip(
+                title=f"{title} {name}",
+                poses=poses,
+                camera=scaled_camera(camera, width, height),
+                compared=len(poses),
+            )
+            for width, height in dict.fromkeys((SIZE, (camera.width, camera.height)))
+        ]
+    if not clips:
+        raise InputError(f"{capture.folder}: expected held-out frames of near or new motion, and it has neither")
+    return clips
 
 
 def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
@@ -141,138 +177,147 @@ def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
     return Camera(name=camera.name, width=width, height=height, K=K, viewmat=camera.viewmat)
 
 
-def _wake(avatar: AshAvatar) -> None:
-    """Give the networks something to say: an untrained head is zero."""
+def _fill_heads(avatar: AshAvatar) -> None:
+    """Give the decoders an output that is not zero: an untrained head is zero."""
     generator = torch.Generator().manual_seed(0)
     decoders = avatar.module.decoders
     assert decoders is not None
     for name, parameter in decoders.named_parameters():
-        if "head" in name or name == "shapes":
+        if "head" in name:
             parameter.data.copy_(0.01 * torch.randn(parameter.shape, generator=generator, device=CPU))
 
 
 @torch.no_grad()
 def frame_by_definition(model: AshModel, pose: Pose, camera: Camera) -> np.ndarray:
-    """The image of a frame by the definitions alone, on one thread: premultiplied RGBA, float32 `[h, w, 4]`."""
-    torch.set_num_threads(1)
+    """The image of a frame by the definitions alone: premultiplied RGBA, float32 `[h, w, 4]`."""
     posed = model.template.pose(pose)
-    canonical, normals, transforms = place_naive(model.lattice, posed, model.config.anchor)
-    conditions = replace(model.conditions(pose), canonical=canonical, normals=normals, transforms=transforms)
-    shares = model.shares(model.decode(conditions), conditions)
-    drawn = [(share, _splatted_by_definition(model, raw, conditions, [camera], None)) for share, raw in shares]
-    return image_of(mixed(drawn))
+    canonical, normals, transforms = sample_surface_naive(model.lattice, posed, model.config.anchor)
+    conditions = replace(model.frame_inputs(pose), canonical=canonical, normals=normals, transforms=transforms)
+    shares = model.blend_components(model.decode(conditions), conditions)
+    return image_of(
+        blend_renders([(share, _splat_by_definition(model, raw, conditions, [camera])) for share, raw in shares])
+    )
 
 
-def _splatted_by_definition(
-    model: AshModel, raw: Tensor, conditions: object, cameras: list[Camera], background: Tensor | None
+def _splat_by_definition(
+    model: AshModel, raw: Tensor, conditions: object, cameras: list[Camera], background: Tensor | None = None
 ) -> Splatted:
     gaussians = pose_naive(raw, conditions, model.config, model.light)  # type: ignore[arg-type]
     views = {name: moved(value, gaussians.means.device) for name, value in views_of(cameras).items()}
     return splat_naive(gaussians, **views, background=background, dilation=model.config.dilation)
 
 
-def agreement(avatar: AshAvatar, player: Player, preset: str, capture: Capture, camera: Camera) -> PictureAgreement:
-    """Foreground PSNR between the image of a frame as it is played and the one by the definitions."""
-    frame = capture.splits["train"].frames[-1]
-    defined = frame_by_definition(avatar.module, Pose(capture.motion, frame), camera)
-    agrees = agreement_db(player.draw(frame, camera), defined)
-    engine = player.engine.name if player.engine else "none"
-    return PictureAgreement(preset=preset, gaussians=avatar.gaussian_count(), psnr_db=agrees, engine=engine)
-
-
 def agreement_db(drawn: np.ndarray, defined: np.ndarray) -> float:
     """PSNR between two premultiplied RGBA images `[h, w, 4]` in dB, on the foreground of the one by the definitions."""
-    return psnr(drawn[..., :3], defined[..., :3], defined[..., 3])
+    return psnr(255 * drawn[..., :3], 255 * defined[..., :3], defined[..., 3] > 0.5)
 
 
-def timed_frame(player: Player, frame: int, camera: Camera, threads: int) -> dict[str, float]:
-    """Milliseconds of a frame's stages and of the whole, played on so many threads."""
-    torch.set_num_threads(threads)
-    clock, start = StageClock(), time.perf_counter()
-    player.draw(frame, camera, clock=clock)
-    elapsed = (time.perf_counter() - start) * 1e3
-    return {stage: clock.ms[stage] for stage in STAGES} | {"frame": elapsed}
+def time_clip(
+    avatar: AshAvatar, clip: Clip, *, threads: tuple[int, ...] = THREADS, rounds: int = 1
+) -> Iterator[Agreement | list[SpeedRow]]:
+    """Draw a clip's frames on each number of threads, and the compared ones by the definitions on one thread."""
+    threads = threads if avatar.device == CPU else (1,)
+    model = avatar.module
+    drawn: dict[int, np.ndarray] = {}  # the last image
+    defined: dict[int, np.ndarray] = {}  # by number of the call
+    agreed: dict[int, list[float]] = {}
 
+    def pose_of(number: int) -> Pose:
+        return clip.poses[number % len(clip.poses)]
 
-def frame_rows(
-    samples: Samples,
-    defined_ms: list[float],
-    name: str,
-    camera: Camera,
-    device: torch.device,
-) -> list[SpeedRow]:
-    """Rows of the frame by the definitions, then of every stage and the whole frame by threads."""
-    size = f"{camera.width}x{camera.height}"
-    reference = min(defined_ms)
-    rows = [row_of("frame", size, "forward", 1, f"{name}-naive", defined_ms, reference, device)]
-    for (what, count), taken in samples.items():
-        over = reference if what == "frame" else math.nan
-        rows.append(row_of(what, size, "forward", count, name, taken, over, device))
-    return rows
+    def arrive(count: int) -> Callable[[int], None]:
+        return lambda number: _arrive(model, pose_of(number), count)
 
+    def draw(number: int) -> Mapping[str, float]:
+        clock = StageClock()
+        drawn[0] = avatar.render(pose_of(number), clip.camera, clock=clock)
+        return clock.ms
 
-def _time_frames(
-    avatar: AshAvatar, players: dict[int, Player], preset: str, capture: Capture, camera: Camera, *, rounds: int
-) -> list[SpeedRow]:
-    """Rows of every stage and of the whole frame, by threads; the definitions first, drawn once."""
-    threads = tuple(players)
-    frames = capture.splits["train"].frames
-    start = time.perf_counter()
-    frame_by_definition(avatar.module, Pose(capture.motion, frames[0]), camera)
-    defined_ms = [(time.perf_counter() - start) * 1e3]
-    samples: Samples = defaultdict(list)
-    for number in range(rounds + 1):
-        for count in threads:
-            # Another motion frame every time, and the history of each posed already, as in playback.
-            frame = frames[(1 + number * len(threads) + threads.index(count)) % len(frames)]
-            measured = timed_frame(players[count], frame, camera, count)
-            if number:
-                for what, value in measured.items():
-                    samples[what, count].append(value)
-    return frame_rows(samples, defined_ms, preset, camera, avatar.device)
+    def define(number: int) -> None:
+        defined[number] = frame_by_definition(model, pose_of(number), clip.camera)
 
+    def compare(number: int) -> None:
+        if number in defined:
+            agreed.setdefault(number, []).append(agreement_db(drawn[0], defined[number]))
 
-def _time_steps(avatar: AshAvatar, preset: str, capture: Capture, *, rounds: int) -> list[SpeedRow]:
-    """A step of training on the capture's images, with the definitions in torch and with the kernels, by turns."""
-    torch.set_num_threads(1)
-    images = load_training_images(capture, avatar.device)
-    groups = avatar.parameter_groups()
-    optimisers = {name: Adam([group | {"lr": 0.0} for group in groups]) for name in ("naive", "native")}
-    samples: dict[str, list[float]] = {"naive": [], "native": []}
-    for number in range(1 + max(1, rounds // 5)):
-        for name in ("naive", *["native"] * 5):
-            batch = draw_batch(images, avatar.config.training, 0, number)
-            avatar._conditions_of(batch.frame)
-            finish(avatar.device)
-            start = time.perf_counter()
-            _step(avatar, batch, optimisers[name], naive=name == "naive")
-            finish(avatar.device)
-            if number:
-                samples[name].append((time.perf_counter() - start) * 1e3)
-    camera = next(iter(images.cameras.values()))
-    size = f"{camera.width}x{camera.height}"
-    reference = min(samples["naive"])
-    return [
-        row_of(
-            "train_step",
-            size,
-            "forward+backward",
-            1,
-            preset if name == "native" else f"{preset}-naive",
-            taken,
-            reference,
-            avatar.device,
+    with torch_threads_restored():
+        by_definition = Candidate(name=f"{clip.title}-naive", threads=1, call=define, before=arrive(1))
+        samples = time_interleaved([by_definition], rounds=clip.compared, warm_up=False, device=avatar.device)
+        samples |= time_interleaved(
+            [
+                Candidate(name=clip.title, threads=count, call=draw, before=arrive(count), after=compare)
+                for count in threads
+            ],
+            rounds=rounds * len(clip.poses),
+            warm_up=False,
+            device=avatar.device,
         )
-        for name, taken in samples.items()
+    worst = [min(several) for several in agreed.values()]
+    yield Agreement(
+        candidate=clip.title,
+        size=clip.size,
+        gaussians=avatar.gaussian_count(),
+        frames=len(worst),
+        least_decoder_weight=min(decoder_weight(model, pose_of(number)) for number in agreed),
+        least_db=min(worst),
+        median_db=statistics.median(worst),
+    )
+    yield rows_of("frame", clip.size, "forward", samples, avatar.device)
+
+
+@torch.no_grad()
+def decoder_weight(model: AshModel, pose: Pose) -> float:
+    """The weight of the decoded picture in a pose, 0..1."""
+    return model.frame_inputs(pose).decoder_weight
+
+
+def _arrive(model: AshModel, pose: Pose, threads: int) -> None:
+    """Leave with the template what playback leaves there: the frames before this one, and not this one."""
+    torch.set_num_threads(threads)
+    model.template.clear_cache()
+    for past in pose.window(model.config.window):
+        if past != pose.frame:
+            model.template.pose(pose.at(int(past)))
+
+
+def time_steps(avatar: AshAvatar, preset: str, capture: Capture, *, rounds: int) -> list[SpeedRow]:
+    """A step of training on the capture's images on one thread, by the definitions and as it is trained, interleaved.
+
+    Batches are drawn before; weights stay as they are.
+    """
+    images = load_training_images(capture, avatar.device)
+    batches: dict[int, Batch] = {}
+
+    def prepare(number: int) -> None:
+        torch.set_num_threads(1)
+        if number not in batches:
+            batches[number] = draw_batch(images, avatar.config.training, 0, number)
+        avatar._inputs_of(batches[number].frame)
+
+    def candidate(name: str, *, naive: bool, repeats: int) -> Candidate:
+        optimiser = Adam([group | {"lr": 0.0} for group in avatar.parameter_groups()])
+
+        def step(number: int) -> None:
+            _step(avatar, batches[number], optimiser, naive=naive)
+
+        return Candidate(name=name, threads=1, call=step, before=prepare, repeats=repeats)
+
+    candidates = [
+        candidate(f"{preset}-naive", naive=True, repeats=1),
+        candidate(preset, naive=False, repeats=5),
     ]
+    with torch_threads_restored():
+        samples = time_interleaved(candidates, rounds=rounds, device=avatar.device)
+    camera = next(iter(images.cameras.values()))
+    return rows_of("train_step", f"{camera.width}x{camera.height}", "forward+backward", samples, avatar.device)
 
 
 def _step(avatar: AshAvatar, batch: Batch, optimiser: Adam, *, naive: bool) -> None:
     training = avatar.config.training
-    conditions = avatar._conditions_of(batch.frame)
     if naive:
+        conditions = avatar._inputs_of(batch.frame)
         raw = avatar.module.decode(conditions)
-        drawn = _splatted_by_definition(avatar.module, raw, conditions, batch.cameras, batch.background).rgb
+        drawn = _splat_by_definition(avatar.module, raw, conditions, batch.cameras, batch.background).rgb
     else:
         (drawn,) = draw_training_step(avatar, [batch], training.steps)
     loss = l1_ssim_loss_naive if naive else l1_ssim_loss
@@ -298,34 +343,40 @@ def captured(folder: Path | None) -> Capture:
 
 
 def main(json_path: Path | None, folder: Path | None = None, device: torch.device = CPU) -> int:
-    """Print the table of a capture, and write it to `json_path`; returns the exit code."""
+    """Print the table of untrained avatars on a capture, and write it to `json_path`; returns the exit code."""
     return print_table(speed_frame(captured(folder), device=device), json_path, device)
 
 
-def print_table(results: Iterable[list[SpeedRow] | AgreementLine], json_path: Path | None, device: torch.device) -> int:
+def main_of_avatar(avatar: Avatar, capture: Capture, title: str, json_path: Path | None) -> int:
+    """Print the table of a trained avatar on its capture, and write it to `json_path`; returns the exit code.
+
+    Raises:
+        InputError: the avatar is none of ASH, or its capture has no held-out motion.
+    """
+    if not isinstance(avatar, AshAvatar):
+        raise InputError(f"speed frame: expected an avatar of ASH, whose stages have definitions, got {title}")
+    clips = held_out_clips(capture, title)
+    results = (result for clip in clips for result in time_clip(avatar, clip, rounds=2))
+    return print_table(results, json_path, avatar.device)
+
+
+def print_table(results: Iterable[list[SpeedRow] | Agreement], json_path: Path | None, device: torch.device) -> int:
     """Print rows and agreements as they come, and write them to `json_path`; returns the exit code."""
     print(f"device {device}")
-    print(f"{'what':10} {'size':9} {'pass':17} th {'by':18} {'min ms':>9} {'median ms':>9} {'naive/min':>9} {'1/s':>6}")
+    print_head()
     rows: list[SpeedRow] = []
-    agreements: list[AgreementLine] = []
+    agreements: list[Agreement] = []
     for result in results:
-        if not isinstance(result, list):
+        if isinstance(result, Agreement):
             agreements.append(result)
-            print(f"  {result.told()}", flush=True)
-            continue
-        rows += result
-        for row in result:
-            ratio = "" if math.isnan(row.ratio) else f"{row.ratio:9.1f}"
-            rate = f"{1e3 / row.median_ms:6.1f}" if row.what in ("frame", "train_step") else ""
-            print(
-                f"{row.what:10} {row.size:9} {row.pass_:17} {row.threads:2} {row.candidate:18}"
-                f" {row.min_ms:9.2f} {row.median_ms:9.2f} {ratio:>9} {rate:>6}",
-                flush=True,
-            )
+            print(f"  {result.line()}", flush=True)
+        else:
+            rows += result
+            print_rows(result)
     print("the paper, on an A100 with its learned template at 1285x940:")
-    for texels, found in PAPER_MS.items():
-        stages = ", ".join(f"{name} {ms:.2f}" for name, ms in found.items())
-        print(f"  {texels} texels: {stages} ms, {1e3 / found['frame']:.2f} frames per second")
+    for texels, paper in PAPER_MS.items():
+        stages = ", ".join(f"{name} {ms:.2f}" for name, ms in paper.items())
+        print(f"  {texels} texels: {stages} ms, {1e3 / paper['frame']:.2f} frames per second")
     if json_path is not None:
         content = {"rows": [as_json(row) for row in rows], "agreements": [vars(a) for a in agreements]}
         write_json(json_path, content | {"paper_ms": PAPER_MS})

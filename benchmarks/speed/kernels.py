@@ -17,8 +17,8 @@ from ash.mesh.rasterizing import rasterize_mesh, rasterize_mesh_naive
 from ash.native.library import fma_peak, instruction_set, stage_ms
 from ash.training.losses import l1_ssim_loss, l1_ssim_loss_naive, ssim_target
 from benchmarks.cell.timing import peak_memory_mb
-from benchmarks.speed.rows import SpeedRow, as_json, in_turns, print_rows, rows_of, time_interleaved
 from benchmarks.speed.scenes import SplatScene, body_mesh, splat_scene
+from benchmarks.speed.timing import Candidate, SpeedRow, as_json, print_head, print_rows, rows_of, time_interleaved
 
 # Floating point operations of one splat at one pixel, counted in native/blend.inc: the exponent and its power of two,
 # the cap and the transmittance, four accumulated channels; backward all but the channels again, and the gradients.
@@ -58,6 +58,23 @@ def speed_kernels(
         yield _time_rasterizer(size, pixels, rounds=rounds, threads=threads, device=device)
 
 
+def _candidates(
+    naive: Callable[[], object], native: Callable[..., object], threads: tuple[int, ...]
+) -> list[Candidate]:
+    """The definition on the threads that torch has, and its kernel, ten calls each, on each number of `threads`."""
+    kernels = [
+        Candidate(name="native", threads=n, call=_without_result(native, threads=n), repeats=10) for n in threads
+    ]
+    return [Candidate(name="naive", threads=torch.get_num_threads(), call=_without_result(naive)), *kernels]
+
+
+def _without_result(call: Callable[..., object], **options: int) -> Callable[[int], None]:
+    def run(number: int) -> None:
+        call(**options)
+
+    return run
+
+
 def time_splat(scene: SplatScene, *, rounds: int, threads: tuple[int, ...]) -> Iterator[list[SpeedRow] | SplatDetail]:
     """Rows of forward and of forward with backward, naive and native by turns; of the CPU a detail per thread count."""
     device = scene.gaussians.means.device
@@ -77,7 +94,7 @@ def time_splat(scene: SplatScene, *, rounds: int, threads: tuple[int, ...]) -> I
             stages[more["threads"]].append(stage_ms())
 
     for pass_, run in (("forward", forward), ("forward+backward", both)):
-        candidates = in_turns(partial(run, splat_naive), partial(run, splat), threads)
+        candidates = _candidates(partial(run, splat_naive), partial(run, splat), threads)
         yield rows_of("splat", scene.name, pass_, time_interleaved(candidates, rounds=rounds, device=device), device)
     if device != CPU:
         return
@@ -139,7 +156,7 @@ def _time_loss(
         image.grad = None
         loss(image, cached, l1_weight=0.9, ssim_weight=0.1, **more).backward()
 
-    candidates = in_turns(partial(run, l1_ssim_loss_naive), partial(run, l1_ssim_loss), threads)
+    candidates = _candidates(partial(run, l1_ssim_loss_naive), partial(run, l1_ssim_loss), threads)
     times = time_interleaved(candidates, rounds=2 * rounds, device=device)
     return rows_of("l1_ssim", size, "forward+backward", times, device)
 
@@ -151,7 +168,7 @@ def _time_rasterizer(
     naive, native = (
         partial(draw, vertices, faces, width=pixels, height=pixels) for draw in (rasterize_mesh_naive, rasterize_mesh)
     )
-    candidates = in_turns(naive, native, threads)
+    candidates = _candidates(naive, native, threads)
     times = time_interleaved(candidates, rounds=max(1, rounds // 3), device=device)
     return rows_of("rasterize_mesh", size, "forward", times, device)
 
@@ -173,7 +190,7 @@ def main(json_path: Path | None, device: torch.device = CPU) -> int:
     print(f"device {device}")
     print(f"instruction set {instruction_set()}, FMA peak {1e-9 * fma_peak(1):.0f} GFLOP/s on one thread", end="")
     print(f" and {1e-9 * fma_peak(2):.0f} on two; torch {torch.__version__}, {torch.get_num_threads()} thread(s)")
-    print(f"{'what':15} {'size':9} {'pass':17} th {'by':7} {'min ms':>10} {'median ms':>10} {'ratio':>8}")
+    print_head()
     rows: list[SpeedRow] = []
     details: list[SplatDetail] = []
     for result in speed_kernels(device=device):

@@ -138,7 +138,7 @@ def _profiled_steps(
     first = learner.config.training.warmup_steps  # Before, decoders do not take part.
     warm = len(images.frames)  # An epoch: each frame's template is posed once.
     with tempfile.TemporaryDirectory() as folder:
-        run = ash.training.loop._Run(learner, config, images, Path(folder))
+        run = ash.training.loop.Trainer(learner, config, images, Path(folder))
         for number in range(steps + warm):
             run.step = first + number
             parts = _Parts(learner.device)
@@ -163,7 +163,7 @@ def _what_else(learner: AshAvatar | DdcAvatar, step: int) -> str:
 
 
 @contextmanager
-def _watched(parts: _Parts, learner: AshAvatar | DdcAvatar, run: ash.training.loop._Run) -> Iterator[None]:
+def _watched(parts: _Parts, learner: AshAvatar | DdcAvatar, run: ash.training.loop.Trainer) -> Iterator[None]:
     """Count the parts of the step that the body makes."""
     if isinstance(learner, AshAvatar):
         drawing = [(learner, "_decode", "decode"), (learner.module, "pose", "pose"), (learner.module, "draw", "draw")]
@@ -190,8 +190,8 @@ def profiles(capture: Capture, device: torch.device = CPU) -> Iterator[list[Part
         for method, preset, precision in SUBJECTS:
             if precision == "bfloat16" and not (device.type != "cpu" or has_tiles()):
                 continue
-            recipe: presets.Recipe[Any] = presets.ash if method == "ash" else ddc
-            make = recipe.but({"training.precision": precision, "device": str(device)})
+            recipe: presets.MethodFactory[Any] = presets.ash if method == "ash" else ddc
+            make = recipe.with_overrides({"training.precision": precision, "device": str(device)})
             learner: AshAvatar | DdcAvatar = make(capture, seed=0, preset=preset)
             yield profile_step(method, learner, images, preset, steps=STEPS)
     finally:

@@ -1,4 +1,4 @@
-"""`ash-bench retarget`: drive trained avatars with a motion of another skeleton, and score them against its truth.
+"""`ash-bench eval --motion`: drive trained avatars with a motion of another skeleton, and score them against its truth.
 
 The paper drives its avatars with motions of AMASS and shows pictures: nobody filmed the person doing that. Here the
 truth for any motion can be rendered.
@@ -23,7 +23,7 @@ from benchmarks.cell.views import View, spread
 from benchmarks.report.pictures import on_paper
 from benchmarks.suites.progress import Progress
 from synth.capture import make_body, make_capture
-from synth.readers.retargeting import retargeted, scene_of
+from synth.truth.retargeting import retargeted, scene_of
 
 STRIP_FRAMES = 6
 

@@ -13,7 +13,7 @@ from benchmarks.suites.stress import Stress
 from benchmarks.suites.suites import CaptureSpec, Suite
 from synth.cost import require_space
 from synth.person.cast import VALIDATION
-from synth.readers.perturb import perturb
+from synth.perturbation.perturb import perturb
 from synth.scene import Scene
 
 

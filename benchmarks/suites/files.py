@@ -26,7 +26,7 @@ from tomlkit.exceptions import NonExistentKey, TOMLKitError
 from tomlkit.items import AbstractTable, Table
 
 from ash.capture.manifest import read_manifest
-from ash.fields import WRITTEN, Changes, for_json, nearest
+from ash.fields import WRITTEN, Changes, for_json, suggest
 from ash.files import InputError, hash_of, open_regular
 from benchmarks.cell.methods import configured, find_method
 from benchmarks.suites.stress import Stress
@@ -71,7 +71,7 @@ def find_suite(name: str | Path) -> Suite:
     known = suite_files()
     path = known.get(str(name), Path(name))
     if path.suffix != ".toml":
-        raise InputError(f"unknown suite {str(name)!r}, {nearest(str(name), (*known, 'FILE.toml'))}")
+        raise InputError(f"unknown suite {str(name)!r}, {suggest(str(name), (*known, 'FILE.toml'))}")
     return read_suite(path)
 
 
@@ -107,7 +107,7 @@ class _Reader:
         """The whole file."""
         for key in content:
             if key not in SUITE_KEYS:
-                raise self.error((key,), f"unknown key {key!r}, {nearest(key, SUITE_KEYS)}")
+                raise self.error((key,), f"unknown key {key!r}, {suggest(key, SUITE_KEYS)}")
         for key in REQUIRED:
             if key not in content:
                 raise InputError(f"{self.path}: expected the key {key!r}")

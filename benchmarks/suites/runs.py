@@ -12,7 +12,7 @@ from typing import Any
 from ash.capture.formats import load_capture
 from ash.capture.typed import from_json
 from ash.fields import for_json
-from ash.files import InputError, only_run_in, read_json, require_plain, write_json
+from ash.files import InputError, read_json, require_plain, run_lock, write_json
 from benchmarks.cell import isolation
 from benchmarks.cell.cells import Cell, CellConfig, CellResult, printable, read_cell, result_of
 from benchmarks.cell.children import clean_environment
@@ -88,7 +88,7 @@ def run_suite(suite: Suite, options: RunOptions) -> Run:
     for note in require_runnable(suite, options):
         print(note, file=sys.stderr)
     options.out.mkdir(parents=True, exist_ok=True)
-    with contextlib.nullcontext() if options.shard else only_run_in(options.out):
+    with contextlib.nullcontext() if options.shard else run_lock(options.out):
         return _run_suite(suite, options)
 
 

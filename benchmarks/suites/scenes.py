@@ -1,14 +1,11 @@
 """Every scene by its name, those of the generator and `splats`, and how each becomes a capture."""
 
-from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
-from ash.fields import Changes, nearest, replaced
+from ash.fields import Changes, apply_overrides, suggest
 from ash.files import InputError
 from benchmarks.suites.progress import Progress
 from synth.presets import SCENES, scene, skinned
@@ -23,14 +20,14 @@ def scene_names() -> tuple[str, ...]:
 
 
 def scene_of(of: str, *, size: str, seed: int = 0, subject: int = 0, name: str = "", changes: Changes = ()) -> Scene:
-    """A scene by name, with fields replaced; `name` is what it is called then.
+    """A scene by name, with changed fields; `name` is what it is called then.
 
     Raises:
         InputError: no such scene, size or field, or a value that the scene refuses.
     """
     if of not in scene_names():
-        raise InputError(f"unknown scene {of!r}, {nearest(of, scene_names())}")
-    return replaced(replace(_plain(of, size, seed), subject=subject, name=name or of), changes, of=of)
+        raise InputError(f"unknown scene {of!r}, {suggest(of, scene_names())}")
+    return apply_overrides(replace(_plain(of, size, seed), subject=subject, name=name or of), changes, of=of)
 
 
 def _plain(of: str, size: str, seed: int) -> Scene:
@@ -77,14 +74,3 @@ def draw_scene(of: str, wanted: Scene, folder: Path, *, title: str, workers: int
                 " when memory runs out, and fewer --workers need less"
             ) from None
     progress.close()
-
-
-def draw_views_of(of: str) -> Callable[..., list[np.ndarray]]:
-    """What draws single views of a scene, for sheets."""
-    if of == SPLATS:
-        from benchmarks.suites.splats import draw_views
-
-        return draw_views
-    from synth.readers.sheets import path_traced
-
-    return path_traced

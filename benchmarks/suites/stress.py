@@ -4,9 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ash.capture.dataset import Capture
-from ash.fields import nearest
+from ash.fields import suggest
 from ash.files import InputError
-from synth.readers.perturb import Perturbation
+from synth.perturbation.perturb import Perturbation
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -88,7 +88,7 @@ class Stress:
 
     def __post_init__(self) -> None:
         if self.axis not in AXES:
-            raise InputError(f"unknown stress axis {self.axis!r}, {nearest(self.axis, tuple(AXES))}")
+            raise InputError(f"unknown stress axis {self.axis!r}, {suggest(self.axis, tuple(AXES))}")
         if not 0 < self.severity < float("inf"):
             raise InputError(f"stress {self.axis}: expected a severity above zero, got {self.severity}")
 

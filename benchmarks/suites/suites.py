@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ash.fields import Changes, nearest
+from ash.fields import Changes, suggest
 from ash.files import InputError, hash_of
 from benchmarks.cell.methods import ORACLES, find_method, is_oracle, named_method
 from benchmarks.suites.stress import Stress
@@ -108,7 +108,7 @@ class Suite:
         for scene in self.scenes:
             for name in scene.methods:
                 if name not in known:
-                    raise InputError(f"scenes: {scene.name} asks for the method {name!r}, {nearest(name, known)}")
+                    raise InputError(f"scenes: {scene.name} asks for the method {name!r}, {suggest(name, known)}")
         if not 1 <= self.seeds <= MOST_SEEDS:
             raise InputError(f"seeds: expected 1 to {MOST_SEEDS}, got {self.seeds}")
         if not 1 <= self.subjects <= VALIDATION:

@@ -199,26 +199,18 @@ class Studio:
         *,
         samples: int,
         seeds: list[int],
-        during: list[np.ndarray] | None = None,
     ) -> list[Picture]:
-        """Render views of a `pose` `[s, 3]`; `during` holds those that the person takes while the shutter is open.
+        """Render views of a `pose` `[s, 3]`.
 
         Light is gathered in two halves of independent noise. One ray through every pixel's centre tells what is there.
         """
-        poses = during or [pose]
-        moving = np.concatenate(poses)
-        windows = [window_of(camera, moving) for camera in cameras]
+        windows = [window_of(camera, pose) for camera in cameras]
         halves = [[np.zeros((window.height, window.width, 4)) for _ in range(2)] for window in windows]
-        share = -(-samples // 2 // len(poses))
-        for place in poses:
-            self._wear(place)
-            for camera, window, pair, seed in zip(cameras, windows, halves, seeds, strict=True):
-                sensor = make_sensor(self.mi, camera, window, vectorised=self.vectorised)
-                for half in pair:
-                    half += self._render(sensor, share, seed % 2**32) / len(poses)
-                    seed += 1
-            seeds = [seed + 2 for seed in seeds]
         self._wear(pose)
+        for camera, window, pair, seed in zip(cameras, windows, halves, seeds, strict=True):
+            sensor = make_sensor(self.mi, camera, window, vectorised=self.vectorised)
+            for index, half in enumerate(pair):
+                half += self._render(sensor, -(-samples // 2), (seed + index) % 2**32)
         return [self._develop(*view) for view in zip(cameras, windows, halves, strict=True)]
 
     def _wear(self, pose: np.ndarray) -> None:

@@ -10,7 +10,7 @@ from ash.config import ModelConfig
 from ash.decoders import Decoders, TexelRows, UNet
 from ash.native.unet import _UNet
 from ash.rotations import RigidTransforms
-from ash.textures import Conditions, build_lattice
+from ash.textures import FrameInputs, build_lattice
 
 
 def config(**changes) -> ModelConfig:
@@ -21,10 +21,10 @@ def config(**changes) -> ModelConfig:
 LATTICE = build_lattice(tube_mesh(), 16)
 
 
-def conditions(textures: torch.Tensor) -> Conditions:
+def frame_inputs(textures: torch.Tensor) -> FrameInputs:
     nothing = torch.zeros(0, 3)
-    return Conditions(
-        trust=1.0,
+    return FrameInputs(
+        decoder_weight=1.0,
         textures=textures,
         motion=torch.zeros(2, 9),
         root_translation=torch.zeros(3),
@@ -35,7 +35,7 @@ def conditions(textures: torch.Tensor) -> Conditions:
 
 
 def test_untrained_decoders_return_zero_so_that_training_starts_from_the_initial_gaussians():
-    decoded = Decoders(config(), LATTICE)(conditions(torch.randn(12, 16, 16)))
+    decoded = Decoders(config(), LATTICE)(frame_inputs(torch.randn(12, 16, 16)))
     assert decoded.shape == (len(LATTICE.texels), 11 + 12)
     assert not decoded.any()
 
@@ -56,7 +56,7 @@ def test_every_parameter_learns_once_the_heads_have_moved():
             torch.nn.init.normal_(net.head.weight)
         side = 16 // changes.get("shuffle", 1)
         textures = torch.randn(12, side, side)
-        decoders(conditions(textures)).square().sum().backward()
+        decoders(frame_inputs(textures)).square().sum().backward()
         assert all(p.grad is not None and p.grad.any() for p in decoders.parameters()), changes
 
 
@@ -64,7 +64,7 @@ def test_global_features_reach_appearance_alone():
     decoders = Decoders(config(), LATTICE)
     for net in decoders.nets:
         torch.nn.init.normal_(net.head.weight)
-    here = conditions(torch.randn(12, 16, 16))
+    here = frame_inputs(torch.randn(12, 16, 16))
     there = replace(here, root_translation=torch.tensor([1.0, 0.0, 2.0]))
     assert torch.equal(decoders(here)[:, :11], decoders(there)[:, :11])
     assert not torch.allclose(decoders(here)[:, 11:], decoders(there)[:, 11:])
@@ -164,7 +164,7 @@ def test_frames_decoded_together_are_those_decoded_alone(shared_trunk, kind):
     numbers = torch.Generator().manual_seed(2)
     frames = [
         replace(
-            conditions(torch.randn(12, 8, 8, generator=numbers).to(kind)),
+            frame_inputs(torch.randn(12, 8, 8, generator=numbers).to(kind)),
             root_translation=torch.randn(3, generator=numbers).to(kind),
         )
         for _ in range(3)

@@ -9,7 +9,7 @@ import ash.files
 import baselines.ddc
 import benchmarks.cell.methods
 from ash.files import hash_sources, source_files
-from synth.code import MAKERS, READERS
+from synth.source_hash import MAKERS, READERS
 
 DECIDE_A_CELL = (
     Path(ash.files.__file__).parent,

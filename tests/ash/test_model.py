@@ -34,7 +34,7 @@ def model(**changes) -> AshModel:
 
 def test_eq_5_the_offset_is_added_before_posing():
     ash = model()
-    conditions = ash.conditions(Pose(tube_motion(), 4))
+    conditions = ash.frame_inputs(Pose(tube_motion(), 4))
     raw = ash.decode(conditions)
     offset, *_ = split_raw(raw)
     expected = conditions.transforms.apply(conditions.canonical + 0.01 * offset)
@@ -44,7 +44,7 @@ def test_eq_5_the_offset_is_added_before_posing():
 def test_each_switch_changes_what_it_names_and_nothing_else():
     full = model(sh_degree=1, light=True)
     full.light.data.normal_(std=0.3)
-    conditions = full.conditions(Pose(tube_motion(), 4))
+    conditions = full.frame_inputs(Pose(tube_motion(), 4))
     raw = full.decode(conditions)
     reference = full.pose(raw, conditions)
     changed_by = {
@@ -66,7 +66,7 @@ def test_each_switch_changes_what_it_names_and_nothing_else():
 
 def test_rotations_turn_with_the_surface():
     ash = model()
-    conditions = ash.conditions(Pose(tube_motion(), 4))
+    conditions = ash.frame_inputs(Pose(tube_motion(), 4))
     raw = ash.decode(conditions)
     _, _, quats, _, _ = split_raw(raw)
     canonical = unitquat_to_rotmat(torch.nn.functional.normalize(quats, dim=-1))
@@ -77,7 +77,7 @@ def test_rotations_turn_with_the_surface():
 
 def test_light_multiplies_the_colour_by_the_exponential_of_the_irradiance():
     ash = model(light=True)
-    conditions = ash.conditions(Pose(tube_motion(), 4))
+    conditions = ash.frame_inputs(Pose(tube_motion(), 4))
     raw = ash.decode(conditions)
     plain = 0.5 + SH_C0 * ash.pose(raw, conditions).sh[:, 0]
     ash.light.data.normal_(std=0.5)
@@ -87,10 +87,10 @@ def test_light_multiplies_the_colour_by_the_exponential_of_the_irradiance():
 
 def test_static_gaussians_do_not_depend_on_the_motion():
     ash = model(motion=False)
-    one, other = (ash.decode(ash.conditions(Pose(tube_motion(seed=s), 4))) for s in (1, 2))
+    one, other = (ash.decode(ash.frame_inputs(Pose(tube_motion(seed=s), 4))) for s in (1, 2))
     assert torch.equal(one, other)
     moving = model()
-    one, other = (moving.decode(moving.conditions(Pose(tube_motion(seed=s), 4))) for s in (1, 2))
+    one, other = (moving.decode(moving.frame_inputs(Pose(tube_motion(seed=s), 4))) for s in (1, 2))
     assert not torch.allclose(one, other)
 
 
@@ -130,7 +130,7 @@ def test_texel_pitch_is_the_spacing_of_texels_on_the_surface():
 
 def test_rotated_normals_reach_the_conditions():
     ash = model()
-    conditions = ash.conditions(Pose(tube_motion(), 0))
+    conditions = ash.frame_inputs(Pose(tube_motion(), 0))
     at_rest = ash.lattice.interpolate(torch.from_numpy(tube_mesh().vertices * [1, 0, 1] / 0.1).float())
     below = conditions.canonical[:, 1] < 0.3
     expected = rotate(conditions.transforms.quats[below], torch.nn.functional.normalize(at_rest[below], dim=-1))

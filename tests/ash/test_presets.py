@@ -103,8 +103,8 @@ def test_the_global_mlps_are_as_wide_as_stated():
 
 def test_the_offsets_unit_scales_the_offset_alone(capture):
     avatar = AshAvatar(AshConfig(model=tube_model_config(), training=small(named("ci")).training), capture)
-    conditions = avatar.module.conditions(Pose(capture.motion, 2))
-    raw = avatar.module.base.detach().clone()
+    conditions = avatar.module.frame_inputs(Pose(capture.motion, 2))
+    raw = avatar.module.base_texels.detach().clone()
     raw[:, :3] = torch.randn(len(raw), 3, generator=torch.Generator().manual_seed(0))
     fine = avatar.module.pose(raw, conditions)
     avatar.module.config = replace(avatar.module.config, offset_unit_m=0.02)
@@ -121,7 +121,7 @@ def test_degrees_of_sh_add_coefficients_and_leave_the_others_alone(capture):
         avatar = AshAvatar(
             AshConfig(model=tube_model_config(sh_degree=degree), training=small(named("ci")).training), capture
         )
-        assert avatar.module.base.shape[1] == 11 + 3 * (degree + 1) ** 2
+        assert avatar.module.base_texels.shape[1] == 11 + 3 * (degree + 1) ** 2
         with torch.no_grad():
             images.append(avatar.module(Pose(capture.motion, 3), capture.cameras["cam1"]).rgb)
     torch.testing.assert_close(*images, atol=1e-6, rtol=0)
@@ -149,7 +149,7 @@ def test_the_weights_of_the_loss_weigh_its_two_parts(capture):
 def test_the_releases_warm_up_aims_at_round_gaussians_turned_to_the_normal(capture, quat_frame):
     model = replace(small(named("official")).model, quat_frame=quat_frame)
     avatar = AshAvatar(replace(small(named("official")), model=model, template=TemplateConfig()), capture)
-    conditions = avatar.module.conditions(Pose(capture.motion, 3))
+    conditions = avatar.module.frame_inputs(Pose(capture.motion, 3))
     target = released_gaussians(model, avatar.analytic, conditions)
     axis = unitquat_to_rotmat(target[:, 6:10])[:, :, 0]
     if quat_frame == "canonical":
@@ -202,12 +202,14 @@ def test_bfloat16_is_a_matter_of_the_decoders_alone(capture):
     avatar = AshAvatar(replace(config, model=replace(config.model, width=16)), capture)
     for net in avatar.module.decoders.nets:
         torch.nn.init.normal_(net.head.weight, std=0.1)
-    conditions = avatar._conditions_of(1)
+    conditions = avatar._inputs_of(1)
     exact = avatar._decode([conditions])[0].detach()
     avatar.config = replace(avatar.config, training=replace(avatar.config.training, precision="bfloat16"))
     rough = avatar._decode([conditions])[0].detach()
     assert rough.dtype == torch.float32
-    assert 0 < float((rough - exact).abs().max()) < 0.05 * float((exact - avatar.module.base.detach()).abs().max())
+    assert (
+        0 < float((rough - exact).abs().max()) < 0.05 * float((exact - avatar.module.base_texels.detach()).abs().max())
+    )
 
 
 def test_noise_in_the_textures_is_for_learning_alone_and_another_one_in_every_step(capture):
@@ -240,4 +242,8 @@ def test_noise_is_smooth_standard_and_a_function_of_its_seed():
 def test_noise_without_standardised_textures_is_refused(model):
     base = named("ci")
     with pytest.raises(InputError, match="texture_noise"):
-        replace(base, model=replace(base.model, fade=0.0, **model), training=replace(base.training, texture_noise=0.5))
+        replace(
+            base,
+            model=replace(base.model, novelty_scale=0.0, **model),
+            training=replace(base.training, texture_noise=0.5),
+        )

@@ -10,17 +10,17 @@ from helpers.devices import META, step_of, tiny, without_numbers
 
 from ash.capture.dataset import Capture
 from ash.devices import CPU
-from ash.presets import Recipe
+from ash.presets import MethodFactory
+from baselines.ablations import wo_disp, wo_mot, wo_offset
 from baselines.ddc import ddc
 from baselines.mlp import mlp, mlp_base
 from baselines.oracle_texture import oracle_texture
 from baselines.static import static
-from baselines.switches import wo_disp, wo_mot, wo_offset
 
-RECIPES: dict[str, Recipe[Any]] = {
+RECIPES: dict[str, MethodFactory[Any]] = {
     "ddc": ddc,
-    "ddc_moves": ddc.but({"refine": "motion"}),
-    "ddc_still": ddc.but({"refine": "none"}),
+    "ddc_moves": ddc.with_overrides({"refine": "motion"}),
+    "ddc_still": ddc.with_overrides({"refine": "none"}),
     "oracle_texture": oracle_texture,
     "static": static,
     "wo_mot": wo_mot,

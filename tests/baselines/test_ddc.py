@@ -12,7 +12,7 @@ import ash.mesh.drawing
 from ash.capture.dataset import Camera, Pose, image_path
 from ash.capture.formats import load_capture
 from ash.config import TemplateConfig
-from ash.fields import replaced
+from ash.fields import apply_overrides
 from ash.files import InputError, write_image
 from ash.mesh.drawing import SUPERSAMPLING, sample_texture
 from ash.presets import named
@@ -113,22 +113,22 @@ def test_the_network_is_sized_as_the_presets_decoders_and_fills_its_texture():
     with pytest.raises(InputError, match="texture: expected a multiple of 64, got 500"):
         replace(config, texture=500)
     with pytest.raises(InputError, match=r"unknown key 'width', did you mean model\.width"):
-        replaced(config, {"width": 8}, of="ddc")
+        apply_overrides(config, {"width": 8}, of="ddc")
     with pytest.raises(InputError, match=r"unknown key 'model\.sh_degree'"):  # A mesh has none.
-        replaced(config, {"model.sh_degree": 1}, of="ddc")
+        apply_overrides(config, {"model.sh_degree": 1}, of="ddc")
 
 
 def test_far_from_training_a_static_texture_is_what_counts(capture, tmp_path):
     mesh = avatar(capture, steps=40)
     mesh.fit(capture, folder=tmp_path)
-    module, seen = mesh.module, mesh._conditions[1]
+    module, seen = mesh.module, mesh._inputs[1]
     with torch.no_grad():
         near = module.dynamic_texture(seen)
         torch.testing.assert_close(near, module.texture + module.correction(seen))
         assert not torch.equal(module.static_texture, module.texture), "each has learned for itself since the warm-up"
-        for trust in (0.0, 0.25):
-            expected = (1 - trust) * module.static_texture + trust * near
-            torch.testing.assert_close(module.dynamic_texture(replace(seen, trust=trust)), expected)
+        for decoder_weight in (0.0, 0.25):
+            expected = (1 - decoder_weight) * module.static_texture + decoder_weight * near
+            torch.testing.assert_close(module.dynamic_texture(replace(seen, decoder_weight=decoder_weight)), expected)
 
 
 def test_static_views_are_drawn_into_what_the_training_views_saw(capture, monkeypatch):

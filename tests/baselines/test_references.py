@@ -16,10 +16,10 @@ from ash.capture.dataset import Camera, Capture, Motion, Pose, image_path
 from ash.capture.formats import load_capture, write_template
 from ash.files import InputError, write_image
 from ash.protocol import Avatar, StageClock
+from baselines.ablations import smpl
 from baselines.nearest import central_frame, move_image, nearest, pose_distances, see_root
 from baselines.oracle_texture import oracle_texture
 from baselines.static import of_one_frame, static
-from baselines.switches import smpl
 from benchmarks.cell.methods import WRONG_BY_MM, find_method
 
 

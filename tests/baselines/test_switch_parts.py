@@ -21,7 +21,7 @@ from helpers.parts import differing, taken_apart
 from ash import presets
 from ash.capture.dataset import Capture, Pose
 from ash.config import AshConfig, AtlasConfig, ModelConfig, TemplateConfig, TrainingConfig
-from ash.fields import changed, replaced
+from ash.fields import apply_overrides, changed
 from ash.files import write_arrays
 from ash.template.template import skinned_template
 from baselines.ddc import DdcConfig, ddc
@@ -60,7 +60,7 @@ def apart(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Apart:
 
     @cache
     def made(method: str, changes: tuple[tuple[str, Any], ...]) -> Parts:
-        config = replaced(METHODS[method].config("ci"), changes, of=method)
+        config = apply_overrides(METHODS[method].config("ci"), changes, of=method)
         avatar = METHODS[method](capture, seed=config.seed, preset="ci", config=config)
         return taken_apart(avatar, capture, tmp_path_factory.mktemp("apart"))
 
@@ -83,11 +83,18 @@ CHANGED_BY_SWITCH = {
     "wo_phi": DECODERS,
     "sh_3": DECODERS | {"spread"},
     "wide_dilation": {"drawing"},
-    "wo_base": {"start", "rates", "trust", "warm_up", "turns"},  # Nothing static could take over far from training.
+    "wo_base": {
+        "start",
+        "rates",
+        "decoder_weight",
+        "warm_up",
+        "turns",
+    },  # Nothing static could take over far from training.
     "blended_anchor": {"places"},
     "wo_light": {"light", "rates"},
-    "wo_light_and_motion": DECODERS | {"light", "rates", "textures", "trust", "warm_up"},  # No motion: no decoders.
-    "wo_standardise": {"textures", "trust", "rates"},  # Novelty is told in units of the standardised textures.
+    "wo_light_and_motion": DECODERS
+    | {"light", "rates", "textures", "decoder_weight", "warm_up"},  # No motion: no decoders.
+    "wo_standardise": {"textures", "decoder_weight", "rates"},  # Novelty is told in units of the standardised textures.
     "wo_bound": {"textures"},
     "wo_heading": {"textures"},
     "two_trunks": DECODERS,
@@ -108,9 +115,15 @@ def test_a_switch_changes_what_it_names_and_nothing_else(
 
 
 CAMERAS = {"batches", "start"}  # The first colours are means over the cameras.
-NO_MOTION = DECODERS | {"textures", "trust", "rates", "warm_up", "turns"}  # no decoders, nothing that they would see
+NO_MOTION = DECODERS | {
+    "textures",
+    "decoder_weight",
+    "rates",
+    "warm_up",
+    "turns",
+}  # no decoders, nothing that they would see
 LATTICE = {"places", "start", "textures", "decoding", "posing"}  # other texels: all that is one per texel
-UNLEARNED = {"start", "trust", "rates", "warm_up", "turns"}  # no learned texels
+UNLEARNED = {"start", "decoder_weight", "rates", "warm_up", "turns"}  # no learned texels
 CHANGED_BY_ROW = {
     "wo_disp": {"counting"},
     "wo_motion_offset": {"counting"},
@@ -126,7 +139,7 @@ CHANGED_BY_ROW = {
     "cams_30": CAMERAS,
     "cams_60": CAMERAS,
     "ash_truth": SURFACE | {"deformation"},
-    "ddc_wo_base": {"start", "trust", "rates", "turns", "warm_up"},
+    "ddc_wo_base": {"start", "decoder_weight", "rates", "turns", "warm_up"},
     "ddc_truth": (SURFACE - {"places"}) | {"deformation", "refinement", "pulls", "rates"},  # Exact: it is not moved.
 }
 
@@ -149,7 +162,7 @@ class Case:
     on: Changes = field(default_factory=dict)
 
 
-UNFADING = {"model.fade": 0.0}
+ALWAYS_DECODED = {"model.novelty_scale": 0.0}
 FITTED = {"training.warmup": "fitted"}
 PLANTED = {
     "template.kind": "exact",
@@ -176,9 +189,9 @@ OF_BOTH = {
     "model.width": Case(8, DECODERS),
     "model.levels": Case(1, DECODERS),
     "model.shuffle": Case(2, DECODERS | {"textures"}),
-    "model.standardise": Case(False, {"textures"}, UNFADING),
-    "model.fade": Case(0.35, {"trust"}),
-    "model.base": Case(False, {"start", "rates"}, {**UNFADING, "training.warmup": "none"}),
+    "model.standardise": Case(False, {"textures"}, ALWAYS_DECODED),
+    "model.novelty_scale": Case(0.35, {"decoder_weight"}),
+    "model.base": Case(False, {"start", "rates"}, {**ALWAYS_DECODED, "training.warmup": "none"}),
     "training.steps": Case(9, {"course"}),
     "training.views_per_step": Case(1, {"batches"}),
     "training.warmup_steps": Case(5, {"warm_up", "turns"}),

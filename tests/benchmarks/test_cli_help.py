@@ -55,7 +55,6 @@ for command in COMMANDS:
         ("run --seeds 0", "--seeds: expected at least 1, got 0"),
         ("run ci --subjects 101", "subjects: expected 1 to 100, got 101: those from 100 on are for validation"),
         ("synth loose --subject -1", "--subject: expected at least 0, got -1"),
-        ("sheets --subjects 2 --scene tight", "--subjects shows people in both outfits: expected it or --scene"),
         ("train ash x --seed 18446744073709551616", "--seed: expected at most 2147483647, got 18446744073709551616"),
         ("report --out x", "expected"),
         ("run --workers x", "--workers: expected a whole number, got 'x'"),

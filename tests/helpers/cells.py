@@ -1,5 +1,8 @@
 """Results of cells that nobody ran."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
 from benchmarks.cell.cells import CellConfig, CellResult, Summary
 
 SPLITS = ("novel_view", "novel_pose")
@@ -29,3 +32,19 @@ def cell(method: str, psnr: float, *, seed: int = 0, axis: str = "", severity: f
     rows += [Summary(split=split, region="", metric="template_mm", value=5.0) for split in SPLITS]
     known = config(method, seed, axis=axis, severity=severity)
     return CellResult(config=known, status="done", summary=tuple(rows))
+
+
+def people(
+    levels: Mapping[str, Sequence[float]], seeds: Sequence[float] = (0.0,), *, scene: str = "loose"
+) -> list[CellResult]:
+    """A cell per method, subject and seed, of 12 ms per frame; `seeds` are what each adds to the subject's level."""
+    costs = (("speed", "frame_ms", 12.0), ("memory", "params", 2e6))
+    rows = tuple(Summary(split=split, region="", metric=metric, value=value) for split, metric, value in costs)
+    found = []
+    for method, own in levels.items():
+        for subject, level in enumerate(own):
+            for seed, luck in enumerate(seeds):
+                result = cell(method, level + luck, seed=seed)
+                place = replace(result.config, scene=scene, subject=subject)
+                found.append(replace(result, config=place, summary=(*result.summary, *rows)))
+    return found

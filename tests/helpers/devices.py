@@ -71,7 +71,7 @@ def without_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ash.model, "splat", _shapes_of_images)
     monkeypatch.setattr(ash.mesh.drawing, "_view_of", _some_samples)
     monkeypatch.setattr(ash.mesh.drawing, "_outlines", _no_outlines)
-    monkeypatch.setattr(ash.textures.TextureDrawer, "trust", lambda drawer, textures: 0.5)
+    monkeypatch.setattr(ash.textures.TextureDrawer, "decoder_weight", lambda drawer, textures: 0.5)
     monkeypatch.setattr(ash.training.adam, "_all_finite", lambda gradients: True)
     equal = torch.equal
     monkeypatch.setattr(torch, "equal", lambda a, b: a.device == b.device == META or equal(a, b))

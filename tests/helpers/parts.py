@@ -26,11 +26,11 @@ from ash.mesh.drawing import MeshView
 from ash.rotations import RigidTransforms
 from ash.template.template import PosedTemplate, skinned_template
 from ash.template_learning.refining import MotionRefinement, RefinedDeformation
-from ash.textures import Conditions, SeenFrame
+from ash.textures import DecoderInputs, FrameInputs
 from ash.training import loop
 from ash.training.batches import Batch
 from ash.training.loop import view_loss
-from baselines.ddc import DdcAvatar, MeshConditions
+from baselines.ddc import DdcAvatar, MeshInputs
 
 TEXELS, CHANNELS, PIXELS = 40, 14, 32
 
@@ -67,7 +67,7 @@ class Subject:
     @property
     def static(self) -> torch.nn.Parameter:
         """What the decoders add to."""
-        made: torch.nn.Parameter = self.avatar.module.texture if self.is_mesh else self.avatar.module.base
+        made: torch.nn.Parameter = self.avatar.module.texture if self.is_mesh else self.avatar.module.base_texels
         return made
 
     @property
@@ -79,7 +79,7 @@ class Subject:
     @torch.no_grad()
     def seen(self, frame: int) -> Any:
         """The conditions of a frame."""
-        return self.avatar._conditions[frame] if self.is_mesh else self.avatar._conditions_of(frame)
+        return self.avatar._inputs[frame] if self.is_mesh else self.avatar._inputs_of(frame)
 
     @cached_property
     def rehearsal(self) -> Rehearsal:
@@ -99,7 +99,7 @@ class Subject:
         """What decoders see in a step, and whether in bfloat16 where tiles are there; None: they are left out."""
         learned: list[tuple[Tensor, bool]] = []
 
-        def decode(frames: Sequence[SeenFrame]) -> list[Tensor]:
+        def decode(frames: Sequence[DecoderInputs]) -> list[Tensor]:
             learned.append((frames[0].textures, torch.is_autocast_enabled("cpu")))
             return [self.static] * len(frames)
 
@@ -120,14 +120,14 @@ def fixed_frame(s: Subject) -> Any:
     model = s.avatar.config.model
     seen: dict[str, Any] = {
         "textures": numbers(6 * model.window, model.decoded_texels, model.decoded_texels, seed=1),
-        "trust": 1.0,
+        "decoder_weight": 1.0,
         "root_translation": numbers(3, seed=2),
     }
     if s.is_mesh:
-        return MeshConditions(**seen, window=[])
+        return MeshInputs(**seen, window=[])
     texels = len(s.avatar.lattice.texels)
     unit = torch.nn.functional.normalize(numbers(texels, 4), dim=1)
-    return Conditions(
+    return FrameInputs(
         **seen,
         motion=s.seen(0).motion,
         canonical=0.1 * numbers(texels, 3, seed=3),
@@ -200,9 +200,9 @@ def textures(s: Subject) -> str:
     return fingerprint(s.seen(2).textures, unseen)
 
 
-def trust(s: Subject) -> str:
+def decoder_weight(s: Subject) -> str:
     drawer = s.avatar.module.textures
-    return fingerprint(None if drawer is None else drawer.fade)
+    return fingerprint(None if drawer is None else drawer.novelty_scale)
 
 
 def weights(s: Subject) -> str:
@@ -222,7 +222,7 @@ def decoding(s: Subject) -> str:
 
 def counting(s: Subject) -> str:
     """What of the decoders' output counts."""
-    return fingerprint(s.avatar.module.corrections(numbers(TEXELS, CHANNELS))[:, :CHANNELS])
+    return fingerprint(s.avatar.module.mask_offsets(numbers(TEXELS, CHANNELS))[:, :CHANNELS])
 
 
 def start(s: Subject) -> str:
@@ -329,13 +329,14 @@ def files(s: Subject) -> str:
 
 
 def average(s: Subject) -> str:
-    run = loop._Run(s.avatar, s.avatar.config.training, s.rehearsal.images, s.folder)
+    run = loop.Trainer(s.avatar, s.avatar.config.training, s.rehearsal.images, s.folder)
     return fingerprint(bool(run.average))
 
 
 # Those that give weights away come first, and those that set them last.
 SHARED = (
-    weights, template, skinning, deformation, textures, trust, start, light, drawing, batches, loss, noise, precision,
+    weights, template, skinning, deformation, textures, decoder_weight, start, light, drawing, batches, loss, noise,
+    precision,
     warm_up, turns, rates, course, files, average, decoding, refinement,
 )  # fmt: skip
 PARTS = {

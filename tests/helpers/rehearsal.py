@@ -62,7 +62,7 @@ class Rehearsal:
     def end_warmup(self) -> None:
         self.told.append("warm-up ends")
 
-    def corrections(self, frame: int) -> None:
+    def decoder_residual(self, frame: int) -> None:
         return None
 
     def clock(self) -> float:

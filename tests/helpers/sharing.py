@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ash.files import only_one
+from ash.files import file_lock
 
 Shared = Callable[[str, Callable[[Path], object]], Path]
 
@@ -19,7 +19,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Shared:
 
     def filled(name: str, make: Callable[[Path], object]) -> Path:
         folder = base / name
-        with only_one(folder):
+        with file_lock(folder):
             if not folder.with_suffix(".whole").exists():
                 make(folder)
                 folder.with_suffix(".whole").touch()

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from helpers.scenes import small_scene
 
-import synth.code
+import synth.source_hash
 from ash.capture.dataset import Capture, image_path, pixels_path, surface_path
 from ash.capture.formats import load_capture, read_template_truth
 from ash.capture.manifest import read_manifest, verify_capture
@@ -215,7 +215,7 @@ def test_what_other_code_made_is_made_again_and_the_reason_said(
 
 def test_the_code_that_counts_is_all_that_making_a_capture_imports():
     """No module that `synth.capture` imports, however far down, is left out of the hash."""
-    root = Path(synth.code.__file__).parents[1]
+    root = Path(synth.source_hash.__file__).parents[1]
     found, waiting = set(), {root / "synth" / "capture.py"}
     while waiting:
         path = waiting.pop()
@@ -225,7 +225,7 @@ def test_the_code_that_counts_is_all_that_making_a_capture_imports():
                 folder = root.joinpath(*node.module.split("."))
                 named = {folder.with_suffix(".py"), *(folder / f"{alias.name}.py" for alias in node.names)}
                 waiting |= {part for part in named if part.is_file()} - found
-    assert found <= set(synth.code.maker_sources())
+    assert found <= set(synth.source_hash.maker_sources())
     assert not any(path.is_relative_to(root / "synth" / "readers") for path in found)
 
 

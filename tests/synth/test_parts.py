@@ -11,10 +11,10 @@ from ash.capture.formats import load_capture, read_scan
 from ash.capture.manifest import verify_capture
 from ash.files import InputError, read_json
 from synth.capture import is_finished, make_capture
-from synth.readers.export import export
-from synth.readers.perturb import Perturbation, perturb
-from synth.readers.retargeting import scene_of
+from synth.export.formats import export
+from synth.perturbation.perturb import Perturbation, perturb
 from synth.scene import Clip, Rig, Scene
+from synth.truth.retargeting import scene_of
 
 
 def rotating_scene() -> Scene:

@@ -18,9 +18,9 @@ from synth.cloth.surface import Folds, true_surface
 from synth.motion.clips import make_motion
 from synth.person.body import PARTS
 from synth.person.mannequin import mannequin
-from synth.readers import truth
 from synth.scene import Clip, Outfit, Rig, Scene
 from synth.skeleton import SIDES
+from synth.truth import pixels as truth
 
 BODY = mannequin(skirt=True)
 

@@ -20,8 +20,8 @@ for (const button of document.querySelectorAll("thead button")) {
     for (const other of head.parentNode.children) other.removeAttribute("aria-sort");
     head.setAttribute("aria-sort", up ? "ascending" : "descending");
     const value = (row) => {
-      const cell = row.cells[column];
-      return cell.dataset.value ? Number(cell.dataset.value) : column === 0 ? cell.textContent : null;
+      const text = row.cells[column].textContent, number = /^[+-]?[\d.]+([kM]?)/.exec(text);
+      return column === 0 ? text : number ? parseFloat(text) * { "": 1, k: 1e3, M: 1e6 }[number[1]] : null;
     };
     const rows = [...body.rows].sort((a, b) => {
       const x = value(a), y = value(b);

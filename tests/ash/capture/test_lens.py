@@ -15,10 +15,10 @@ from ash.files import InputError
 from synth.camera.rig import make_cameras, rig_from_file
 from synth.camera.sensing import make_sensor, window_of
 from synth.capture import make_capture
-from synth.readers import truth
-from synth.readers.export import export
-from synth.readers.undistorting import undistort as undistort_capture
+from synth.export.formats import export
+from synth.export.undistorted import undistort as undistort_capture
 from synth.scene import Rig
+from synth.truth import pixels as truth
 
 LENSES = {
     "barrel": (-0.28, 0.07, 0.0, 0.0),
@@ -119,12 +119,12 @@ def bent(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_distorted_capture_is_exact_and_methods_are_told(bent: Path, tmp_path: Path):
     capture = load_capture(bent)
     assert verify_capture(bent) == []
-    with pytest.raises(InputError, match="ash-bench undistort"):
+    with pytest.raises(InputError, match="ash-bench export --format undistorted"):
         capture.training_only()
     _require_exact_truth(bent)
     for camera_ in capture.cameras.values():
         assert camera_.K[1, 1] == pytest.approx(1.2 * camera_.K[0, 0])
-    with pytest.raises(InputError, match="undistort"):
+    with pytest.raises(InputError, match="undistorted"):
         export(capture, tmp_path / "official", form="ash")
     text = (export(capture, tmp_path / "colmap", form="colmap") / "sparse/0/cameras.txt").read_text()
     assert " OPENCV 96 96 " in text and text.split()[-1] == "0.0"

@@ -10,10 +10,10 @@ from helpers.figures import tube_mesh, tube_motion, tube_skeleton
 from ash.capture.dataset import Motion, Pose
 from ash.gaussians import texels
 from ash.gaussians.gaussians import Gaussians, raw_channels
-from ash.gaussians.texels import Placed, place, place_naive, pose, pose_naive
+from ash.gaussians.texels import Placed, pose, pose_naive, sample_surface, sample_surface_naive
 from ash.rotations import RigidTransforms
 from ash.template.template import PosedTemplate, RestDeformation, Template
-from ash.textures import Conditions, TexelLattice, build_lattice
+from ash.textures import FrameInputs, TexelLattice, build_lattice
 
 pytestmark = pytest.mark.usefixtures("instructions")
 
@@ -24,10 +24,10 @@ def posed_tube(motion: Motion | None = None) -> PosedTemplate:
     return Template(tube_mesh(), tube_skeleton(), RestDeformation(tube_mesh())).pose(Pose(motion or tube_motion(), 4))
 
 
-def conditions(lattice: TexelLattice = LATTICE) -> Conditions:
-    canonical, normals, transforms = place_naive(lattice, posed_tube())
-    return Conditions(
-        trust=1.0,
+def frame_inputs(lattice: TexelLattice = LATTICE) -> FrameInputs:
+    canonical, normals, transforms = sample_surface_naive(lattice, posed_tube())
+    return FrameInputs(
+        decoder_weight=1.0,
         textures=torch.zeros(0, 1, 1),
         motion=torch.zeros(2, 9),
         root_translation=torch.zeros(3),
@@ -46,9 +46,9 @@ def raw_and_light(sh_degree: int, count: int = len(LATTICE.texels)) -> tuple[tor
 
 
 def test_texels_are_placed_as_defined():
-    expected_canonical, expected_normals, expected = place_naive(LATTICE, posed_tube())
+    expected_canonical, expected_normals, expected = sample_surface_naive(LATTICE, posed_tube())
     for threads in (1, 2):
-        canonical, normals, transforms = place(LATTICE, posed_tube(), threads=threads)
+        canonical, normals, transforms = sample_surface(LATTICE, posed_tube(), threads=threads)
         torch.testing.assert_close(canonical, expected_canonical, atol=1e-6, rtol=0)
         torch.testing.assert_close(normals, expected_normals, atol=2e-6, rtol=0)
         torch.testing.assert_close(transforms.quats, expected.quats, atol=1e-6, rtol=0)
@@ -74,9 +74,9 @@ def farthest_from_the_triangles(posed: PosedTemplate, placed: Placed) -> float:
 def test_anchored_at_the_surface_texels_lie_on_the_posed_triangles(angle, monkeypatch):
     """Also where a joint is bent far; with blended transforms they do not."""
     posed = posed_tube(bent(angle))
-    naive = {anchor: place_naive(LATTICE, posed, anchor) for anchor in ("surface", "blended")}
-    monkeypatch.setattr(texels, "place_naive", pytest.fail)
-    native = {anchor: place(LATTICE, posed, anchor) for anchor in ("surface", "blended")}
+    naive = {anchor: sample_surface_naive(LATTICE, posed, anchor) for anchor in ("surface", "blended")}
+    monkeypatch.setattr(texels, "sample_surface_naive", pytest.fail)
+    native = {anchor: sample_surface(LATTICE, posed, anchor) for anchor in ("surface", "blended")}
     for placed in (naive, native):
         assert farthest_from_the_triangles(posed, placed["surface"]) < 1e-5
         assert farthest_from_the_triangles(posed, placed["blended"]) > 1e-4
@@ -88,11 +88,11 @@ def test_opposite_quaternions_of_neighbours_are_the_same_rotation():
     posed = posed_tube()
     signs = torch.where(torch.arange(len(posed.vertices)) % 3 == 0, -1.0, 1.0)[:, None]
     flipped = RigidTransforms(quats=signs * posed.transforms.quats, translations=posed.transforms.translations)
-    _, _, transforms = place(LATTICE, replace(posed, transforms=flipped))
-    _, _, defined = place_naive(LATTICE, replace(posed, transforms=flipped))
+    _, _, transforms = sample_surface(LATTICE, replace(posed, transforms=flipped))
+    _, _, defined = sample_surface_naive(LATTICE, replace(posed, transforms=flipped))
     torch.testing.assert_close(transforms.quats, defined.quats, atol=1e-6, rtol=0)
     points = torch.randn(len(LATTICE.texels), 3, generator=torch.Generator().manual_seed(1))
-    _, _, unflipped = place(LATTICE, posed)
+    _, _, unflipped = sample_surface(LATTICE, posed)
     torch.testing.assert_close(transforms.apply(points), unflipped.apply(points), atol=1e-5, rtol=0)
 
 
@@ -105,7 +105,7 @@ def test_gaussians_are_posed_as_defined(sh_degree, lit, changes):
     results = []
     for function, dtype in ((pose, torch.float32), (pose_naive, torch.float32), (pose_naive, torch.float64)):
         leaves = [raw.to(dtype, copy=True).requires_grad_(), light.to(dtype, copy=True).requires_grad_()]
-        here = conditions()
+        here = frame_inputs()
         if dtype == torch.float64:
             turned = RigidTransforms(
                 quats=here.transforms.quats.double(), translations=here.transforms.translations.double()
@@ -129,7 +129,7 @@ def test_any_number_of_threads_gives_the_same_bits():
     gradients = []
     for threads in (1, 3):
         raw, leaf = raw_and_light(0)[0].requires_grad_(), light.clone().requires_grad_()
-        posed = pose(raw, conditions(), config, leaf, threads=threads)
+        posed = pose(raw, frame_inputs(), config, leaf, threads=threads)
         (posed.means.sum() + posed.sh.square().sum() + posed.quats.sum()).backward()
         gradients.append((posed.means.detach(), raw.grad, leaf.grad))
     assert all(torch.equal(one, other) for one, other in zip(*gradients, strict=True))
@@ -137,7 +137,7 @@ def test_any_number_of_threads_gives_the_same_bits():
 
 def test_gradients_of_the_surface_go_through_the_definition():
     raw, _ = raw_and_light(0)
-    here = conditions()
+    here = frame_inputs()
     canonical = here.canonical.clone().requires_grad_()
     pose(raw, replace(here, canonical=canonical), tube_model_config(), None).means.sum().backward()
     assert canonical.grad.abs().min() > 0
@@ -148,6 +148,6 @@ def test_what_is_not_finite_stays_so(column):
     """The splatter must see it, and the training with it."""
     raw, light = raw_and_light(0)
     raw[5, column] = float("nan")
-    posed = pose(raw, conditions(), tube_model_config(), light)
+    posed = pose(raw, frame_inputs(), tube_model_config(), light)
     finite = [bool(torch.isfinite(getattr(posed, field.name)).all()) for field in fields(Gaussians)]
     assert finite.count(False) == 1

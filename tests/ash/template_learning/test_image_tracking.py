@@ -20,7 +20,7 @@ from ash.template_learning import image_tracking
 from ash.template_learning.image_tracking import track_images
 from ash.template_learning.nearest import NearestPoint, nearest_naive
 from ash.template_learning.observing import _least_around, blurred, observe, sample
-from ash.training.images import Cutout
+from ash.training.images import ImageCrop
 
 SIZE, FRAMES = 96, 6
 
@@ -140,7 +140,7 @@ def test_a_view_is_cut_out_around_the_subject_with_its_outline() -> None:
     rgba = np.zeros((64, 64, 4), np.uint8)
     rgba[..., 0], rgba[..., 3] = 200, np.round(255 * alpha)
     camera = ring_cameras(1, 64)[0]
-    cutout = Cutout(pixels=torch.from_numpy(rgba[23:45, 19:41].copy()), left=19, top=23)
+    cutout = ImageCrop(pixels=torch.from_numpy(rgba[23:45, 19:41].copy()), left=19, top=23)
     view = observe(cutout, camera, blur=0.5)
     shift = camera.K[:2, 2] - view.K[:2, 2].numpy()
     outline = view.outline.numpy() + shift

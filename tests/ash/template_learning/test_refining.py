@@ -69,7 +69,7 @@ def test_a_refinement_that_follows_the_motion_starts_at_nothing_and_fades_with_t
     window = blank.window(Pose(capture.motion, 1))
     torch.testing.assert_close(blank(window), torch.zeros(len(capture.template.vertices), 3), atol=1e-6, rtol=0)
     refinement = moving(capture)
-    whole, half, none = (refinement(window, trust).detach() for trust in (1.0, 0.5, 0.0))
+    whole, half, none = (refinement(window, decoder_weight).detach() for decoder_weight in (1.0, 0.5, 0.0))
     assert float(whole.norm(dim=1).max()) > 1e-4
     torch.testing.assert_close(half, 0.5 * whole)
     assert not none.any()
@@ -82,12 +82,12 @@ def test_a_refined_template_is_the_old_one_moved_and_all_that_is_drawn_from_it_f
     pose = Pose(capture.motion, 2)
     torch.testing.assert_close(refined.pose(pose).vertices, old.pose(pose).vertices, atol=1e-6, rtol=0)
     refinement.load_state_dict(moving(capture).state_dict())
-    refined.forget()
+    refined.clear_cache()
     shift = refinement(refinement.window(pose)).detach()
     after, before = refined.pose(pose), old.pose(pose)
     torch.testing.assert_close(after.canonical, before.canonical + shift)
     assert not torch.allclose(after.normals, before.normals, atol=1e-4)
-    learning = refined.pose_anew(pose)
+    learning = refined.pose_uncached(pose)
     (learning.vertices.square().sum() + learning.normals[:, 0].sum()).backward()
     parameters = [*refinement.nets.networks(), refinement.shared.rough]
     assert all(p.grad is not None and p.grad.any() for p in parameters if p.requires_grad)
@@ -95,10 +95,10 @@ def test_a_refined_template_is_the_old_one_moved_and_all_that_is_drawn_from_it_f
 
 def test_splats_of_a_refined_template_see_textures_redrawn_from_it(capture):
     avatar = AshAvatar(replace(named("ci"), model=tube_model_config(refine=True)), capture)
-    before = avatar._conditions_of(1)
+    before = avatar._inputs_of(1)
     assert before.canonical.requires_grad and before.normals.requires_grad and not before.textures.requires_grad
     avatar.module.refinement.load_state_dict(moving_like(avatar, capture))
-    after = avatar._conditions_of(1)
+    after = avatar._inputs_of(1)
     assert not torch.allclose(after.textures, before.textures, atol=1e-4)
     assert not torch.allclose(after.canonical, before.canonical, atol=1e-5)
 
@@ -136,7 +136,7 @@ def test_without_refine_ddc_draws_the_template_it_was_given(capture):
     still = ddc(capture, refine="none")
     assert still.module.refinement is None
     posed = still.template.pose(Pose(capture.motion, 2))
-    assert still.module.refined(posed, still.module.conditions(Pose(capture.motion, 2))) is posed
+    assert still.module.refined(posed, still.module.frame_inputs(Pose(capture.motion, 2))) is posed
     np.testing.assert_array_equal(still.template_vertices(Pose(capture.motion, 2)), posed.vertices.numpy())
 
 

@@ -14,13 +14,13 @@ from helpers.captures import tiny_preset, write_tube_capture
 import ash.capture.dataset
 import ash.training.loop
 from ash.avatar import AshAvatar
+from ash.bounded_cache import size_of
 from ash.capture.dataset import Capture, image_path
 from ash.capture.formats import load_capture
 from ash.devices import CPU
 from ash.files import InputError
-from ash.kept import size_of
 from ash.training.batches import composite_naive, draw_ahead, draw_batch, sampled
-from ash.training.images import STEPS_AHEAD, ReadAhead, load_training_images, read_cutout
+from ash.training.images import STEPS_AHEAD, ReadAhead, load_training_images, read_crop
 
 STEPS = 24
 
@@ -49,14 +49,14 @@ TRAINING = replace(tiny_preset(steps=4, warmup_steps=0).training, views_per_step
 
 def room_for(count: int, capture: Capture) -> int:
     """Bytes of the first so many cutouts."""
-    return sum(size_of(read_cutout(capture, *view)) for view in capture.splits["train"].views[:count])
+    return sum(size_of(read_crop(capture, *view)) for view in capture.splits["train"].views[:count])
 
 
 def test_a_window_of_a_cutout_is_that_of_the_image(capture: Capture) -> None:
     camera = capture.cameras["cam1"]
     image = capture.image("cam1", 0)
     image[image[..., 3] == 0] = 0
-    cutout = read_cutout(capture, "cam1", 0)
+    cutout = read_crop(capture, "cam1", 0)
     assert size_of(cutout) < image.nbytes
     padded = np.zeros((camera.height + 40, camera.width + 40, 4), np.uint8)
     padded[20:-20, 20:-20] = image
@@ -147,4 +147,4 @@ def test_on_the_cpu_a_step_reads_its_own(capture: Capture) -> None:
 def test_an_image_that_shows_nobody_is_refused(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Capture, "image", lambda self, camera, frame: np.zeros((4, 4, 4), np.uint8))
     with pytest.raises(InputError, match="nobody is seen by camera cam1 in frame 2"):
-        read_cutout(capture, "cam1", 2)
+        read_crop(capture, "cam1", 2)

@@ -21,7 +21,7 @@ from ash.files import InputError
 from ash.protocol import StageClock
 from ash.training import loop, stopping
 from ash.training.adam import Adam
-from ash.training.batches import composite, composite_naive, cut_batch, draw_batch
+from ash.training.batches import composite, composite_naive, draw_batch, make_batch
 from ash.training.images import load_training_images
 from ash.training.loop import Diverged, Interrupted
 
@@ -95,7 +95,7 @@ def test_a_run_stopped_at_ten_random_steps_ends_with_the_same_bits(frames, captu
         assert torch.equal(weights(again)[name], value), name
     once_more = AshAvatar(settings, capture)
     once_more.fit(capture, folder=tmp_path / "stopped")
-    assert torch.equal(weights(once_more)["base"], weights(undisturbed)["base"])
+    assert torch.equal(weights(once_more)["base_texels"], weights(undisturbed)["base_texels"])
 
 
 def test_a_run_stopped_before_and_in_its_decay_decides_nothing_anew(capture, tmp_path, monkeypatch):
@@ -159,11 +159,11 @@ def test_without_decoders_there_is_nothing_to_carry(capture, tmp_path):
 
 def test_the_static_avatar_learns_in_every_so_many_steps_after_the_warm_up(capture, tmp_path, monkeypatch):
     settings = config(steps=12, warmup_steps=4, static_every=3)
-    avatar = AshAvatar(replace(settings, model=replace(settings.model, standardise=True, fade=0.5)), capture)
+    avatar = AshAvatar(replace(settings, model=replace(settings.model, standardise=True, novelty_scale=0.5)), capture)
     move, learned = Adam.step, []
 
     def step(optimiser):
-        learned.append(avatar.module.static.grad is not None)
+        learned.append(avatar.module.fallback_texels.grad is not None)
         return move(optimiser)
 
     monkeypatch.setattr(Adam, "step", step)
@@ -174,37 +174,41 @@ def test_the_static_avatar_learns_in_every_so_many_steps_after_the_warm_up(captu
 
 
 def test_far_from_training_a_static_avatar_has_its_share_of_the_picture(capture, tmp_path, monkeypatch):
-    """Pictures are mixed by trust, not parameters; of training frames all is decoded."""
+    """Pictures are mixed by decoder_weight, not parameters; of training frames all is decoded."""
     settings = config(steps=60)
-    model = replace(settings.model, standardise=True, fade=0.5)
+    model = replace(settings.model, standardise=True, novelty_scale=0.5)
     avatar = AshAvatar(replace(settings, model=model), capture)
     avatar.fit(capture, folder=tmp_path)
     with torch.no_grad():
-        added = [avatar.corrections(frame) for frame in range(4)]
-        static, camera = avatar.module.static, next(iter(capture.cameras.values()))
+        added = [avatar.decoder_residual(frame) for frame in range(4)]
+        static, camera = avatar.module.fallback_texels, next(iter(capture.cameras.values()))
         for frame in range(4):
             pose = Pose(capture.motion, frame)
-            near = avatar.module.conditions(pose)
-            assert near.trust == 1
+            near = avatar.module.frame_inputs(pose)
+            assert near.decoder_weight == 1
             decoded = avatar.module.decode(near)
-            torch.testing.assert_close(decoded, avatar.module.base + added[frame])
+            torch.testing.assert_close(decoded, avatar.module.base_texels + added[frame])
             sets = [avatar.module.pose(raw, near) for raw in (decoded, static)]
             alone = [avatar.module.draw(gaussians, [camera], None) for gaussians in sets]
             assert not torch.equal(alone[0].rgb, alone[1].rgb)
-            for trust, larger in ((1.0, 0), (0.75, 0), (0.25, 1)):
+            for decoder_weight, larger in ((1.0, 0), (0.75, 0), (0.25, 1)):
                 with monkeypatch.context() as patched:
-                    patched.setattr(avatar.texture_drawer(), "trust", lambda textures, trust=trust: trust)
+                    patched.setattr(
+                        avatar.module.textures,
+                        "decoder_weight",
+                        lambda textures, decoder_weight=decoder_weight: decoder_weight,
+                    )
                     drawn, kept = avatar.module(pose, camera), avatar.gaussians(pose)
                 for name in ("rgb", "alpha", "depth"):
-                    wanted = trust * getattr(alone[0], name) + (1 - trust) * getattr(alone[1], name)
+                    wanted = decoder_weight * getattr(alone[0], name) + (1 - decoder_weight) * getattr(alone[1], name)
                     torch.testing.assert_close(getattr(drawn, name), wanted)
                 assert torch.equal(kept.means, sets[larger].means), "one set alone: that of the larger share"
     assert not torch.equal(added[0], added[2])
-    assert not torch.equal(static, avatar.module.base), "each has learned for itself since the warm-up"
+    assert not torch.equal(static, avatar.module.base_texels), "each has learned for itself since the warm-up"
     avatar.save(tmp_path / "weights.safetensors")
     other = AshAvatar(replace(settings, model=model), capture)
     other.load(tmp_path / "weights.safetensors")
-    assert torch.equal(other.module.static, static)
+    assert torch.equal(other.module.fallback_texels, static)
 
 
 def test_the_average_of_the_weights_is_the_result_and_nothing_else_changes(capture, tmp_path):
@@ -214,18 +218,18 @@ def test_the_average_of_the_weights_is_the_result_and_nothing_else_changes(captu
 
     def draw_and_keep(*arguments):
         if arguments[-2] == len(passed):  # The curve's views are drawn besides.
-            passed.append(last.module.base.detach().clone())
+            passed.append(last.module.base_texels.detach().clone())
         return draw(*arguments)
 
     last.draw_training_views = draw_and_keep
     last.fit(capture, folder=tmp_path / "last")
     averaged.fit(capture, folder=tmp_path / "averaged")
     expected = passed[0]
-    for step, base in enumerate([*passed[1:12], last.module.base.detach()]):
+    for step, base in enumerate([*passed[1:12], last.module.base_texels.detach()]):
         decay = min(0.5, (1 + step) / (10 + step))
         expected = decay * expected + (1 - decay) * base
-    torch.testing.assert_close(averaged.module.base.detach(), expected, atol=1e-5, rtol=1e-5)
-    assert not torch.equal(averaged.module.base, last.module.base)
+    torch.testing.assert_close(averaged.module.base_texels.detach(), expected, atol=1e-5, rtol=1e-5)
+    assert not torch.equal(averaged.module.base_texels, last.module.base_texels)
 
 
 def test_reserved_views_are_never_trained_on(capture):
@@ -254,7 +258,7 @@ def test_equal_seeds_give_equal_bits_and_other_seeds_do_not(capture, tmp_path):
     for run, seed in enumerate((0, 0, 1)):
         avatar = AshAvatar(replace(config(), seed=seed), capture)
         avatar.fit(capture, folder=tmp_path / str(run))
-        results.append(weights(avatar)["base"])
+        results.append(weights(avatar)["base_texels"])
     assert torch.equal(results[0], results[1])
     assert not torch.equal(results[0], results[2])
 
@@ -286,7 +290,7 @@ def poison(avatar: AshAvatar, *, at: set[int], times: int) -> None:
         if step in at and left[0] > 0:
             left[0] -= 1
             with torch.no_grad():
-                avatar.module.base[0, 3] = float("nan")
+                avatar.module.base_texels[0, 3] = float("nan")
         return decode(frames, step)
 
     avatar.decode_together = decode_poisoned
@@ -313,7 +317,7 @@ def test_weights_that_the_last_step_spoiled_are_never_the_result(capture, tmp_pa
         made[0] += 1
         if made[0] in spoiled:
             with torch.no_grad():
-                avatar.module.base[0, 3] = float("nan")
+                avatar.module.base_texels[0, 3] = float("nan")
         return finite
 
     monkeypatch.setattr(Adam, "step", spoil)
@@ -376,7 +380,7 @@ def test_saved_weights_render_the_same_image(capture, tmp_path):
 
 def test_a_crop_draws_what_the_full_image_shows_there(capture):
     images = load_training_images(capture.training_only())
-    batch = cut_batch(images, 1, ["cam1", "cam2"], torch.tensor([0.2, 0.4, 0.6]))
+    batch = make_batch(images, 1, ["cam1", "cam2"], torch.tensor([0.2, 0.4, 0.6]))
     avatar = AshAvatar(config(), capture)
     background = torch.tensor([0.2, 0.4, 0.6])
     cropped = training_views(avatar, 1, batch.cameras, background, 0)

@@ -12,31 +12,31 @@ from ash.training.stopping import (
     FINAL_LEARNING_RATE,
     LEAST_STEPS,
     ReservedScore,
-    TrainingCourse,
-    decided,
+    ScheduleState,
     gain_of_last_third,
-    is_mark,
+    is_eval_step,
     last_step,
     rate_factor,
+    update,
 )
 
 CONFIG = replace(presets.ci().training, steps=20_000, warmup_steps=200, learning_rate=1e-3, ema=0.0)
 
 
-def train(curve, config: TrainingConfig, *, seconds_per_step: float = 0.0) -> tuple[TrainingCourse, list[float]]:
+def train(curve, config: TrainingConfig, *, seconds_per_step: float = 0.0) -> tuple[ScheduleState, list[float]]:
     """What would be decided if the reserved views scored `curve(step)`; and the rates' factors, step by step."""
-    course, step, factors = TrainingCourse(), 0, []
+    course, step, factors = ScheduleState(), 0, []
     while step < last_step(course, config):
         factors.append(rate_factor(course, config, step=step))
         step += 1
-        if is_mark(step):
+        if is_eval_step(step):
             course = replace(course, scores=(*course.scores, ReservedScore(step=step, psnr=float(curve(step)))))
-        course = decided(course, config, step=step, seconds=step * seconds_per_step)
+        course = update(course, config, step=step, seconds=step * seconds_per_step)
     return course, factors
 
 
 def test_marks_come_twice_on_the_way_to_half_as_many_steps_more():
-    marks = [step for step in range(20_000) if is_mark(step)]
+    marks = [step for step in range(20_000) if is_eval_step(step)]
     assert marks[:5] == [64, 78, 96, 118, 144]
     assert 25 < len(marks) < 32
     for before, after in zip(marks, marks[2:], strict=False):
@@ -111,12 +111,12 @@ def test_the_schedule_of_the_release_stays_and_ends_at_the_plateau_itself():
 
 
 def test_a_course_survives_a_checkpoint():
-    course = TrainingCourse(
+    course = ScheduleState(
         scores=(ReservedScore(step=64, psnr=1 / 3), ReservedScore(step=78, psnr=21.0)),
         decay_from=78,
         ended_by="plateau",
     )
-    assert TrainingCourse.from_json(course.to_json()) == course
+    assert ScheduleState.from_json(course.to_json()) == course
 
 
 @pytest.mark.parametrize(

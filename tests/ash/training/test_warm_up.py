@@ -107,7 +107,7 @@ def test_a_fit_is_like_its_frame_and_stays_on_the_template(capture: Capture) -> 
 
     def loss(raw: torch.Tensor) -> float:
         drawn = made.draw_training_views(
-            batch.frame, batch.cameras, batch.background, 0, (raw, made._conditions_of(batch.frame))
+            batch.frame, batch.cameras, batch.background, 0, (raw, made._inputs_of(batch.frame))
         )
         return float(view_loss([drawn], [batch], made.config.training).detach())
 
@@ -125,7 +125,7 @@ def test_decoders_are_regressed_to_the_fits_for_the_steps_of_the_warm_up(capture
         made._fit_frame = lambda images, frame, fits=fits: fits[frame]  # type: ignore[method-assign]
         made._warm_up(load_training_images(capture))
         with torch.no_grad():
-            apart = {frame: made.module.decode(made._conditions_of(frame)) - fit for frame, fit in fits.items()}
+            apart = {frame: made.module.decode(made._inputs_of(frame)) - fit for frame, fit in fits.items()}
         far[steps] = {frame: float(difference.square().mean().sqrt()) for frame, difference in apart.items()}
     assert far[0] == pytest.approx({0: 0.3, 2: 0.5})
     assert all(far[40][frame] < 0.25 * far[0][frame] for frame in fits)

@@ -1,18 +1,19 @@
 """Our rows beside the paper's, and the agreement of the two orders."""
 
 import pytest
-from helpers.cells import cell
+from helpers.cells import cell, config
 
 from benchmarks.analysis import paper
-from benchmarks.analysis.scores import Scores, scores_of
+from benchmarks.analysis.results import RunTables
+from benchmarks.cell.cells import CellResult, Summary
 from benchmarks.cell.methods import offered
 from benchmarks.report.content import Bullets, Table
 from benchmarks.report.sections import beside_the_paper
 from benchmarks.suites.files import find_suite
 
 
-def run(levels: dict[str, float], seeds: int = 3) -> Scores:
-    return scores_of([cell(m, level + 0.1 * seed, seed=seed) for m, level in levels.items() for seed in range(seeds)])
+def run(levels: dict[str, float], seeds: int = 3) -> RunTables:
+    return RunTables([cell(m, level + 0.1 * seed, seed=seed) for m, level in levels.items() for seed in range(seeds)])
 
 
 def test_the_papers_numbers_are_the_papers() -> None:
@@ -23,29 +24,18 @@ def test_the_papers_numbers_are_the_papers() -> None:
 
 def test_the_same_order_agrees_and_the_opposite_does_not() -> None:
     like = {"wo_mot": 20.0, "wo_disp": 21.0, "res_128": 22.0, "res_512": 23.0, "ash": 24.0}
-    (view, _) = next(found for table, found in paper.tables_beside(run(like)) if "components" in table.title)
-    assert (view.tau, view.low, view.high, view.methods) == (1.0, 1.0, 1.0, 5)
-    against = dict(zip(like, reversed(like.values()), strict=True))
-    (view, _) = next(found for table, found in paper.tables_beside(run(against)) if "components" in table.title)
-    assert view.tau == -1.0
-
-
-def test_orders_within_the_spread_of_seeds_leave_a_wide_interval() -> None:
-    close = {"wo_mot": 20.0, "wo_disp": 20.05, "res_128": 20.0, "res_512": 20.02, "ash": 20.04}
-    view = paper.tables_beside(run(close))[0][1][0]
-    assert view.low is not None and view.high is not None and view.high - view.low > 0.5
+    for levels, tau in ((like, 1.0), (dict(zip(like, reversed(like.values()), strict=True)), -1.0)):
+        found = next(taus for table, taus in paper.tables_beside(run(levels)) if "components" in table.title)
+        assert found["novel_view"] == tau
+    assert paper.tables_beside(run({"ash": 24.0})) == ()
 
 
 def test_methods_that_were_not_run_are_not_made_up() -> None:
-    scores = run({"ash": 24.0, "ddc": 22.0}, seeds=1)
-    (section,) = beside_the_paper(scores, "table")
+    (section,) = beside_the_paper(run({"ash": 24.0, "ddc": 22.0}, seeds=1), "table")
     table, told = section.blocks[:2]
     assert isinstance(table, Table) and isinstance(told, Bullets)
-    rows = {row.name: [entry.whole for entry in row.entries] for row in table.rows}
-    assert rows["TAVA"] == ["27.31", "37.55", "26.31", "50.11", *["n/a"] * 7]
-    assert rows["ASH"][4] == "24.00" and rows["ASH"][6] == "n/a"  # no weights for LPIPS
-    assert paper.tables_beside(scores)[0][1][0].low is None
-    assert paper.tables_beside(run({"ash": 24.0})) == ()
+    assert table.frame.loc["TAVA"].tolist() == ["27.31", "37.55", "26.31", "50.11", *["n/a"] * 7]
+    assert table.frame.loc["ASH"].tolist()[4:7:2] == ["24.00", "n/a"], "no weights for LPIPS"
     assert told.items[0] == "Kendall's tau, novel view: +1.00 over 2 methods"
 
 
@@ -58,17 +48,35 @@ def components(levels: dict[str, float]) -> tuple[Table, tuple[str, ...]]:
     return table, told.items
 
 
-def test_the_papers_static_row_is_compared_with_ours_of_as_few_frames() -> None:
+def test_the_papers_static_row_is_compared_with_ours_of_as_few_frames_or_it_is_said() -> None:
     table, told = components({"wo_mot": 30.0, "wo_mot_truncated": 20.0, "ash": 24.0})
-    assert table.rows[0].name == "w/o mot." and table.rows[0].entries[4].text == "20.10"
-    assert [item.rpartition(": ")[2][:5] for item in told] == ["+1.00", "+1.00"], "the order of the row of few frames"
-
-
-def test_where_ours_saw_all_frames_it_is_compared_and_that_is_said() -> None:
+    assert (
+        table.frame.iloc[0, 4].startswith("20.10") and [item.rpartition(": ")[2][:5] for item in told] == ["+1.00"] * 2
+    )
     table, told = components({"wo_mot": 30.0, "ash": 24.0})
-    assert table.rows[0].entries[4].text == "30.10" and told[0].startswith("Kendall's tau, novel view: -1.00")
+    assert table.frame.iloc[0, 4].startswith("30.10") and told[0].startswith("Kendall's tau, novel view: -1.00")
     assert told[2:] == ("w/o mot.: ours saw all frames, the paper's 1,000 of 27,000 frames.",)
     assert not any("saw all" in item for item in components({"wo_disp": 20.0, "ash": 24.0})[1]), "neither was run"
+
+
+def test_conventions_move_the_ranking_and_say_how_far() -> None:
+    def scored(method: str, values: tuple[float, ...]) -> CellResult:
+        rows = [
+            Summary(split="novel_view", region=region, metric="psnr", value=value)
+            for region, value in zip(paper.CONVENTIONS, values, strict=True)
+        ]
+        return CellResult(config=config(method, 0), status="done", summary=tuple(rows))
+
+    results = [
+        scored("ash", (27.0, 30.0, 25.0, 36.0)),
+        scored("ddc", (25.0, 31.0, 24.0, 37.0)),
+        scored("mlp", (24.0, 28.0, 26.0, 35.0)),
+        scored("ash_truth", (40.0, 40.0, 40.0, 40.0)),
+    ]
+    found = paper.conventions(RunTables(results), "loose", "novel_view", "psnr")
+    assert found is not None and list(found[0].index) == ["ash", "ddc", "mlp"], "oracles are left out"
+    assert found[1] == pytest.approx([1, 1 / 3, -1 / 3, 1 / 3])
+    assert paper.conventions(RunTables(results[:1]), "loose", "novel_view", "psnr") is None
 
 
 @pytest.mark.parametrize("method", paper.SEEN)

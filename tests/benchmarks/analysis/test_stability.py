@@ -14,12 +14,13 @@ from ash.capture.formats import load_capture
 from ash.capture.manifest import verify_capture
 from ash.files import InputError
 from benchmarks.analysis import stability, template_error
-from benchmarks.analysis.scores import scores_of
+from benchmarks.analysis.results import RunTables, load
 from benchmarks.cell.cells import CellResult, failed_result
 from benchmarks.cell.methods import configured, offered
 from benchmarks.report import sections, vega
 from benchmarks.report.charts import _number_axis
-from benchmarks.report.content import Chart, Table
+from benchmarks.report.content import Table
+from benchmarks.report.vega import Figure
 from benchmarks.suites import captures
 from benchmarks.suites.dry_run import estimate
 from benchmarks.suites.files import find_suite
@@ -46,85 +47,70 @@ def course(levels: tuple[float, ...]) -> list[CellResult]:
     return found
 
 
-def test_a_method_breaks_where_it_is_surely_below_half_way_to_the_trivial_baseline() -> None:
-    (ash,) = [c for c in stability.curves(scores_of(course((30.0, 26.0, 19.9, 12.0))))[0].courses if c.method == "ash"]
+def breakdown(results: list[CellResult]) -> pd.Series:
+    """What is known of ASH on novel views."""
+    found = stability.breakdowns(stability.steps(load(results)))
+    return found.query("method == 'ash' and split == 'novel_view'").iloc[0]
+
+
+def test_a_method_breaks_where_its_interval_is_below_half_way_to_the_trivial_baseline() -> None:
+    ash = breakdown(course((30.0, 26.0, 19.9, 12.0)))
     assert ash.midpoint == pytest.approx((30.1 + 10.0) / 2)
     assert ash.breakdown == 75.0  # at 50 % the mean, 20.0, lies below the midpoint, 20.05, but not its interval
     assert ash.loss == pytest.approx(18.0)
-    (firm,) = [c for c in stability.curves(scores_of(course((30.0, 26.0, 25.0, 24.0))))[0].courses if c.method == "ash"]
-    assert firm.breakdown is None
-
-
-def test_without_the_trivial_baseline_there_is_no_breakdown_point() -> None:
-    curve = stability.curves(scores_of(course((30.0, 26.0, 19.0, 12.0))[1:]))[0]
-    assert curve.trivial is None
-    assert curve.courses[0].midpoint is None and curve.courses[0].breakdown is None
+    assert pd.isna(breakdown(course((30.0, 26.0, 25.0, 24.0))).breakdown)
+    without = breakdown(course((30.0, 26.0, 19.0, 12.0))[1:])
+    assert pd.isna(without.midpoint) and pd.isna(without.breakdown), "no trivial baseline was run"
 
 
 def test_a_failed_cell_is_the_worst_score_and_counts_in_the_rate() -> None:
     results = course((30.0, 26.0, 25.0, 24.0))
     last = next(i for i, r in enumerate(results) if r.config.severity == 75.0)
     results[last] = failed_result(results[last].config, "diverged", "NaN")
-    (ash,) = [c for c in stability.curves(scores_of(results))[0].courses if c.method == "ash"]
-    assert ash.steps[-1].failures == 1
-    assert ash.steps[-1].quality.mean == pytest.approx((24.1 + 24.2) / 3)
-    row = next(r for r in stability.reliability(scores_of(results), "loose") if r.method == "ash")
+    steps = stability.steps(load(results)).query("method == 'ash' and split == 'novel_view'")
+    assert steps["psnr"].iloc[-1] == pytest.approx((24.1 + 24.2) / 3)
+    row = stability.reliability(load(results), "loose").set_index("method").loc["ash"]
     assert (row.failures, row.cells, row.diverged) == (1, 12, 1)
-    assert row.rate[0] < 1 / 12 < row.rate[1]
-    assert row.spread_db == pytest.approx(0.1)
+    assert row.low < 1 / 12 < row.high and row.spread_db == pytest.approx(0.1)
 
 
-def test_spoilt_captures_do_not_reach_the_tables() -> None:
-    assert set(scores_of(course((30.0, 26.0, 19.9, 12.0))).clean["axis"]) == {""}
+def test_perturbed_captures_do_not_reach_the_tables() -> None:
+    assert set(RunTables(course((30.0, 26.0, 19.9, 12.0))).rows["axis"]) == {""}
 
 
 def test_the_margin_is_read_off_templates_of_known_error() -> None:
     pairs = {"ash_truth": 30.0, "ddc_truth": 31.0, "ash_4mm": 27.0, "ddc_4mm": 26.0, "ash_16mm": 24.0, "ddc_16mm": 16.0}
     results = [cell(method, psnr, seed=seed) for method, psnr in pairs.items() for seed in range(3)]
-    results += [cell("ash", 26.0), cell("ddc", 24.5)]
-    view = template_error.margin_curves(scores_of(results))[0]
-    assert [(m.error_mm, m.mean) for m in view.known] == [(0.0, -1.0), (4.0, 1.0), (16.0, 8.0)]
-    assert view.crossing_mm == pytest.approx(2.0)
-    assert view.paper_db == 7.4
-    assert view.error_at(7.4) == pytest.approx(4 + 12 * 6.4 / 7)
-    assert [(m.template, m.error_mm, m.mean) for m in view.learned] == [("images", 5.0, 1.5)]
-    assert view.margin_at(5.0) == pytest.approx(1 + 7 / 12) and view.margin_at(17.0) is None
-    said = template_error.sentence(view)
-    assert "the two are equal at 2.0 mm" in said
-    assert "learned from images (5.0 mm) it is +1.5 dB, on a planted error of that size +1.6 dB" in said
-    assert template_error.margin_curves(scores_of(results[:6])) == ()
-
-
-def test_learned_templates_have_their_place_on_the_curve_of_their_kind() -> None:
-    """Two scenes, each on its own curve; a template that only one method learned has a place, and no margin."""
-    known = {"ash_truth": 30.0, "ddc_truth": 31.0, "ash_4mm": 27.0, "ddc_4mm": 26.0, "ash_16mm": 24.0, "ddc_16mm": 16.0}
     own = {"ash": 26.0, "ddc": 24.5, "by_scans": 26.5, "ddc_by_scans": 25.5}
-    results = [cell(method, psnr, seed=seed) for method, psnr in (known | own).items() for seed in range(3)]
-    elsewhere = [cell(method, psnr - 1, seed=seed) for method, psnr in known.items() for seed in range(3)]
-    results += [replace(result, config=replace(result.config, scene="tight")) for result in elsewhere]
-    scores = scores_of(results)
-    loose, tight = (
-        next(c for c in template_error.margin_curves(scores) if (c.scene, c.split) == (scene, "novel_view"))
-        for scene in ("loose", "tight")
-    )
-    assert [(m.template, m.mean) for m in loose.learned] == [("images", 1.5), ("scans", 1.0)]
-    assert [(p.method, p.psnr) for p in loose.placed] == [("ash", 26.0), ("by_scans", 26.5)]
-    assert {p.planted_psnr for p in loose.placed} == {27 - 3 * 1 / 12}
-    assert (tight.learned, tight.placed) == ((), ()) and template_error.placement(tight) == ""
-    assert "ASH 26.0 dB at 5.0 mm (26.8)" in template_error.placement(loose)
+    results += [cell(method, psnr, seed=seed) for method, psnr in own.items() for seed in range(3)]
+    tables = RunTables(results)
+    found = template_error.margins(tables).query("split == 'novel_view'")
+    planted = found[found["template"] == template_error.PLANTED]
+    assert list(zip(planted["error_mm"], planted["mean"], strict=True)) == [(0.0, -1.0), (4.0, 1.0), (16.0, 8.0)]
+    learned = found[found["template"] != template_error.PLANTED]
+    assert learned[["template", "error_mm", "mean"]].to_numpy().tolist() == [["images", 5.0, 1.5], ["scans", 5.0, 1.0]]
+    assert template_error.error_at(planted, 0.0) == pytest.approx(2.0)
+    assert template_error.error_at(planted, 7.4) == pytest.approx(4 + 12 * 6.4 / 7)
+    assert template_error.interpolated(planted["error_mm"], planted["mean"], 5.0) == pytest.approx(1 + 7 / 12)
+    assert template_error.interpolated(planted["error_mm"], planted["mean"], 17.0) is None
+    said = template_error.sentences(tables, template_error.margins(tables))
+    assert "the two are equal at 2.0 mm" in said[0] and "the paper's +7.4 dB is reached at" in said[0]
+    assert "learned from images (5.0 mm) it is +1.5 dB, on a planted error of that size +1.6 dB" in said[0]
+    assert "ASH 26.0 dB at 5.0 mm (26.8)" in said[2]
+    assert not len(template_error.margins(RunTables(results[:6]))), "two planted errors are needed"
 
 
 def test_quality_on_templates_of_known_error_has_a_curve_per_method_and_shows_no_failed_one() -> None:
     known = {"ash_truth": 30.0, "ddc_truth": 31.0, "oracle_texture": 29.0, "ash_4mm": 27.0, "ddc_4mm": 26.0}
     results = [cell(method, psnr, seed=seed) for method, psnr in known.items() for seed in range(3)]
     results += [failed_result(cell("texture_4mm", 20.0).config, "diverged", "NaN")]
-    scores = scores_of(results)
-    view = template_error.margin_curves(scores)[0]
-    found = {level.method: [(mm, quality.mean) for mm, quality in level.qualities] for level in view.levels}
+    tables = RunTables(results)
+    views = template_error.levels(tables).query("split == 'novel_view'")
+    found = {m: list(zip(own["error_mm"], own["psnr"], strict=True)) for m, own in views.groupby("method")}
     expected = {"ash_truth": [(0.0, 30.0), (4.0, 27.0)], "ddc_truth": [(0.0, 31.0), (4.0, 26.0)]}
     assert found == {**expected, "oracle_texture": [(0.0, 29.0)]}
-    (section,) = sections.margins(scores)
-    levels = next(block.figure for block in section.blocks if isinstance(block, Chart))
+    (section,) = sections.template_errors(tables)
+    levels = next(block for block in section.blocks if isinstance(block, Figure))
     assert levels.file == "chart_levels.svg"
     assert "fixed mesh, best texture" in "".join(ElementTree.fromstring(levels.svg()).itertext())
 
@@ -136,15 +122,15 @@ def test_ticks_that_would_lie_on_each_other_give_way_to_the_rounder_one() -> Non
 
 
 def test_charts_are_svg_with_a_mark_where_a_method_breaks() -> None:
-    (section,) = sections.stabilities(scores_of(course((30.0, 26.0, 12.0, 11.0))))
-    figures = [block.figure for block in section.blocks if isinstance(block, Chart)]
+    (section,) = sections.stabilities(RunTables(course((30.0, 26.0, 12.0, 11.0))))
+    figures = [block for block in section.blocks if isinstance(block, Figure)]
     assert [figure.file for figure in figures] == ["chart_stability_loose_0.svg", "chart_stability_loose_1.svg"]
     for figure in figures:
         drawn = ElementTree.fromstring(figure.svg())
         crosses = [path for path in drawn.iter("{http://www.w3.org/2000/svg}path") if path.get("stroke") == vega.INK]
         assert drawn.tag.endswith("svg") and len(crosses) == 1
     breakdowns = next(block for block in section.blocks if isinstance(block, Table))
-    assert breakdowns.rows[0].entries[0].text == "50 (19.0 dB lost at worst)"
+    assert breakdowns.frame.iloc[0, 0] == "50 (19.0 dB lost at worst)"
 
 
 def test_ash_that_knows_the_empty_studio_stands_beside_ash() -> None:
@@ -152,15 +138,12 @@ def test_ash_that_knows_the_empty_studio_stands_beside_ash() -> None:
     results = [cell("nearest", 10.0)]
     for method, worst in {"ash": 12.0, "ash_studio": 29.0}.items():
         results += [cell(method, 30.0), cell(method, worst, axis="mask_grown", severity=8.0)]
-    (section,) = sections.stabilities(scores_of(results))
+    (section,) = sections.stabilities(RunTables(results))
     breakdowns, reliability = (block for block in section.blocks if isinstance(block, Table))
-    assert [column.title for column in breakdowns.columns] == ["ASH", "ASH, empty studio known"]
-    assert [entry.text for entry in breakdowns.rows[0].entries] == [
-        "8 (18.0 dB lost at worst)",
-        "none (1.0 dB lost at worst)",
-    ]
-    assert "ASH, empty studio known" in [row.name for row in reliability.rows]
-    mine = scores_of([*results, cell("mine", 20.0)])
+    assert list(breakdowns.frame.columns) == ["ASH", "ASH, known background"]
+    assert breakdowns.frame.iloc[0].tolist() == ["8 (18.0 dB lost at worst)", "none (1.0 dB lost at worst)"]
+    assert "ASH, known background" in reliability.frame.index
+    mine = RunTables([*results, cell("mine", 20.0)])
     assert mine.methods("loose") == ("mine", "nearest", "ash", "ash_studio"), "a user's own first"
 
 

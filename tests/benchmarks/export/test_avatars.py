@@ -9,10 +9,10 @@ import torch
 import trimesh
 from helpers.figures import tube_motion, tube_skeleton
 from helpers.gaussian_files import read_gltf, read_ply
+from helpers.scoring import psnr
 
 from ash.capture.dataset import Pose
 from ash.gaussians.splatting import splat
-from ash.inference import psnr
 from ash.mesh.drawing import draw_mesh, textured, topology_of
 from ash.model import image_of, views_of
 from ash.protocol import StageClock

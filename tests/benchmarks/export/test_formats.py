@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 from helpers.gaussian_files import read_gltf, read_ply, read_spz
+from helpers.scoring import psnr
 from plyfile import PlyData
 
 from ash.files import InputError
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import splat
-from ash.inference import psnr
 from benchmarks.export.gaussians import ply_bytes, spz_bytes, turned
 from benchmarks.export.gltf import gaussians_gltf
 

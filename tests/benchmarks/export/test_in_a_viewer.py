@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.browser import Visitor
+from helpers.scoring import psnr
 from PIL import Image
 
 from ash.capture.dataset import Pose
-from ash.inference import psnr
 from ash.protocol import StageClock
 from benchmarks import cli
 from benchmarks.play.avatars import open_avatars

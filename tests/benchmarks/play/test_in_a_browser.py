@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import torch
 from helpers.browser import PHONE, Visitor
+from helpers.scoring import psnr
 from helpers.viewers import PATIENCE, state_of
 from helpers.waiting import wait_for
 from PIL import Image
 
 from ash.capture.dataset import Pose
-from ash.inference import psnr
 from ash.protocol import StageClock
 from benchmarks import cli
 from benchmarks.play.avatars import composite

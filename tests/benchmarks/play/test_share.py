@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 from helpers.browser import Visitor
+from helpers.scoring import psnr
 from PIL import Image
 
 from ash.capture.dataset import Pose
-from ash.inference import psnr
 from ash.protocol import StageClock
 from benchmarks import cli
 from benchmarks.play.avatars import open_avatars

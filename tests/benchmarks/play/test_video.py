@@ -7,12 +7,12 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from helpers.captures import SIZE
+from helpers.scoring import psnr
 from PIL import Image, ImageSequence
 
 from ash.capture.dataset import Capture, Pose
 from ash.capture.formats import load_capture
 from ash.files import InputError
-from ash.inference import psnr
 from ash.protocol import StageClock
 from benchmarks import cli
 from benchmarks.cell import metrics

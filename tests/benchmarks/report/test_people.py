@@ -1,4 +1,4 @@
-"""What a report says of each person of a cast."""
+"""What a report says of each subject."""
 
 import io
 import shutil
@@ -10,16 +10,17 @@ from helpers.cells import config
 from PIL import Image
 
 from ash.files import InputError
-from benchmarks.analysis.scores import Scores, scores_of
+from benchmarks.analysis.results import RunTables
 from benchmarks.cell.cells import Cell, CellResult, Summary, failed_result
 from benchmarks.report import people
-from benchmarks.report.content import Bullets, Chart, Section, Table
+from benchmarks.report.content import Bullets, Table
 from benchmarks.report.pictures import Album
 from benchmarks.report.scene import SceneData, scene_report
+from benchmarks.report.vega import Figure
 from benchmarks.suites.runs import Run, results_of
 
 SPLITS = ("novel_view", "novel_pose")
-PSNR = {  # on held-out views by subject and seed; one dB less on new motion
+PSNR = {  # on novel views by subject and seed; one dB less on novel poses
     "ash": ((24.0, 26.0), (27.0, 29.0)),
     "ddc": ((23.0, 23.5), (28.5, 29.0)),
 }
@@ -30,8 +31,8 @@ def result(method: str, subject: int, seed: int, psnr: float) -> CellResult:
     return CellResult(config=replace(config(method, seed), subject=subject), status="done", summary=tuple(rows))
 
 
-def cast(psnr: dict[str, tuple[tuple[float, ...], ...]]) -> Scores:
-    return scores_of(
+def cast(psnr: dict[str, tuple[tuple[float, ...], ...]]) -> RunTables:
+    return RunTables(
         [
             result(method, subject, seed, value)
             for method, persons in psnr.items()
@@ -41,62 +42,46 @@ def cast(psnr: dict[str, tuple[tuple[float, ...], ...]]) -> Scores:
     )
 
 
-def blocks(section: Section, kind: type) -> list:
-    return [block for block in section.blocks if isinstance(block, kind)]
+def blocks(tables: RunTables, kind: type) -> list:
+    return [block for block in people.blocks(tables, "loose") if isinstance(block, kind)]
 
 
-def test_every_person_has_the_lead_of_ash_and_the_cast_its_spread() -> None:
-    (section,) = people.sections(cast(PSNR), "loose")
-    views, _, spread = blocks(section, Table)
-    assert [(row.name, [e.text for e in row.entries]) for row in views.rows] == [
-        ("subject 0", ["25.00", "+1.75"]),
-        ("subject 1", ["28.00", "-0.75"]),
-    ]
+def test_every_subject_has_the_lead_of_ash_and_scores_their_spread() -> None:
+    views, _, spread = blocks(cast(PSNR), Table)
+    assert views.frame.index.tolist() == ["subject 0", "subject 1"]
+    assert views.frame.to_numpy().tolist() == [["25.00", "+1.75"], ["28.00", "-0.75"]]
     # ASH: means 25 and 28, so a variance of 4.5, of which half of the seeds' 2 is theirs.
-    assert [[e.text for e in row.entries[:2]] for row in spread.rows] == [["1.87", "1.41"], ["3.88", "0.35"]]
-    (told,) = blocks(section, Bullets)
-    assert told.items[0] == "On held-out views ASH is ahead of DDC on 1 of 2 people, by -0.75 to +1.75 dB."
-    (chart,) = blocks(section, Chart)
-    assert chart.figure.svg().count("subject 0") >= 2, "a row in each of the two panels"
+    assert spread.frame.iloc[:, :2].to_numpy().tolist() == [["1.87", "1.41"], ["3.88", "0.35"]]
+    (told,) = blocks(cast(PSNR), Bullets)
+    assert told.items[0] == "On novel views ASH is ahead of DDC on 1 of 2 subjects, by -0.75 to +1.75 dB."
+    (figure,) = blocks(cast(PSNR), Figure)
+    assert figure.svg().count("subject 0") >= 2, "a row in each of the two panels"
 
 
 def test_an_ablation_that_changes_nothing_is_no_win() -> None:
     def first(psnr: tuple[tuple[float, ...], ...]) -> str:
-        (section,) = people.sections(cast(PSNR | {"ddc": psnr}), "loose")
-        return blocks(section, Bullets)[0].items[0]
+        return blocks(cast(PSNR | {"ddc": psnr}), Bullets)[0].items[0]
 
-    assert first(PSNR["ash"]) == "On held-out views ASH and DDC are equal on all 2 people, within 0.01 dB."
+    assert first(PSNR["ash"]) == "On novel views ASH and DDC are equal on all 2 subjects, within 0.01 dB."
     assert first(((26.0, 26.0), (29.0, 29.0))) == (
-        "On held-out views ASH is ahead of DDC on none of 2 people; the differences are -1.00 to -1.00 dB."
+        "On novel views ASH is ahead of DDC on none of 2 subjects; the differences are -1.00 to -1.00 dB."
     )
 
 
-def test_a_single_person_and_a_rival_that_failed_have_no_such_section() -> None:
+def test_a_single_subject_and_a_method_that_failed_or_saw_other_subjects_have_no_such_section() -> None:
     alone = cast({method: persons[:1] for method, persons in PSNR.items()})
-    assert people.sections(alone, "loose") == []
-    fallen = [result("ash", subject, 0, 25.0) for subject in (0, 1)]
-    fallen += [replace(failed_result(replace(config("ddc", 0), subject=k), "crashed", "boom")) for k in (0, 1)]
-    assert people.sections(scores_of(fallen), "loose") == []
+    assert people.blocks(alone, "loose") == ()
+    ash = [result("ash", subject, 0, 25.0) for subject in (0, 1)]
+    fallen = [failed_result(replace(config("ddc", 0), subject=k), "crashed", "boom") for k in (0, 1)]
+    assert people.blocks(RunTables([*ash, *fallen]), "loose") == ()
+    others = [result("ddc", subject, 0, 24.0) for subject in (1, 2)]
+    assert people.blocks(RunTables([*ash, *others]), "loose") == ()
 
 
 def test_of_many_rows_the_rivals_and_the_users_own_are_shown() -> None:
     rows = ("ash", "ddc", "wo_disp", "wo_offset", "wo_mot", "mlp", "res_128", "res_512", "theirs")
-    (section,) = people.sections(cast({row: ((25.0,), (26.0,)) for row in rows}), "loose")
-    assert [head.title for head in blocks(section, Table)[0].columns] == [
-        "ASH",
-        "minus theirs",
-        "minus DDC",
-        "minus w/o mot.",
-    ]
-
-
-def test_rows_of_other_people_than_those_of_ash_are_left_out() -> None:
-    scores = cast({"ash": ((25.0,), (26.0,)), "ddc": ((24.0,), (24.5,))})
-    few = [result("ash", subject, 0, 25.0) for subject in (0, 1)] + [
-        result("ddc", subject, 0, 24.0) for subject in (1, 2)
-    ]
-    assert len(people.sections(scores, "loose")) == 1
-    assert people.sections(scores_of(few), "loose") == []
+    table = blocks(cast({row: ((25.0,), (26.0,)) for row in rows}), Table)[0]
+    assert list(table.frame.columns) == ["ASH [dB]", "minus theirs", "minus DDC", "minus w/o mot."]
 
 
 def two_people(run: Run, other: Path) -> tuple[Run, list[CellResult]]:
@@ -115,21 +100,21 @@ def two_people(run: Run, other: Path) -> tuple[Run, list[CellResult]]:
 
 def test_a_report_over_people_shows_everybody(run: Run, tmp_path: Path) -> None:
     cast, results = two_people(run, tmp_path / "other")
-    scores = scores_of(results, {cell.config.key: cell.capture_folder.name for cell in cast.cells})
+    tables = RunTables(results, {cell.config.key: cell.capture_folder.name for cell in cast.cells})
     data = SceneData(
-        run=cast, scores=scores, results=tuple(results), scene="boxes", album=Album(), room=10**6, worst_frames=1
+        run=cast, tables=tables, results=tuple(results), scene="boxes", album=Album(), room=10**6, worst_frames=1
     )
     made = scene_report(data)
-    (strips,) = (b for s in made.sections if s.title == "Everybody on boxes" for b in s.blocks if b.kind == "strips")
+    (strips,) = (b for s in made.sections if s.title == "All subjects on boxes" for b in s.blocks if b.kind == "strips")
     assert [name for name, _ in strips.groups] == ["subject 0", "subject 1"]
-    assert all([tile.caption for tile in strip.tiles] == ["Truth", "ASH", "DDC"] for strip in strips.groups[0][1])
+    assert all([caption for caption, *_ in strip.tiles] == ["Truth", "ASH", "DDC"] for strip in strips.groups[0][1])
     assert [strip.title.split(",")[:2] for strip in strips.groups[1][1]] == [
-        ["subject 1", " held-out views"],
-        ["subject 1", " held-out motion"],
+        ["subject 1", " novel views"],
+        ["subject 1", " novel poses"],
     ]
     sheet = Image.open(io.BytesIO(made.sheets[strips.file]))
     alone = next(b for s in made.sections for b in s.blocks if b.kind == "flipbook")
     assert strips.file in made.sheets and alone.file in made.sheets and sheet.width < sheet.height
     shutil.rmtree(tmp_path / "other")
     with pytest.raises(InputError):
-        people.pictured(cast, results, scores, "boxes", Album())
+        people.pictured(cast, results, tables, "boxes", Album())

@@ -6,7 +6,8 @@ import pandas as pd
 import pytest
 
 from ash.files import InputError
-from benchmarks.analysis.scores import COLUMNS, csv_of, foreground, read_csv, scores_of, tidy
+from benchmarks.analysis.results import COLUMNS, RunTables, csv_of, foreground, load, read_csv, samples_of
+from benchmarks.analysis.statistics import independent
 from benchmarks.cell.cells import (
     Cell,
     CellConfig,
@@ -86,7 +87,7 @@ def test_every_input_changes_the_key() -> None:
 
 
 def test_results_csv_has_the_stable_columns_and_all_digits(tmp_path: Path) -> None:
-    made = tidy([result(psnr=1 / 3), failed_result(config("ddc"), "crashed", "")])
+    made = load([result(psnr=1 / 3), failed_result(config("ddc"), "crashed", "")])
     (tmp_path / "results.csv").write_text(csv_of(made))
     table = pd.read_csv(tmp_path / "results.csv", keep_default_na=False)
     header = "scene,method,seed,split,region,metric,value,unit,direction,protocol,subject,capture"
@@ -107,21 +108,22 @@ def test_several_captures_of_a_scene_are_the_unit_and_their_seeds_are_averaged()
         for subject, scores in values.items()
         for seed, psnr in enumerate(scores)
     ]
-    scores = scores_of(results)
-    assert list(scores.rows["subject"].unique()) == [0, 1]
-    assert list(scores.rows["capture"].unique()) == ["boxes-ci-0", "boxes-ci-0-subject1"]
-    assert scores.values("boxes", "ash", foreground()) == [25.0, 28.0] and scores.captures("boxes") == 2
-    assert scores.get("boxes", "ash", foreground()).seeds == 2
+    tables = RunTables(results)
+    assert list(tables.rows["subject"].unique()) == [0, 1]
+    assert list(tables.rows["capture"].unique()) == ["boxes-ci-0", "boxes-ci-0-subject1"]
+    samples = samples_of(tables.of("boxes"), foreground())["ash"]
+    assert independent(samples) == [25.0, 28.0] and tables.captures("boxes") == 2
+    assert tables.get("boxes", "ash", foreground()).n == 2
 
 
 def test_scores_are_means_with_students_interval() -> None:
-    scores = scores_of([result(seed=seed, psnr=psnr) for seed, psnr in enumerate((24.0, 25.0, 27.0))])
-    score = scores.get("boxes", "ash", foreground())
-    assert score is not None and score.seeds == 3
-    assert score.mean == pytest.approx(76 / 3)
+    tables = RunTables([result(seed=seed, psnr=psnr) for seed, psnr in enumerate((24.0, 25.0, 27.0))])
+    score = tables.get("boxes", "ash", foreground())
+    assert score is not None and score.n == 3
+    assert score.value == pytest.approx(76 / 3)
     assert score.half_width == pytest.approx(4.302653 * math.sqrt(7 / 3 / 3), rel=1e-5)  # t of 2 degrees of freedom
-    assert scores_of([result()]).get("boxes", "ash", foreground()).half_width is None
-    assert scores.get("boxes", "ddc", foreground()) is None
+    assert math.isnan(RunTables([result()]).get("boxes", "ash", foreground()).half_width)
+    assert tables.get("boxes", "ddc", foreground()) is None
 
 
 def test_a_curve_passes_over_what_is_no_point(tmp_path: Path) -> None:
@@ -156,9 +158,9 @@ def test_what_was_not_enforced_and_clocks_that_contradict_are_told() -> None:
     assert doubts([oracle]) == (), "an oracle is given the truth"
     columns = quality_columns(("psnr",))
     plain, marked = (
-        build(scores_of([result()]), "boxes", columns, title="", exposed=exposed) for exposed in ((), ("ash",))
+        build(RunTables([result()]), "boxes", columns, title="", exposed=exposed) for exposed in ((), ("ash",))
     )
-    assert (plain.rows[0].note, marked.rows[0].note) == ("", "not isolated")
+    assert (plain.frame.index[0], marked.frame.index[0]) == ("ASH", "ASH (not isolated)")
 
 
 def test_texts_of_a_result_cannot_steer_the_terminal(tmp_path: Path) -> None:

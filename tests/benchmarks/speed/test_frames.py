@@ -1,19 +1,30 @@
-"""The table of frames: its rows, and that what is timed is what is defined."""
+"""Frames and steps: the rows of the table, what is drawn when a frame is timed, and agreement with the definitions."""
 
 import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from helpers.captures import write_tube_capture
+from helpers.captures import SIZE, write_tube_capture
+from helpers.commands import refused
 
 from ash.avatar import AshAvatar
-from ash.files import read_json
-from ash.inference import Player
+from ash.capture.dataset import Capture
+from ash.files import InputError, read_json
 from ash.presets import named
+from ash.textures import TextureDrawer
 from ash.training.images import load_training_images
+from benchmarks import cli
+from benchmarks.play.avatars import open_avatars
 from benchmarks.speed import frames, profile
-from benchmarks.speed.frames import PictureAgreement, TimedAvatar, scaled_camera, subjects
+from benchmarks.speed.frames import Agreement, Clip, Subject, held_out_clips, scaled_camera, subjects, time_clip
+
+NEAR, NEW = (1, 2, 3), (4, 5)  # Training frames of the tube serve as near motion.
+AGREES_DB = 80
+Trained = tuple[AshAvatar, Capture]
 
 
 @pytest.fixture(scope="module")
@@ -21,11 +32,42 @@ def capture(tmp_path_factory):
     return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
 
 
+@pytest.fixture(scope="module")
+def trained(tube_cells: dict[str, Path]) -> Iterator[Trained]:
+    """The tube as ash, and its capture with near motion."""
+    with open_avatars(tube_cells["ash"]) as avatars:
+        avatar = avatars.only().avatar
+        assert isinstance(avatar, AshAvatar)
+        yield avatar, with_near_motion(avatars.capture)
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The definitions of 512x512 pixels would take seconds."""
+    monkeypatch.setattr(frames, "SIZE", (64, 64))
+
+
+def with_near_motion(capture: Capture) -> Capture:
+    near = replace(capture.splits["novel_pose"], frames=NEAR)
+    return replace(capture, splits=capture.splits | {"near_pose": near})
+
+
+def clips_of(capture: Capture) -> list[Clip]:
+    """Near and new motion at the size of the capture's images."""
+    return [clip for clip in held_out_clips(capture, "it") if clip.camera.width == SIZE]
+
+
+def agreements(avatar: AshAvatar, capture: Capture, *, threads: tuple[int, ...] = (1,)) -> dict[str, Agreement]:
+    """By the motion's name."""
+    results = (result for clip in clips_of(capture) for result in time_clip(avatar, clip, threads=threads))
+    return {each.candidate.split()[1]: each for each in results if isinstance(each, Agreement)}
+
+
 def test_the_table_has_every_stage_and_fast_images_agree_with_the_definitions(capture, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(frames, "captured", lambda folder: capture)
-    subject = TimedAvatar(name="ci", config=named("ci"), width=64, height=64, trains=True)
-    results = list(frames.speed_frame(capture, timed=(subject,), rounds=2))
-    monkeypatch.setattr(frames, "speed_frame", lambda capture, device: iter(results))
+    monkeypatch.setattr(
+        frames, "subjects", lambda: (Subject(name="ci", config=named("ci"), width=64, height=64, trains=True),)
+    )
     before = torch.get_num_threads()
     assert frames.main(tmp_path / "rows.json") == 0
     assert torch.get_num_threads() == before
@@ -39,18 +81,102 @@ def test_the_table_has_every_stage_and_fast_images_agree_with_the_definitions(ca
     }
     assert keys == expected
     assert all(0 < row["min_ms"] <= row["median_ms"] for row in written["rows"])
-    agreement = next(result for result in results if isinstance(result, PictureAgreement))
-    assert agreement.psnr_db > (80 if agreement.engine == "float32" else 45)
+    (agreement,) = written["agreements"]
+    assert agreement["least_db"] > AGREES_DB and agreement["frames"] == frames.DEFINITION_RUNS
     assert "29.64 frames per second" in capsys.readouterr().out
 
 
-def test_an_avatar_that_draws_something_else_would_be_seen(capture):
-    avatar = AshAvatar(named("ci"), capture)
-    camera = scaled_camera(capture.cameras["cam0"], 64, 64)
-    player = Player(avatar, capture.motion, camera)
-    draw = player.draw
-    player.draw = lambda *a, **k: draw(*a, **k) * np.float32(0.9)
-    assert frames.agreement(avatar, player, "ci", capture, camera).psnr_db < 40
+def test_the_table_of_a_trained_cell_has_every_stage_and_agrees_with_the_definitions(
+    tube_cells: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["speed", "frame", "--avatar", str(tube_cells["ash"]), "--json", str(tmp_path / "rows.json")]
+    assert cli.main(command) == cli.DONE
+    written = read_json(tmp_path / "rows.json")
+    assert set(written) == {"rows", "agreements", "paper_ms"}
+    (by,) = {row["candidate"].removesuffix("-naive") for row in written["rows"]}
+    assert by.startswith("ash+") and by.endswith(":ci new"), "the method with its changes, the preset, the motion"
+    sizes, stages = ("64x64", f"{SIZE}x{SIZE}"), ("stg1", "stg2", "stg3", "stg4", "frame")
+    expected = {(what, size, n, by) for size in sizes for what in stages for n in (1, 2)}
+    expected |= {("frame", size, 1, f"{by}-naive") for size in sizes}
+    assert {(row["what"], row["size"], row["threads"], row["candidate"]) for row in written["rows"]} == expected
+    assert [agreement["size"] for agreement in written["agreements"]] == list(sizes)
+    for agreement in written["agreements"]:
+        assert agreement["frames"] == len(NEW)
+        assert AGREES_DB < agreement["least_db"] <= agreement["median_db"]
+    assert f"median of {len(NEW)} frames, decoder weight" in capsys.readouterr().out
+
+
+def test_another_method_and_several_avatars_are_refused(tube_run: Path, tube_cells: dict[str, Path], capsys) -> None:
+    assert "expected an avatar of ASH" in refused(capsys, "speed", "frame", "--avatar", str(tube_cells["ddc"]))
+    assert "give the folder of a cell" in refused(capsys, "speed", "frame", "--avatar", str(tube_run))
+
+
+def test_near_and_new_motion_are_timed_in_the_order_of_playback(trained: Trained) -> None:
+    _, capture = trained
+    near = replace(capture.splits["near_pose"], frames=NEAR[::-1])
+    clips = held_out_clips(replace(capture, splits=capture.splits | {"near_pose": near}), "it")
+    timed = [(clip.title, tuple(pose.frame for pose in clip.poses), clip.camera.width) for clip in clips]
+    assert timed == [("it near", NEAR, 64), ("it near", NEAR, SIZE), ("it new", NEW, 64), ("it new", NEW, SIZE)]
+    with pytest.raises(InputError, match="near or new motion"):
+        held_out_clips(replace(capture, splits={"train": capture.splits["train"]}), "it")
+
+
+def test_a_timed_frame_poses_its_own_template_and_not_that_of_the_frames_before(
+    trained: Trained, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    avatar, capture = trained
+    template, posed, timed = avatar.module.template, [], []
+    anew, render = template.pose_anew, avatar.render
+
+    def recorded(pose, *rest, **options):
+        posed.clear()
+        image = render(pose, *rest, **options)
+        timed.append((pose.frame, *posed))
+        return image
+
+    monkeypatch.setattr(template, "pose_anew", lambda pose: posed.append(pose.frame) or anew(pose))
+    monkeypatch.setattr(avatar, "render", recorded)
+    agreements(avatar, capture, threads=(1, 2))
+    assert avatar.config.model.window > 1
+    assert timed == [(frame, frame) for frame in (*NEAR, *NEW) for _ in (1, 2)]
+
+
+def test_one_wrong_image_lowers_the_least_agreement_and_not_the_median(
+    trained: Trained, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    avatar, capture = trained
+    render = avatar.render
+
+    def dimmed(pose, *rest, **options):
+        wrong = pose.frame == NEAR[1] and torch.get_num_threads() == 2
+        return render(pose, *rest, **options) * np.float32(0.9 if wrong else 1)
+
+    monkeypatch.setattr(avatar, "render", dimmed)
+    assert agreements(avatar, capture)["near"].least_db > AGREES_DB
+    near = agreements(avatar, capture, threads=(1, 2))["near"]
+    assert near.least_db < 40 < AGREES_DB < near.median_db
+
+
+def test_an_empty_image_does_not_agree(trained: Trained, monkeypatch: pytest.MonkeyPatch) -> None:
+    avatar, capture = trained
+    empty = np.zeros((SIZE, SIZE, 4), np.float32)
+    monkeypatch.setattr(avatar, "render", lambda *_, **__: empty)
+    assert agreements(avatar, capture)["near"].median_db < 30
+
+
+def test_an_agreement_has_the_least_weight_of_the_decoders(trained: Trained, monkeypatch: pytest.MonkeyPatch) -> None:
+    avatar, capture = trained
+    monkeypatch.setattr(TextureDrawer, "trust", lambda self, textures: 0.7 if self.novelty(textures) > 1e-3 else 1.0)
+    new = agreements(avatar, capture)["new"]
+    assert new.least_decoder_weight == 0.7
+    assert f"of {len(NEW)} frames, decoder weight 0.70 or more" in new.line()
+
+
+def test_an_avatar_without_decoders_agrees_too(capture: Capture) -> None:
+    config = named("ci")
+    avatar = AshAvatar(replace(config, model=replace(config.model, motion=False)), capture)
+    for agreement in agreements(avatar, with_near_motion(capture)).values():
+        assert agreement.least_decoder_weight == 1.0 and agreement.least_db > AGREES_DB
 
 
 def test_a_scaled_camera_sees_the_same_window_in_the_middle(capture):

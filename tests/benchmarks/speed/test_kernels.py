@@ -1,4 +1,4 @@
-"""The speed table: who is called how often and in which order, what a ratio refers to, what is counted."""
+"""The speed table: the order of calls, what a ratio refers to, the pairs of a pixel and a splat."""
 
 from pathlib import Path
 
@@ -7,36 +7,37 @@ import pytest
 import benchmarks.speed.kernels
 from ash.files import read_json
 from benchmarks.speed.kernels import SplatDetail, count_pairs, main
-from benchmarks.speed.rows import SpeedRow, TimedCandidate, as_json, rows_of, time_interleaved
 from benchmarks.speed.scenes import splat_scene
+from benchmarks.speed.timing import WHOLE, Candidate, SpeedRow, as_json, rows_of, time_interleaved
 
 
-def test_candidates_take_turns_and_the_fast_ones_are_called_more_often() -> None:
+def test_candidates_are_interleaved_and_the_fast_ones_are_called_more_often() -> None:
     calls: list[str] = []
-    slow = TimedCandidate(name="slow", threads=1, call=lambda: calls.append("slow"))
-    fast = TimedCandidate(name="fast", threads=2, call=lambda: calls.append("fast"), repeats=3)
-    times = time_interleaved([slow, fast], rounds=2)
-    assert calls == ["fast", *["slow", "fast", "fast", "fast"] * 2]  # the first call warms up and is not timed
-    assert {key: len(samples) for key, samples in times.items()} == {("slow", 1): 2, ("fast", 2): 6}
+
+    def candidate(name: str, repeats: int) -> Candidate:
+        return Candidate(
+            name=name,
+            threads=repeats,
+            before=lambda number: calls.append(f"before {number}"),
+            call=lambda number: calls.append(name) or {"stage": 7.0},
+            repeats=repeats,
+        )
+
+    samples = time_interleaved([candidate("slow", 1), candidate("fast", 2)], rounds=2)
+    assert [call for call in calls if "before" not in call] == ["fast", *["slow", "fast", "fast"] * 2], "one warms up"
+    assert calls[:4] == ["before 0", "fast", "before 0", "slow"]
+    assert {key: len(stages[WHOLE]) for key, stages in samples.items()} == {("slow", 1): 2, ("fast", 2): 4}
+    assert samples["fast", 2]["stage"] == [7.0] * 4
 
 
 def test_a_ratio_is_the_first_candidates_minimum_over_the_rows_own() -> None:
-    naive, native = rows_of(
-        "splat", "S", "forward", {("naive", 1): [40.0, 60.0, 90.0], ("native", 2): [5.0, 4.0, 10.0]}
-    )
+    samples = {("naive", 1): {WHOLE: [40.0, 60.0, 90.0]}, ("native", 2): {WHOLE: [5.0, 4.0, 10.0], "part": [1.0]}}
+    naive, native, part = rows_of("splat", "S", "forward", samples)
     assert (naive.ratio, native.ratio) == (1.0, 10.0)
-    assert (native.min_ms, native.median_ms) == (4.0, 5.0)
-    assert list(as_json(native)) == [
-        "what",
-        "size",
-        "pass",
-        "device",
-        "threads",
-        "candidate",
-        "min_ms",
-        "median_ms",
-        "ratio",
-    ]
+    assert (native.min_ms, native.median_ms, part.what) == (4.0, 5.0, "part")
+    columns = ["what", "size", "pass", "device", "threads", "candidate", "min_ms", "median_ms", "ratio"]
+    assert list(as_json(native)) == columns
+    assert as_json(part)["ratio"] is None
 
 
 def test_pairs_are_counted_as_the_definition_blends_them() -> None:

@@ -15,8 +15,8 @@ from benchmarks import cli
 from benchmarks.commands import arguments
 from synth.capture import make_body, make_capture
 from synth.motion.importing import import_motion
-from synth.readers.retargeting import retargeted, scene_of
 from synth.scene import Outfit
+from synth.truth.retargeting import retargeted, scene_of
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def test_avatars_are_driven_by_the_motion_and_scored_against_its_truth(
     out = run / "out"
     rows = []
     for cell in (static, nearest):
-        command = ["retarget", str(cell), "--motion", str(motion), "--frames", "3", "--out", str(out), "--workers", "1"]
+        command = ["eval", str(cell), "--motion", str(motion), "--frames", "3", "--out", str(out), "--workers", "1"]
         assert cli.main(command) == arguments.DONE
         content = json.loads((out / "result-mannequin.json").read_text())
         rows += content["avatars"]
@@ -96,9 +96,9 @@ def test_the_scene_of_a_capture_comes_back_from_its_manifest(capture: Path, moti
 def test_nothing_to_drive_and_a_bad_motion_are_refused(run: Path, tmp_path: Path, capsys) -> None:
     (cell, *_) = (run / "cells").iterdir()
     (tmp_path / "bad.bvh").write_text("HIERARCHY nothing")
-    assert cli.main(["retarget", str(cell), "--motion", str(tmp_path / "bad.bvh")]) == arguments.WRONG_INPUT
+    assert cli.main(["eval", str(cell), "--motion", str(tmp_path / "bad.bvh")]) == arguments.WRONG_INPUT
     untrained = tmp_path / "cell"
     untrained.mkdir()
     (untrained / "config.json").write_bytes((cell / "config.json").read_bytes())
-    assert cli.main(["retarget", str(untrained), "--motion", str(tmp_path / "bad.bvh")]) == arguments.WRONG_INPUT
+    assert cli.main(["eval", str(untrained), "--motion", str(tmp_path / "bad.bvh")]) == arguments.WRONG_INPUT
     assert "no trained avatar" in capsys.readouterr().err

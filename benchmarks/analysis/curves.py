@@ -1,0 +1,167 @@
+"""Quality against what was spent and against how far a test is from training: curves with intervals, and sentences.
+
+`time_to_quality`: training seconds. `data_scaling`: training frames. `novelty`: distance of a pose from training.
+"""
+
+from collections.abc import Iterator
+from itertools import combinations, pairwise
+
+import numpy as np
+import pandas as pd
+
+from benchmarks.analysis.results import HELD_OUT_SPLITS, foreground, samples_of
+from benchmarks.analysis.statistics import independent, intervals, mean_interval
+from benchmarks.analysis.style import SPLIT_NAMES, style_of
+from benchmarks.suites.stress import FOOTAGE_FRAMES
+
+FOOTAGE_AXIS, STATIC = "footage", "wo_mot"
+BINS, LEAST = 5, 3  # at most so many bins of motion, of so many frames or more
+NARROW_DEG = 1.0  # Motion that stays within it makes no curve.
+
+
+def _table(rows: list[tuple], *columns: str) -> pd.DataFrame:
+    return pd.DataFrame(rows, columns=[*columns, "psnr", "low", "high"]).astype({"low": float, "high": float})
+
+
+def time_to_quality(snapshots: pd.DataFrame) -> pd.DataFrame:
+    """Scene, split, method, seconds, psnr, low, high, at the seconds of all snapshots on the scene.
+
+    A training that ended earlier keeps its last score; before its first snapshot a method has no row.
+    """
+    rows = []
+    for (scene, split), here in snapshots.groupby(["scene", "split"], sort=False):
+        marks = np.unique(here["seconds"].round())
+        for method, own in here.groupby("method", sort=False):
+            for mark in marks:
+                scores = own.groupby(["capture", "seed"]).apply(_score_at, mark, include_groups=False)
+                if scores.notna().all():
+                    found = mean_interval(independent(scores.groupby("capture").agg(list).to_dict()))
+                    rows.append((scene, split, method, mark, found.mean, found.low, found.high))
+    return _table(rows, "scene", "split", "method", "seconds")
+
+
+def _score_at(run: pd.DataFrame, seconds: float) -> float:
+    """The score of the latest snapshot up to then; NaN where there is none."""
+    earlier = run[run["seconds"].round() <= seconds].sort_values("seconds")
+    return float(earlier["psnr"].iloc[-1]) if len(earlier) else np.nan
+
+
+def crossings(table: pd.DataFrame) -> list[str]:
+    """Sentences: from when on one method is ahead of another, or that it is throughout.
+
+    Between two snapshots the difference is taken to change linearly in the logarithm of the seconds.
+    """
+    crossed, never = [], []
+    for (scene, split), here in table.groupby(["scene", "split"], sort=False):
+        wide = here.pivot(index="seconds", columns="method", values="psnr")
+        for first, second in combinations(dict.fromkeys(here["method"]), 2):
+            lead = (wide[first] - wide[second]).dropna()
+            names = {1: (first, second), -1: (second, first)}
+            where = f"On {scene}, {SPLIT_NAMES[split].words}, "
+
+            def pair(sign: int, names: dict[int, tuple[str, str]] = names) -> str:
+                return " is ahead of ".join(style_of(name).title for name in names[sign])
+
+            for seconds, sign in _sign_changes(lead):
+                crossed.append(f"{where}{pair(sign)} from {seconds:.0f} s of training on.")
+            if len(lead) and ((lead > 0).all() or (lead < 0).all()):
+                least, most = abs(lead).min(), abs(lead).max()
+                sign = 1 if lead.iloc[0] > 0 else -1
+                never.append(f"{where}{pair(sign)} at every time, by {least:.1f} to {most:.1f} dB.")
+    return crossed + never
+
+
+def _sign_changes(lead: pd.Series) -> Iterator[tuple[float, int]]:
+    """Seconds at which a lead passes through zero, and its sign from there on."""
+    points = [(float(seconds), float(value)) for seconds, value in lead.items() if value != 0]
+    for (before, low), (after, high) in pairwise(points):
+        if low * high < 0:
+            share = low / (low - high)
+            yield float(np.exp((1 - share) * np.log(before) + share * np.log(after))), int(np.sign(high))
+
+
+def data_scaling(rows: pd.DataFrame) -> pd.DataFrame:
+    """Scene, split, method, frames, psnr, low, high, of captures whose training motion was cut; `rows`: all."""
+    rows = rows[rows["axis"].isin(("", FOOTAGE_AXIS)) & (rows["status"] == "done")]
+    rows = rows.assign(scene=rows["scene"].str.split(" ").str[0])
+    scenes = rows.loc[rows["axis"] == FOOTAGE_AXIS, "scene"].unique()
+    found = []
+    for (scene, severity), here in rows[rows["scene"].isin(scenes)].groupby(["scene", "severity"], sort=False):
+        for split in HELD_OUT_SPLITS:
+            for method, samples in samples_of(here, foreground(split)).items():
+                interval = mean_interval(independent(samples))
+                frames = FOOTAGE_FRAMES - int(severity)
+                found.append((scene, split, method, frames, interval.mean, interval.low, interval.high))
+    table = _table(found, "scene", "split", "method", "frames")
+    order = table["split"].map(HELD_OUT_SPLITS.index)
+    return table.assign(order=order).sort_values(["scene", "order", "method", "frames"]).drop(columns="order")
+
+
+def frames_needed(table: pd.DataFrame) -> list[str]:
+    """Sentences: at how many training frames a method is above static Gaussians on new poses."""
+    said = []
+    for method in dict.fromkeys(table["method"]):
+        for scene, here in table[table["split"] == "novel_pose"].groupby("scene", sort=False):
+            wide = here.pivot(index="frames", columns="method", values="psnr")
+            if method != STATIC and {method, STATIC} <= set(wide.columns):
+                rest = f"{style_of(STATIC).title} on {SPLIT_NAMES['novel_pose'].words}"
+                ahead = _when(wide[method] > wide[STATIC])
+                said.append(f"On {scene}, {style_of(method).title} is above {rest} {ahead}.")
+    return said
+
+
+def _when(ahead: pd.Series) -> str:
+    frames = ahead.index
+    if ahead.all():
+        return f"at every number of training frames, {frames.min()} to {frames.max()}"
+    if not ahead.any():
+        return "at no number of training frames"
+    if ahead.iloc[-1]:
+        return f"from {frames[frames > frames[~ahead].max()].min()} training frames on"
+    return f"at {', '.join(map(str, frames[ahead]))} training frames, but not at {frames.max()}"
+
+
+def novelty(images: pd.DataFrame) -> pd.DataFrame:
+    """Scene, method, novelty_deg, psnr, low, high: mean foreground PSNR by bins of novelty.
+
+    Novel views of training poses stand at zero degrees; the frames of all novel poses are sorted by novelty into bins
+    of equal number. Scenes whose frames fill fewer than two bins, or lie within a degree, have no curve.
+    """
+    known = images[images["split"].isin(HELD_OUT_SPLITS) & images["novelty_deg"].notna()]
+    rows = [row for scene, here in known.groupby("scene", sort=False) for row in _novelty_of(str(scene), here)]
+    return _table(rows, "scene", "method", "novelty_deg")
+
+
+def _novelty_of(scene: str, images: pd.DataFrame) -> Iterator[tuple]:
+    frames = images.drop_duplicates(["capture", "frame"])
+    moved = frames.loc[frames["split"] != "novel_view", "novelty_deg"]
+    count = min(BINS, len(moved) // LEAST)
+    if count < 2 or moved.max() < NARROW_DEG:
+        return
+    edges = np.quantile(moved, np.linspace(0, 1, count + 1)[1:-1])
+    of_image = pd.Series(1 + np.searchsorted(edges, images["novelty_deg"], side="right"), index=images.index)
+    of_image[images["split"] == "novel_view"] = 0
+    degrees = frames["novelty_deg"].groupby(of_image[frames.index]).mean()
+    means = images.groupby(["method", of_image, "capture", "seed"], sort=False)["psnr"].mean()
+    for index, mean_deg in degrees.items():
+        here = means[means.index.get_level_values(1) == index]
+        samples = {
+            str(method): own.groupby("capture").agg(list).to_dict()
+            for method, own in here.groupby("method", sort=False)
+        }
+        for method, found in intervals(samples).items():
+            yield scene, method, float(mean_deg), found.mean, found.low, found.high
+
+
+def losses_by_novelty(table: pd.DataFrame) -> list[str]:
+    """A sentence per scene: what each method loses from training poses to the most novel ones, least loss first."""
+    said = []
+    for scene, here in table.groupby("scene", sort=False):
+        ends = here.sort_values("novelty_deg").groupby("method", sort=False)
+        losses = {str(method): own["psnr"].iloc[0] - own["psnr"].iloc[-1] for method, own in ends if len(own) > 1}
+        names = ", ".join(
+            f"{style_of(m).title} {loss:.1f} dB" for m, loss in sorted(losses.items(), key=lambda p: p[1])
+        )
+        first, last = here["novelty_deg"].min(), here["novelty_deg"].max()
+        said.append(f"On {scene}, from {first:.0f} to {last:.0f} degrees from the training poses, PSNR falls: {names}.")
+    return said

@@ -1,0 +1,1 @@
+"""Exports of a finished capture: not part of its hash."""

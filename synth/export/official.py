@@ -1,0 +1,375 @@
+"""Export in the formats of the released ASH code: a capture that its trainer reads as if it came from a studio.
+
+Lengths are millimetres there. A ball joint is a chain of three one-axis joints; the root's yaw comes first and its
+angles count three times, as in the released skeletons, because the released code relies on it.
+"""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from ash.capture.dataset import Camera, Capture, Skeleton, TemplateMesh
+from ash.capture.formats import read_template_truth
+from ash.files import InputError, write_atomic, write_image, write_json
+from synth.posing import blended_dual_quaternions, bone_frames, rotvec_to_rotmat, skinning_transforms
+
+MM = 1000.0
+YAW_WEIGHT = 3.0
+INFLUENCES = 6
+NODE_REACH = (
+    2  # edges from any vertex to its nearest graph node; the release links up to 3, and knows no farther than 6
+)
+FOREGROUND = 127  # alpha above which the release's binary masks are on
+AXES = {"rx": (1, 0, 0), "ry": (0, 1, 0), "rz": (0, 0, 1)}
+
+
+def bone_name(joint: str) -> str:
+    """A joint's name without underscores: what follows an underscore tells the axis there."""
+    first, *rest = joint.split("_")
+    return first + "".join(word.capitalize() for word in rest)
+
+
+def skeleton_text(skeleton: Skeleton) -> str:
+    """`ddc.skeleton`: three prismatic root joints, then three revolute joints per ball joint, and one DoF for each."""
+    joints, dofs = [], []
+    offset = skeleton.heads[0] * MM
+    for k, axis in enumerate("xyz"):
+        parent = "none" if k == 0 else f"root_t{'xyz'[k - 1]}"
+        place = offset if k == 0 else np.zeros(3)
+        joints.append((f"root_t{axis}", "prismatic", parent, place, np.eye(3)[k]))
+        dofs.append((f"root_t{axis}", MM))
+    for j, name in enumerate(skeleton.names):
+        order = ("ry", "rz", "rx") if j == 0 else ("rz", "ry", "rx")
+        above = "root_tz" if j == 0 else f"{bone_name(skeleton.names[skeleton.parents[j]])}_rx"
+        place = np.zeros(3) if j == 0 else (skeleton.heads[j] - skeleton.heads[skeleton.parents[j]]) * MM
+        for axis in order:
+            full = f"{bone_name(name)}_{axis}"
+            joints.append((full, "revolute", above, place, np.array(AXES[axis], dtype=np.float64)))
+            dofs.append((full, YAW_WEIGHT if j == 0 else 1.0))
+            above, place = full, np.zeros(3)
+    lines = ["Skeletool Skeleton Definition V1.0", f"joints: {len(joints)}"]
+    for name, kind, parent, place, axis in joints:
+        numbers = " ".join(f"{value:.12g}" for value in (*place, *axis, 1.0))
+        lines.append(f"{name} {kind} {parent} {numbers}")
+    lines += ["markers: 0", "scaling joints: 0", f"dofs: {len(dofs)}"]
+    for name, weight in dofs:
+        lines += [f"{name} 1", "nolimits", f"{name} {weight:.12g}"]
+    return "\n".join(lines) + "\n"
+
+
+def euler_angles(rotations: np.ndarray, order: str) -> np.ndarray:
+    """Angles `[..., 3]` with R = R_first R_second R_third about the axes of `order` ("yzx" or "zyx"), radians."""
+    i, j, k = ("xyz".index(axis) for axis in order)
+    sign = 1.0 if (i, j, k) in ((0, 1, 2), (1, 2, 0), (2, 0, 1)) else -1.0
+    # R = R_i(a) R_j(b) R_k(c): the entry (i, k) is sign * sin(b).
+    second = np.arcsin(np.clip(sign * rotations[..., i, k], -1, 1))
+    first = np.arctan2(-sign * rotations[..., j, k], rotations[..., k, k])
+    third = np.arctan2(-sign * rotations[..., i, j], rotations[..., i, i])
+    return np.stack([first, second, third], axis=-1)
+
+
+def to_official_dofs(skeleton: Skeleton, dofs: np.ndarray) -> np.ndarray:
+    """Our degrees of freedom `[t, 3 + 3 j]` as those of `skeleton_text`; the root's angles are thirds."""
+    rotations = rotvec_to_rotmat(dofs[:, 3:].reshape(len(dofs), -1, 3))
+    angles = np.concatenate([euler_angles(rotations[:, :1], "yzx"), euler_angles(rotations[:, 1:], "zyx")], axis=1)
+    angles = np.unwrap(angles, axis=0)
+    angles[:, 0] /= YAW_WEIGHT
+    return np.concatenate([dofs[:, :3], angles.reshape(len(dofs), -1)], axis=1)
+
+
+def motion_text(dofs: np.ndarray) -> str:
+    """A motion file: a header, then a frame number and its degrees of freedom per line."""
+    lines = ["Skeletool Motion File V1.0"]
+    lines += [f"{frame} " + " ".join(f"{value:.12g}" for value in row) for frame, row in enumerate(dofs)]
+    return "\n".join(lines) + "\n"
+
+
+def normalise_motion(dofs: np.ndarray, windows: np.ndarray) -> np.ndarray:
+    """Translation and yaw relative to each frame: rows f-2, f-1, f (oldest first) for every frame f, `[3 t, d]`.
+
+    t' = R_y(-3 d3_f) (t_k - t_f), d3' = d3_k - d3_f, all else unchanged. `windows` `[t, 3]` holds f, f-1, f-2.
+    """
+    rows = []
+    for frame, window in enumerate(windows):
+        back = rotvec_to_rotmat(np.array([0, -YAW_WEIGHT * dofs[frame, 3], 0]))
+        for k in window[::-1]:
+            row = dofs[k].copy()
+            row[:3] = back @ (dofs[k, :3] - dofs[frame, :3])
+            row[3] -= dofs[frame, 3]
+            rows.append(row)
+    return np.array(rows)
+
+
+def skin_text(skeleton: Skeleton, weights: np.ndarray) -> str:
+    """`ddc.skin`: bone names, then the six heaviest weights of every vertex, heaviest first."""
+    order = np.argsort(-weights, axis=1, kind="stable")[:, :INFLUENCES]
+    heaviest = np.take_along_axis(weights, order, axis=1)
+    heaviest = heaviest / heaviest.sum(axis=1, keepdims=True)
+    lines = [
+        "Skeletool character skinning file V1.0",
+        "bones:",
+        " ".join(bone_name(name) for name in skeleton.names),
+        "vertex weights:",
+    ]
+    for vertex, (bones, values) in enumerate(zip(order, heaviest, strict=True)):
+        pairs = " ".join(f"{bone} {value:.9f}" for bone, value in zip(bones, values, strict=True))
+        lines.append(f"{vertex} {pairs}")
+    return "\n".join(lines) + "\n"
+
+
+def obj_text(vertices: np.ndarray, faces: np.ndarray, *, uvs: np.ndarray, uv_faces: np.ndarray, material: str) -> str:
+    """An OBJ in millimetres as the released reader wants it: colours behind vertices, `v/vt` faces."""
+    lines = [f"mtllib ./{material}"]
+    lines += ["v {:.9f} {:.9f} {:.9f} 0.7 0.7 0.7".format(*point) for point in vertices * MM]
+    lines += ["vt {:.9f} {:.9f}".format(*uv) for uv in uvs]
+    for face, uv in zip(faces + 1, uv_faces + 1, strict=True):
+        lines.append("f " + " ".join(f"{v}/{t}" for v, t in zip(face, uv, strict=True)))
+    return "\n".join(lines) + "\n"
+
+
+def calibration_text(cameras: list[Camera]) -> str:
+    """`cameras.calibration`: seven lines per camera, extrinsics from world to camera in millimetres."""
+    lines = ["Skeletool Camera Calibration File V1.0"]
+    for index, camera in enumerate(cameras):
+        intrinsic = np.eye(4)
+        intrinsic[:3, :3] = camera.K
+        extrinsic = camera.viewmat.copy()
+        extrinsic[:3, 3] *= MM
+        size = f"{camera.width} {camera.height}"
+        lines += [f"name {index}", f"sensor {size}", f"size {size}", "animated 0"]
+        for name, matrix in (("intrinsic", intrinsic), ("extrinsic", extrinsic)):
+            lines.append(f"{name} " + " ".join(f"{value:.12g}" for value in matrix.ravel()))
+        lines.append("radial 0")
+    return "\n".join(lines) + "\n"
+
+
+def cameras_json(cameras: list[Camera]) -> dict:
+    """`cameras.json` of the release: camera to world, OpenCV axes, in a world whose axes are permuted to (z, x, y)."""
+    frames = []
+    for index, camera in enumerate(cameras):
+        pose = np.linalg.inv(camera.viewmat)[[2, 0, 1, 3]]
+        fx, fy = camera.K[0, 0], camera.K[1, 1]
+        frames.append(
+            {
+                "file_path": f"{index:06d}",
+                "camera_angle_x": float(2 * np.arctan(camera.width / (2 * fx))),
+                "camera_angle_y": float(2 * np.arctan(camera.height / (2 * fy))),
+                "fl_x": float(fx),
+                "fl_y": float(fy),
+                "cx": float(camera.K[0, 2]),
+                "cy": float(camera.K[1, 2]),
+                "transform_matrix": pose.tolist(),
+            }
+        )
+    size = {"w": float(cameras[0].width), "h": float(cameras[0].height)}
+    return {"k1": 0, "k2": 0, "p1": 0, "p2": 0, **size, "aabb_scale": 16, "frames": frames}
+
+
+def cached_arrays(capture: Capture) -> dict[str, dict[int, np.ndarray]]:
+    """The six arrays per training frame that the released trainer caches of its template, from the truth instead."""
+    template, motion, skeleton = capture.template, capture.motion, capture.skeleton
+    posed = read_template_truth(capture) * MM
+    frames = sorted(capture.splits["train"].frames)
+    transforms = skinning_transforms(skeleton, motion.dofs)
+    transforms[..., :3, 3] *= MM
+    heads = bone_frames(skeleton, motion.dofs)[:, :, :3, 3] * MM
+    result: dict[str, dict[int, np.ndarray]] = {name: {} for name in CACHED}
+    for frame in frames:
+        window = motion.window(frame, 3)
+        pieces = [blended_dual_quaternions(template.skin_weights, transforms[k]) for k in window]
+        canonical = np.stack([_unpose(posed[k], *piece) for k, piece in zip(window, pieces, strict=True)])
+        result["cached_joints"][frame] = joint_places(skeleton, motion.dofs[frame], heads[frame])
+        result["cached_ret_posed_delta"][frame] = posed[window]
+        result["cached_ret_canonical_delta"][frame] = np.concatenate(
+            [canonical, np.ones((*canonical.shape[:2], 1))], axis=-1
+        )
+        result["cached_fin_rotation_quad"][frame], result["cached_fin_translation_quad"][frame] = pieces[0]
+        result["cached_temp_vert_normal"][frame] = np.stack([unit_normals(posed[k], template.faces) for k in window])
+    return result
+
+
+def joint_places(skeleton: Skeleton, dofs: np.ndarray, heads: np.ndarray) -> np.ndarray:
+    """Where every joint of `skeleton_text` is, `[3 + 3 j, 3]` millimetres: the root slides along x, then y, then z.
+
+    `heads` `[j, 3]` are where ours are; the three joints of a ball joint are at one place.
+    """
+    sliding = skeleton.heads[0] + np.tril(np.ones((3, 3))) * dofs[:3]
+    return np.concatenate([sliding * MM, np.repeat(heads, 3, axis=0)])
+
+
+def unit_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Normals `[v, 3]` as the release has them: the mean of the adjacent faces' unit normals, not weighted by area."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    across = np.cross(b - a, c - a)
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
+    normals = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(normals, faces[:, k], across)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+
+
+CACHED = (
+    "cached_joints",
+    "cached_ret_posed_delta",
+    "cached_ret_canonical_delta",
+    "cached_fin_rotation_quad",
+    "cached_fin_translation_quad",
+    "cached_temp_vert_normal",
+)
+
+
+def _unpose(posed: np.ndarray, real: np.ndarray, dual: np.ndarray) -> np.ndarray:
+    """Invert the rigid motion of unit dual quaternions: x = R^T (y - t)."""
+    w, axis = real[:, :1], -real[:, 1:]
+    shift = 2 * (real[:, :1] * dual[:, 1:] - dual[:, :1] * real[:, 1:] + np.cross(real[:, 1:], dual[:, 1:]))
+    moved = posed - shift
+    return moved + 2 * np.cross(axis, np.cross(axis, moved) + w * moved)
+
+
+def graph_nodes(template: TemplateMesh) -> np.ndarray:
+    """Vertices that serve as nodes of the embedded graph, so that on every piece of the mesh all have one in reach.
+
+    The release looks a node up as the nearest vertex that is not taken yet, so of two vertices at one place it may take
+    the other one; what that leaves out of reach becomes a node as well.
+    """
+    edges = _edges(template)
+    nodes = _spread(edges, np.arange(len(template.vertices)), np.zeros(0, dtype=np.int64))
+    while True:
+        far = np.flatnonzero(_hops(edges, taken_vertices(template.vertices, nodes)) > NODE_REACH + 1)
+        if not len(far):
+            return nodes
+        nodes = np.concatenate([nodes, _spread(edges, far, nodes)])
+
+
+def taken_vertices(vertices: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Which vertex the release takes for each node, in the order of the graph's file."""
+    free = np.ones(len(vertices), dtype=bool)
+    taken = []
+    for node in nodes:
+        distance = np.where(free, np.linalg.norm(vertices - vertices[node], axis=1), np.inf)
+        taken.append(int(np.argmin(distance)))
+        free[taken[-1]] = False
+    return np.array(taken)
+
+
+def graph_faces(template: TemplateMesh, nodes: np.ndarray) -> np.ndarray:
+    """Triangles `[f, 3]` of nodes whose regions (of nearest vertices along edges) meet in a face of the template."""
+    _, _, nearest = dijkstra(
+        _edges(template), directed=False, indices=nodes, unweighted=True, min_only=True, return_predecessors=True
+    )
+    index = np.full(len(template.vertices), -1)
+    index[nodes] = np.arange(len(nodes))
+    corners = index[nearest[template.faces]]
+    distinct = (np.diff(np.sort(corners, axis=1), axis=1) > 0).all(axis=1)
+    _, first = np.unique(np.sort(corners[distinct], axis=1), axis=0, return_index=True)
+    return corners[distinct][np.sort(first)]
+
+
+def _edges(template: TemplateMesh) -> csr_array:
+    one, other = template.faces.ravel(), template.faces[:, [1, 2, 0]].ravel()
+    ends = np.concatenate([one, other]), np.concatenate([other, one])
+    count = len(template.vertices)
+    return coo_array((np.ones(len(ends[0])), ends), shape=(count, count)).tocsr()
+
+
+def _hops(edges: csr_array, nodes: np.ndarray) -> np.ndarray:
+    """Edges from each vertex to its nearest node; infinite where there is none on its piece of the mesh."""
+    if not len(nodes):
+        return np.full(edges.shape[0], np.inf)
+    return dijkstra(edges, directed=False, indices=nodes, unweighted=True, min_only=True)
+
+
+def _spread(edges: csr_array, wanted: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """New nodes among `wanted`, in their order, each more than the reach away from all others."""
+    covered = _hops(edges, nodes) <= NODE_REACH
+    new = []
+    for vertex in wanted:
+        if not covered[vertex]:
+            new.append(vertex)
+            ball = {int(vertex)}
+            for _ in range(NODE_REACH):
+                ball |= {int(n) for v in ball for n in edges.indices[edges.indptr[v] : edges.indptr[v + 1]]}
+            covered[list(ball)] = True
+    return np.array(new, dtype=np.int64)
+
+
+def export_official(capture: Capture, folder: Path, *, subject: str = "Synthetic") -> Path:
+    """Write everything that the released trainer reads of a subject. Training views only, as there."""
+    skeleton, template = capture.skeleton, capture.template
+    meta = folder / "meta_data" / subject
+    dofs = to_official_dofs(skeleton, capture.motion.dofs)
+    windows = np.stack([capture.motion.window(frame, 3) for frame in range(len(dofs))])
+    cameras = [capture.cameras[name] for name in capture.splits["train"].cameras]
+    if not all(camera.is_pinhole for camera in cameras):
+        raise InputError(f"{capture.folder}: a lens distorts; expected pinholes: ash-bench export --format undistorted")
+    training = max(capture.splits["train"].frames) + 1
+    if capture.splits["train"].parts:
+        raise InputError(
+            f"{capture.folder}: a part of the cameras saw each frame, and the release reads an image of every camera in"
+            " every frame; make the capture with --rig.part 0"
+        )
+    _require_faces_everywhere(capture)
+    nodes = graph_nodes(template)
+    node_faces = graph_faces(template, nodes)
+    texts = {
+        "ddc.skeleton": skeleton_text(skeleton),
+        "ddc.skin": skin_text(skeleton, template.skin_weights),
+        "ddc.motion": motion_text(np.zeros((1, dofs.shape[1]))),
+        "ddc.obj": obj_text(
+            template.vertices, template.faces, uvs=template.uvs, uv_faces=template.uv_faces, material="ddc.obj.mtl"
+        ),
+        "ddc.obj.mtl": "newmtl cloth\nmap_Kd ddc.png\n",
+        "ddc_graph.obj": obj_text(
+            template.vertices[nodes],
+            node_faces,
+            uvs=np.zeros((len(nodes), 2)),
+            uv_faces=node_faces,
+            material="ddc.obj.mtl",
+        ),
+        "segmentation.txt": "\n".join(["0"] * len(template.vertices)) + "\n",
+        "hand_segmentation.txt": "\n".join(_hands(capture)) + "\n",
+        "real_translation.txt": "0 0 0\n",
+        "cameras.calibration": calibration_text(cameras),
+    }
+    for name, frames in (("skeletoolToGTPose", slice(0, training)), ("skeletoolToGTPoseTest", slice(training, None))):
+        if len(dofs[frames]):
+            texts[f"{name}/poseAngles.motion"] = motion_text(dofs[frames])
+            relative = normalise_motion(dofs, windows)[3 * (frames.start) : 3 * (frames.stop or len(dofs))]
+            texts[f"{name}/poseAnglesRotationNormalized.motion"] = motion_text(relative)
+    for name, text in texts.items():
+        write_atomic(meta / name, text.encode())
+    write_json(meta / "cameras.json", cameras_json(cameras))
+    texture = capture.folder / "truth" / "texture.png"
+    if texture.is_file():
+        write_atomic(meta / "ddc.png", texture.read_bytes())
+    for name, array in cached_arrays(capture).items():
+        write_atomic(folder / "cached_files" / f"{name}.pkl", pickle.dumps(array, protocol=4))
+    _write_images(capture, folder / "raw_data" / subject / "metadata" / "training")
+    return folder
+
+
+def _require_faces_everywhere(capture: Capture) -> None:
+    """The release's embedded graph knows no vertex that belongs to no face."""
+    lonely = len(capture.template.vertices) - len(np.unique(capture.template.faces))
+    if lonely:
+        raise InputError(f"{capture.folder}/template.npz: {lonely} vertices belong to no face, expected none")
+
+
+def _hands(capture: Capture) -> list[str]:
+    heaviest = np.argmax(capture.template.skin_weights, axis=1)
+    marks = {"hand_left": "1", "hand_right": "2"}
+    return [marks.get(capture.skeleton.names[j], "0") for j in heaviest]
+
+
+def _write_images(capture: Capture, folder: Path) -> None:
+    train = capture.splits["train"]
+    for index, camera in enumerate(train.cameras):
+        for frame in train.frames:
+            rgba = capture.image(camera, frame)
+            name = f"{index}/image_c_{index}_f_{frame}.png"
+            write_image(folder / "images" / name, rgba[..., :3])
+            mask = np.where(rgba[..., 3:] > FOREGROUND, np.uint8(255), np.uint8(0))
+            write_image(folder / "foregroundSegmentation" / name, np.repeat(mask, 3, axis=-1))

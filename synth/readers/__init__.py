@@ -1,1 +1,0 @@
-"""What reads captures and decides no byte of them."""

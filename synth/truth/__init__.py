@@ -1,0 +1,1 @@
+"""Truth that is derived from a capture or rendered on demand: not part of its hash."""

@@ -1,0 +1,62 @@
+"""The truth of a capture's person in any pose, seen by any camera: rendered when it is asked for."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from ash.capture.dataset import Camera, Capture, Pose, surface_path
+from ash.files import InputError, read_arrays
+from synth.camera.render import probe
+from synth.capture import make_body
+from synth.cloth import surface as cloth
+from synth.scene import Scene, stream
+from synth.shooting import studio_of
+from synth.truth.retargeting import scene_of
+
+HISTORY = 24  # frames before the pose, through which clothes are carried: they depend on where they came from
+
+
+class PoseTruth:
+    """Renders the person of a capture. Heavy: it belongs into a process of its own."""
+
+    def __init__(self, capture: Capture) -> None:
+        """Find a renderer.
+
+        Raises:
+            InputError: the capture is not of this version's scenes, has no truth, or nothing here renders.
+        """
+        self.capture, self.scene = capture, scene_of(capture.manifest, capture.folder)
+        if not (capture.folder / "truth" / "surface.npz").is_file():
+            raise InputError(f"{capture.folder}: has no truth to render")
+        self.renderer = probe()
+
+    def picture(self, pose: Pose, camera: Camera, *, captured: bool, tell: Callable[[str], None]) -> np.ndarray:
+        """RGBA uint8 `[h, w, 4]`, straight alpha: exactly the capture's image where frame and camera are its own.
+
+        `captured`: the frame is one of the capture's, whose surface is known; else the person is posed and dressed
+        anew, from `HISTORY` frames of the motion. `tell` hears what is being done.
+        """
+        if captured:
+            surface = read_arrays(surface_path(self.capture.folder, pose.frame), expected=("vertices",))["vertices"]
+        else:
+            tell("posing the body and its clothes")
+            surface = dressed(self.scene, pose)
+        tell("tracing light")
+        studio = studio_of(self.scene, self.capture.folder, self.renderer)
+        seed = stream(self.scene, "pixels", camera.name, pose.frame)
+        return studio.shoot(surface, [camera], samples=self.scene.samples, seeds=[seed])[0].rgba
+
+
+def dressed(scene: Scene, pose: Pose) -> np.ndarray:
+    """The true surface in a frame of a motion that the scene never saw, `[s, 3]` float32 metres."""
+    first = int(pose.window(HISTORY)[-1])
+    clip = replace(
+        pose.motion,
+        dofs=pose.motion.dofs[first : pose.frame + 1],
+        sequence=pose.motion.sequence[first : pose.frame + 1],
+    )
+    if len(clip.dofs) == 1:  # Cloth that swings needs a before.
+        clip = replace(clip, dofs=clip.dofs.repeat(2, axis=0), sequence=clip.sequence.repeat(2))
+    surface = cloth.true_surface(make_body(scene), clip, scene.outfit, seed=stream(scene, "folds"))
+    return surface[-1].astype(np.float32)

@@ -1,0 +1,181 @@
+"""Quality against training seconds, training frames and novelty, on known numbers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.cells import cell, config
+
+from ash.protocol import TrainingOutcome
+from benchmarks.analysis import curves, stability
+from benchmarks.analysis.results import RunTables, load, load_images, load_snapshots
+from benchmarks.cell.cells import CellResult, CurvePoint, Snapshot, Summary, ViewScore, failed_result
+from benchmarks.cell.curves import seconds_to_settle
+from benchmarks.report import sections, tables
+from benchmarks.report.content import Bullets
+from benchmarks.report.vega import Figure
+
+STATIC = {30: 23.0, 60: 24.0, 120: 24.0}
+LEARNED = {30: 22.0, 60: 23.5, 120: 25.0, 240: 26.0}
+
+
+def trained(method: str, course: dict[int, float], *, seed: int = 0) -> CellResult:
+    """A cell with snapshots of these scores; the last is its end."""
+    *early, end = course.items()
+    snapshots = tuple(
+        Snapshot(seconds=float(s), split=split, psnr=p) for s, p in early for split in ("novel_view", "novel_pose")
+    )
+    outcome = TrainingOutcome(steps=100, seconds=float(end[0]), ended_by="plateau")
+    return replace(cell(method, end[1], seed=seed), snapshots=snapshots, training=outcome)
+
+
+def test_methods_cross_where_their_scores_are_equal() -> None:
+    """ASH is 0.5 dB behind after a minute and 1 dB ahead after two: a third of the way, in the logarithm."""
+    table = curves.time_to_quality(load_snapshots([trained("wo_mot", STATIC), trained("ash", LEARNED)]))
+    views = table[table.split == "novel_view"]
+    assert views[views.method == "ash"].psnr.tolist() == [22.0, 23.5, 25.0, 26.0]
+    assert views[views.method == "wo_mot"].psnr.tolist() == [23.0, 24.0, 24.0, 24.0], "it had ended"
+    assert curves.crossings(views) == [
+        f"On loose, novel views, ASH is ahead of w/o mot. from {60 * 2 ** (1 / 3):.0f} s of training on."
+    ]
+    above = {s: p + 1 for s, p in STATIC.items()}
+    table = curves.time_to_quality(load_snapshots([trained("wo_mot", STATIC), trained("ash", above)]))
+    assert curves.crossings(table)[0].endswith("ASH is ahead of w/o mot. at every time, by 1.0 to 1.0 dB.")
+
+
+def test_seeds_give_intervals_and_are_averaged_within_captures() -> None:
+    cells = [
+        trained("ash", {s: p + shift for s, p in LEARNED.items()}, seed=i) for i, shift in enumerate((-0.2, 0, 0.2))
+    ]
+    table = curves.time_to_quality(load_snapshots(cells))
+    assert (table.high > table.psnr).all() and (table.low < table.psnr).all()
+    assert np.isnan(curves.time_to_quality(load_snapshots(cells[:1])).low).all()
+    runs = [
+        replace(run, config=replace(run.config, capture=capture))
+        for capture, shift in (("a", 0.0), ("b", 4.0))
+        for seed in (0, 1)
+        for run in [trained("ash", {s: p + shift + seed for s, p in LEARNED.items()}, seed=seed)]
+    ]
+    first = curves.time_to_quality(load_snapshots(runs)).query("split == 'novel_view'").iloc[0]
+    assert (first.psnr, first.high - first.psnr) == (24.5, pytest.approx(12.706 * 2.0, rel=1e-4))  # t of 1 degree
+
+
+@pytest.mark.parametrize(
+    ("scores", "expected"),
+    [
+        ((22.0, 23.1, 22.9, 23.5, 24.0), "from 160 training frames on."),
+        ((23.1, 23.1, 23.1, 23.5, 24.0), "at every number of training frames, 20 to 320."),
+        ((20.0, 20.0, 20.0, 20.0, 20.0), "at no number of training frames."),
+        ((23.1, 22.0, 23.1, 22.0, 22.0), "at 20, 80 training frames, but not at 320."),
+    ],
+)
+def test_from_how_many_training_frames_on_motion_helps(scores: tuple[float, ...], expected: str) -> None:
+    frames = dict(zip((20, 40, 80, 160, 320), scores, strict=True))
+
+    def made(method: str, score: float, count: int) -> CellResult:
+        missing = 320 - count
+        return cell(method, score, axis="footage" if missing else "", severity=float(missing))
+
+    results = [made("ash", score, count) for count, score in frames.items()]
+    results += [made("wo_mot", 23.0, count) for count in frames]
+    table = curves.data_scaling(load(results))
+    assert table[(table.method == "ash") & (table.split == "novel_pose")].frames.tolist() == [20, 40, 80, 160, 320]
+    assert curves.frames_needed(table) == [f"On loose, ASH is above w/o mot. on novel poses {expected}"]
+    assert list(dict.fromkeys(table.split)) == ["novel_view", "novel_pose"]
+    assert not len(stability.steps(load(results)).query("axis == 'footage'")), "less footage is no perturbation"
+
+
+def test_the_report_draws_what_was_run_on_a_scale_for_each_scene() -> None:
+    results = [trained("wo_mot", STATIC), trained("ash", LEARNED)]
+    results += [replace(r, config=replace(r.config, scene="elsewhere")) for r in [trained("ash", {30: 31.0, 60: 33.0})]]
+    (section,) = sections.training_cost(RunTables(results))
+    figure, said = section.blocks
+    assert isinstance(figure, Figure) and figure.file == "chart_budget.svg" and "ASH" in figure.svg()
+    spans = [panel.to_dict()["layer"][1]["encoding"]["y"]["scale"]["domain"] for panel in figure.panels]
+    assert len(spans) == 4 and spans[0] == spans[1] != spans[2] == spans[3]
+    assert isinstance(said, Bullets) and any("ahead" in sentence for sentence in said.items)
+    assert sections.training_cost(RunTables([cell("ash", 20.0)])) == []
+
+
+def test_a_curve_settles_where_it_never_leaves_the_last_three_tenths_again() -> None:
+    scores = {10: 20.0, 20: 24.8, 30: 24.5, 40: 24.75, 80: 25.0}
+    curve = tuple(CurvePoint(seconds=float(s), loss=None, psnr=p) for s, p in scores.items())
+    assert seconds_to_settle(curve) == 40
+    assert seconds_to_settle(curve[-1:]) == 80
+    assert seconds_to_settle((CurvePoint(seconds=1.0, loss=0.1, psnr=None),)) is None
+
+
+MOTION = {"near_pose": (3.0, 4.0, 5.0), "novel_pose": (10.0, 11.0, 12.0), "far_pose": (18.0, 20.0, 22.0)}
+
+
+def moving(method: str, seed: int, slope: float, *, capture: str = "c", level: float = 30.0) -> CellResult:
+    """PSNR falls by `slope` dB per degree, and one seed is half a decibel better than the next."""
+    views = [
+        ViewScore(
+            split=split,
+            camera=camera,
+            frame=100 * index + number,
+            prediction="",
+            scores={("foreground", "psnr"): level - slope * degrees - 0.5 * seed, ("", "novelty_deg"): degrees},
+        )
+        for index, (split, all_degrees) in enumerate([("novel_view", (0.0, 0.0)), *MOTION.items()])
+        for number, degrees in enumerate(all_degrees)
+        for camera in ("a", "b")
+    ]
+    summary = [
+        Summary(split=split, region="foreground", metric="psnr", value=level - slope * float(np.mean(degrees)))
+        for split, degrees in [("novel_view", (0.0,)), *MOTION.items()]
+    ]
+    place = replace(config(method, seed), capture=capture * 64)
+    return CellResult(config=place, status="done", summary=tuple(summary), views=tuple(views))
+
+
+def test_bins_of_novelty_hold_equal_numbers_of_frames_and_their_means() -> None:
+    table = curves.novelty(load_images([moving("ash", 0, 0.5), moving("wo_mot", 0, 0.1)]))
+    ash = table[table["method"] == "ash"]
+    np.testing.assert_allclose(ash["novelty_deg"], [0, 4, 11, 20])
+    np.testing.assert_allclose(ash["psnr"], [30, 28, 24.5, 20])
+    assert ash[["low", "high"]].isna().all(axis=None), "one training has no interval"
+    assert curves.losses_by_novelty(table) == [
+        "On loose, from 0 to 20 degrees from the training poses, PSNR falls: w/o mot. 2.0 dB, ASH 10.0 dB."
+    ]
+
+
+def test_intervals_of_novelty_are_over_seeds_of_one_capture_and_over_several_captures() -> None:
+    seeds = curves.novelty(load_images([moving("ash", seed, 0.5) for seed in range(3)]))
+    np.testing.assert_allclose(seeds["psnr"], [29.5, 27.5, 24, 19.5])
+    np.testing.assert_allclose(seeds["high"] - seeds["psnr"], 4.3026528 * 0.5 / np.sqrt(3), rtol=1e-5)
+    several = [
+        moving("ash", seed, 0.5, capture=name, level=30 + gain) for gain, name in enumerate("cd") for seed in (0, 1)
+    ]
+    captures = curves.novelty(load_images(several))
+    half = 12.7062047 * np.std([0, 1], ddof=1) / np.sqrt(2)
+    np.testing.assert_allclose(captures["high"] - captures["psnr"], half, rtol=1e-5)
+
+
+def test_one_pose_and_results_without_novelty_have_no_curve() -> None:
+    images = load_images([moving("ash", 0, 0.5)])
+    assert curves.novelty(images.assign(novelty_deg=images["novelty_deg"] / 25)).empty
+    assert not curves.novelty(images.assign(novelty_deg=images["novelty_deg"] / 20)).empty
+    old = moving("ash", 0, 0.5)
+    views = [replace(v, scores={("foreground", "psnr"): 20.0}) for v in old.views if v.split == "novel_view"]
+    assert sections.novelty(RunTables([replace(old, views=tuple(views))])) == []
+
+
+def test_the_chart_of_novelty_has_a_line_per_method() -> None:
+    (section,) = sections.novelty(RunTables([moving("ash", s, 0.5) for s in (0, 1)] + [moving("ddc", 0, 0.2)]))
+    figure = section.blocks[0]
+    assert isinstance(figure, Figure) and figure.file == "chart_novelty.svg"
+    assert [series.title for series in figure.series] == ["ASH", "DDC"]
+    assert "novelty of the pose [degrees]" in figure.svg()
+
+
+@pytest.mark.parametrize("splits", [("novel_view", "novel_pose"), ("novel_view", *MOTION)])
+def test_tables_show_near_and_far_where_a_scene_has_them(splits: tuple[str, ...]) -> None:
+    whole = moving("ash", 0, 0.5)
+    own = replace(whole, summary=tuple(row for row in whole.summary if row.split in splits))
+    fallen = failed_result(config("ddc"), "crashed", "", splits=splits)
+    made = tables.build(RunTables([own, fallen]), "loose", tables.quality_columns(("psnr",)), title="")
+    groups = [group for group, _ in made.groups]
+    assert ("Novel pose: near" in groups) == ("Novel pose: far" in groups) == ("near_pose" in splits)
+    assert "Novel pose: new" in groups

@@ -1,0 +1,102 @@
+"""Differences over captures: their false alarms, and what a run could have found."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from helpers.cells import cell, people
+from scipy import stats
+
+from benchmarks.analysis.differences import detectable_effects, differences
+from benchmarks.analysis.pareto import candidates
+from benchmarks.analysis.results import COLUMNS, RunTables, compare, foreground
+from benchmarks.analysis.statistics import detectable
+from benchmarks.cell.cells import failed_result
+from benchmarks.report.content import Table
+from benchmarks.report.scene import detectable as detectable_sentence
+from benchmarks.report.scene import difference_blocks
+
+ROUNDS, TABLES = 600, 200
+
+
+def null_rows(rng: np.random.Generator, *, captures: int, seeds: int, methods: tuple[str, ...]) -> pd.DataFrame:
+    """A scene on which no method is better: captures differ by 3 dB, methods on a capture by chance."""
+    rows = [
+        ("scene", method, seed, *foreground(), value, "dB", "up", "2", subject, str(subject))
+        for subject, level in enumerate(rng.normal(25, 3, captures))
+        for method in methods
+        for luck in [rng.normal(0, 0.2)]
+        for seed, value in enumerate(level + luck + rng.normal(0, 0.15, seeds))
+    ]
+    return pd.DataFrame(rows, columns=list(COLUMNS)).assign(axis="", severity=0.0, status="done")
+
+
+@pytest.mark.parametrize(("captures", "seeds"), [(8, 1), (4, 2), (1, 3)])
+def test_false_alarms_are_at_most_five_percent(captures: int, seeds: int) -> None:
+    """On one capture a method's luck there is part of the truth: only seeds may differ."""
+    rng = np.random.default_rng(captures)
+    runs = (null_rows(rng, captures=captures, seeds=seeds, methods=("ash", "ddc")) for _ in range(ROUNDS))
+    tests = [compare(rows, "ash", "ddc", foreground()) for rows in runs]
+    alarms = sum(test is not None and test.significant for test in tests)
+    if captures == 1:
+        assert alarms / ROUNDS > 0.2, "seeds of one capture say nothing about the next: the reason for several"
+    else:
+        assert stats.binomtest(alarms, ROUNDS, 0.05, alternative="greater").pvalue > 0.01, alarms / ROUNDS
+        assert alarms / ROUNDS > 0.02, "a test that never alarms is none"
+
+
+def test_a_table_of_differences_keeps_the_level_over_all_its_rows() -> None:
+    rng = np.random.default_rng(9)
+    alarms = 0
+    for _ in range(TABLES):
+        captures = rng.normal(25, 3, 8)
+        levels = {m: captures + rng.normal(0, 0.2, 8) for m in ("ash", "ddc", "mlp", "static", "wo_mot")}
+        tables = RunTables(people({m: own.tolist() for m, own in levels.items()}))
+        alarms += bool((differences(tables)["p"] < 0.05).any())
+    assert stats.binomtest(alarms, TABLES, 0.05, alternative="greater").pvalue > 0.01, alarms / TABLES
+
+
+def test_a_method_is_compared_on_the_captures_that_both_have() -> None:
+    tables = RunTables(people({"ash": (20.0, 25.0, 31.0, 40.0), "ddc": (19.5, 24.7, 30.6)}, seeds=(0.0, 0.2)))
+    found = compare(tables.of("loose"), "ash", "ddc", foreground())
+    assert found is not None and found.captures == 3 and found.mean == pytest.approx(0.4)
+    assert found.p == pytest.approx(stats.ttest_rel([20.1, 25.1, 31.1], [19.6, 24.8, 30.7]).pvalue)
+
+
+def test_a_failed_method_is_compared_with_nobody() -> None:
+    results = people({"ash": (20.0, 25.0), "ddc": (19.5, 24.7)})
+    results[-1] = failed_result(results[-1].config, "crashed", "boom")
+    assert not len(differences(RunTables(results)))
+
+
+def test_methods_compete_on_the_captures_that_all_have() -> None:
+    tables = RunTables(people({"ash": (20.0, 25.0, 40.0), "ddc": (19.5, 24.7)}))
+    assert [c.psnr for c in candidates(tables, "loose", "novel_view")] == [22.5, pytest.approx(22.1)]
+
+
+def test_what_more_captures_show_follows_from_the_spread_over_captures() -> None:
+    levels = {"ash": (20.0, 25.0, 30.0, 35.0), "ddc": (19.0, 24.2, 29.2, 34.0), "mlp": (18.0, 25.0, 27.0, 30.0)}
+    table = differences(RunTables(people(levels)))
+    found = detectable_effects(table).query("split == 'novel_view'").set_index("captures")
+    assert list(found.index) == [1, 2, 4, 8, 16] and math.isinf(found.loc[1, "median"])
+    assert found.loc[4, "worst"] == pytest.approx(table.loc[table["method"] == "mlp", "detectable"].iloc[0])
+    spread = [np.std(np.subtract(levels["ash"], levels[name]), ddof=1) for name in ("ddc", "mlp")]
+    assert found.loc[8, "median"] == pytest.approx(detectable(float(np.mean(spread)), 8))
+
+
+def test_a_report_says_what_was_compared_and_what_could_be_found() -> None:
+    many = RunTables(people({"ash": (20.0, 25.0, 30.0), "ddc": (19.0, 24.2, 29.2)}))
+    ranked = differences(many)
+    main, more = (b for b in difference_blocks(many, "loose", ranked) if isinstance(b, Table))
+    assert list(main.frame.columns)[2] == "95 % interval [captures, paired t]"
+    assert main.frame.index[0] == "DDC" and main.frame["verdict"].tolist() == ["better", "better"]
+    assert more.frame.iloc[0, 0] == "none"
+    said = detectable_sentence(many, "loose", ranked)
+    assert "Smallest detectable difference to ASH, median row: 0." in said and "3 captures, compared in pairs" in said
+    one = RunTables(people({"ash": (20.0,), "ddc": (19.0,)}, seeds=(0.0, 0.1, 0.3)))
+    (main,) = (b for b in difference_blocks(one, "loose", differences(one)) if isinstance(b, Table))
+    assert list(main.frame.columns)[2] == "95 % interval [seeds, Welch]"
+    single = RunTables([cell("ash", 20.0), cell("ddc", 19.0)])
+    assert difference_blocks(single, "loose", differences(single)) == []
+    assert "no verdict" in detectable_sentence(single, "loose", differences(single))
