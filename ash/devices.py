@@ -1,4 +1,4 @@
-"""Devices: which one is meant, whether everything learned can run there, and how things get there.
+"""Devices: by name, whether they can be used, and moving values to them.
 
 Tensors carry their device, and a function with a fast version dispatches on it. What is learned starts on the CPU, so
 that a start is the same for every device, and is then moved as a whole.
@@ -47,37 +47,37 @@ def device_named(name: str) -> torch.device:
 
 
 def describe_gpu(name: str = "cuda") -> str:
-    """What a CUDA device has that a training needs, in a few words."""
-    found = torch.cuda.get_device_properties(torch.device(name))
+    """Memory, compute capability and bfloat16 of a CUDA device."""
+    gpu = torch.cuda.get_device_properties(torch.device(name))
     half = "with" if torch.cuda.is_bf16_supported() else "without"
-    return f"{found.total_memory / 2**30:.0f} GB, compute capability {found.major}.{found.minor}, {half} bfloat16"
+    return f"{gpu.total_memory / 2**30:.0f} GB, compute capability {gpu.major}.{gpu.minor}, {half} bfloat16"
 
 
 def finish(device: torch.device) -> None:
-    """Wait for what was queued on a GPU, so that a clock that is read next has seen it."""
+    """Wait for what was queued on a GPU, so that a clock that is read next includes it."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def moved(value: Moved, device: torch.device) -> Moved:
     """The value with its tensors on a device: a tensor, whatever has `to`, or a dataclass, list or tuple of such."""
-    found: Any = value
-    if isinstance(value, type) or found is None:
+    result: Any = value
+    if isinstance(value, type) or result is None:
         return value
     if hasattr(value, "to"):
-        found = found.to(device)
+        result = result.to(device)
     elif is_dataclass(value):
         parts = {field.name: getattr(value, field.name) for field in fields(value) if field.init}
         there = {name: moved(part, device) for name, part in parts.items()}
         if any(there[name] is not part for name, part in parts.items()):
-            found = replace(found, **there)
+            result = replace(result, **there)
     elif isinstance(value, list | tuple) and not hasattr(value, "_fields"):
-        found = type(value)(moved(part, device) for part in value)
-    return found  # type: ignore[no-any-return]
+        result = type(value)(moved(part, device) for part in value)
+    return result  # type: ignore[no-any-return]
 
 
 class MovingModule(nn.Module):
-    """A module that takes what its plain attributes hold along when it is moved."""
+    """A module whose plain attributes move with it."""
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "MovingModule":
         super()._apply(fn, recurse)

@@ -4,6 +4,7 @@ OLD_COMMANDS: dict[str, tuple[str, ...]] = {  # old command -> what is typed in 
     "merge": ("report",),
     "rescore": ("eval", "--scores-only"),
     "retarget": ("eval",),
+    "suites": ("run", "--list"),
     "undistort": ("export", "--format", "undistorted"),
     "export-avatar": ("export",),
     "share": ("export", "--format", "html"),
@@ -13,3 +14,5 @@ OLD_COMMANDS: dict[str, tuple[str, ...]] = {  # old command -> what is typed in 
 OLD_FORMATS = {"glb": "gltf"}  # of `export`, for avatars
 
 OLD_FIELDS = {"model.fade": "model.novelty_scale"}  # of configurations, as flags and as keys of a suite's file
+OLD_SUITES = {"ladder": "factors"}
+OLD_SIZES = {"rung": "factor"}  # of scenes

@@ -37,7 +37,6 @@ METHOD_PATH_FLAG = "--method-path"
 
 COMMANDS = {
     "run": "runs:RunCommand",
-    "suites": "checkout:SuitesCommand",
     "synth": "captures:SynthCommand",
     "train": "runs:TrainCommand",
     "report": "runs:ReportCommand",

@@ -1,4 +1,4 @@
-"""Named scenes. A scene is a function of its size and seed; each rung adds exactly one phenomenon to `skinned`."""
+"""Named scenes: functions of size and seed. Each factor scene adds exactly one phenomenon to `skinned`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from synth.motion.clips import clip_from_file
 from synth.motion.importing import WHOLE
 from synth.scene import Clip, Light, Outfit, Rig, Scene, Take
 
-SIZES = ("ci", "rung", "quick", "long", "table", "paper")
+SIZES = ("ci", "factor", "quick", "long", "table", "paper")
 ROTATING = Rig(cameras=24, held_out=4, part=4)
 ALONE: dict[str, Any] = {"near": (), "far": (), "near_stride": 1, "far_stride": 1}  # no motion beside what is asked for
 EVENING = Light(falloff=0.4, gloss=0.2)  # a lamp that lights one side of the floor, on cloth that shines a little
@@ -39,7 +39,7 @@ def _size(name: str) -> Size:
         rig = Rig(cameras=6, held_out=2, width=128, height=128)
         apart = {"test_frames": 3, "stride": 3, "near_stride": 2, "far_stride": 2}
         return Size(rig=rig, repeats=1, frames=4, **apart, samples=16, texture=512)
-    if name == "rung":  # Enough cameras for held-out views to be between them, enough pixels for what a rung adds.
+    if name == "factor":  # Novel views lie between cameras, and pixels show what a factor adds.
         rig = Rig(cameras=20, held_out=4, part=8, width=192, height=192)
         apart = {"test_frames": 12, "stride": 10, "near_stride": 10, "far_stride": 4}
         return Size(rig=rig, repeats=2, frames=10, **apart, samples=50, texture=1024)
@@ -110,9 +110,9 @@ def tight(*, size: str, seed: int) -> Scene:
 
 
 def skinned(*, size: str, seed: int) -> Scene:
-    """Articulation only: the template with the true skinning is exact. The scene that every rung adds to.
+    """Articulation only: the template with the true skinning is exact. The scene that every factor scene adds to.
 
-    At size `ci` the body is the mannequin, so that all rungs together take minutes and need no body model.
+    At size `ci` the body is the mannequin, so that all factor scenes together take minutes and need no body model.
     """
     amount = _size(size)
     # Nothing that lifts the knees through a skirt that is only skinned.
@@ -121,8 +121,8 @@ def skinned(*, size: str, seed: int) -> Scene:
     return _moving(base, amount, kinds, ("arms_up",))
 
 
-def rung(name: str, *, size: str, seed: int = 0, strength: float = 1.0) -> Scene:
-    """A rung: `skinned` with one phenomenon, whose strength 0 gives the images of `skinned` back bit for bit."""
+def factor_scene(name: str, *, size: str, seed: int = 0, strength: float = 1.0) -> Scene:
+    """A factor scene: `skinned` with one phenomenon; at strength 0 its images are those of `skinned`, bit for bit."""
     base = replace(skinned(size=size, seed=seed), name=name)
     if name == "wrinkles":
         return replace(base, outfit=replace(base.outfit, folds_mm=7.0 * strength))
@@ -134,7 +134,7 @@ def rung(name: str, *, size: str, seed: int = 0, strength: float = 1.0) -> Scene
         return replace(base, light=replace(base.light, gloss=strength))
     if name == "turning":
         return replace(base, test=tuple(replace(clip, yaw=2.4 * strength) for clip in base.test))
-    raise InputError(f"unknown rung {name!r}, expected one of {', '.join(RUNGS)}")
+    raise InputError(f"unknown factor scene {name!r}, expected one of {', '.join(FACTORS)}")
 
 
 def still(*, size: str, seed: int) -> Scene:
@@ -145,12 +145,12 @@ def still(*, size: str, seed: int) -> Scene:
     return replace(base, name="still", rig=rig, train=(train,), test=(test,), **ALONE, novel_view_stride=2)
 
 
-RUNGS = ("wrinkles", "swing", "lit", "glossy", "turning")
+FACTORS = ("wrinkles", "swing", "lit", "glossy", "turning")
 SCENES: dict[str, Callable[..., Scene]] = {
     "mannequin": mannequin,
     "still": still,
     "skinned": skinned,
-    **{name: partial(rung, name) for name in RUNGS},
+    **{name: partial(factor_scene, name) for name in FACTORS},
     "tight": tight,
     "loose": loose,
 }

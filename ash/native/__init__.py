@@ -1,1 +1,1 @@
-"""C++17 kernels and the way to them."""
+"""C++17 kernels, and the nodes of torch's graph that call them."""

@@ -36,7 +36,6 @@ _SIGNATURES: dict[str, tuple[type | None, list[type]]] = {
     "ash_release": (None, [_P]),
     "ash_stage_seconds": (None, [POINTER(c_double)]),
     "ash_l1_ssim": (c_int, [_P] * 3 + [c_int] * 4 + [c_float] * 2 + [c_int, _P, POINTER(c_double)]),
-    "ash_composite": (None, [_P, c_int64, c_int, c_int, _P, _P, _P]),
     "ash_adam": (c_int, [c_int, *[POINTER(_P)] * 5, POINTER(c_int64), *[c_double] * 4, c_int]),
     "ash_shade": (None, [*_SHADE, c_int, _P]),
     "ash_shade_backward": (None, [*_SHADE, _P, _P, POINTER(c_double), _P]),
@@ -98,7 +97,7 @@ def load() -> ctypes.CDLL:
 def _parallel_of_torch() -> int | None:
     """The address of `GOMP_parallel` in the OpenMP runtime that torch has loaded; None where it uses another kind."""
     try:
-        # A symbol is looked up in a library and in all that it depends on: found under whatever name torch ships it.
+        # A symbol is looked up in a library and in all that it depends on, under whatever name torch ships it.
         parallel = ctypes.CDLL(torch._C.__file__).GOMP_parallel
     except (OSError, AttributeError):
         return None
@@ -111,10 +110,10 @@ def use_team(*, of_torch: bool) -> None:
 
 
 def keep_freed_memory() -> bool:
-    """Let the C library keep what is freed for the next allocation; False: it is not glibc, and nothing changes.
+    """Let the C library reuse freed memory for the next allocation; False: it is not glibc, and nothing changes.
 
-    By default large arrays go back to the system as they are freed, and come anew page fault by page fault: 2,000 in
-    every step of the mesh, a sixth of its time.
+    By default large arrays are returned to the system, and each new one costs page faults: 2,000 in a step of the mesh,
+    a sixth of its time.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

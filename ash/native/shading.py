@@ -46,7 +46,7 @@ class _Shade(Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         texture, light, _, weights = ctx.saved_tensors
-        grad = grad.contiguous()  # Kept by name: an address does not keep what it points at.
+        grad = grad.contiguous()  # An address holds no reference to what it points at.
         grad_texture, sums = torch.empty_like(texture), (c_double * 27)()
         grad_weights = torch.empty_like(weights) if ctx.needs_input_grad[2] else None
         load().ash_shade_backward(

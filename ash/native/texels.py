@@ -1,4 +1,8 @@
-"""The native kernels of Stg. 2 and Eq. 5: what a texel takes from its triangle, and raw parameters to Gaussians."""
+"""The native kernels of Stg. 2 and Eq. 5: a texel's place on its triangle, and raw parameters to Gaussians.
+
+`pose` saves 27 % of a training step of the default `ash` (13 of 48 ms, 30,569 texels, one thread),
+`place_texels` 4.4 ms of a played frame (16 ms).
+"""
 
 from ctypes import c_double
 from typing import Any, NamedTuple

@@ -1,7 +1,7 @@
 """Adam (Kingma and Ba 2015): `torch._fused_adam_` defines it, the native kernel does the same in float32 on the CPU.
 
-`torch.optim.Adam` does the same arithmetic, but its class imports torch's compiler: 2.6 seconds of every process, a
-quarter of a small training.
+The kernel saves 3.3 % of a training step of the default `ash` (1.2 of 36 ms, one thread). `torch.optim.Adam` does the
+same arithmetic, but its class imports torch's compiler: 2.6 seconds of every process.
 """
 
 from ctypes import c_int64, c_void_p
@@ -53,10 +53,10 @@ class Adam:
     def _move(self, first: int, parameters: list[Tensor], moments: list[Moments], lr: float) -> bool:
         """All of one learning rate; whether their gradients were finite."""
         if all(p.dtype == torch.float32 and p.device.type == "cpu" for p in parameters):
-            known = self._addresses.get(first)
-            if known is None or not known.are_of(parameters, moments):
-                known = self._addresses[first] = _Addresses(parameters, moments)
-            return _move_native(known, lr, self.eps)
+            addresses = self._addresses.get(first)
+            if addresses is None or not addresses.are_of(parameters, moments):
+                addresses = self._addresses[first] = _Addresses(parameters, moments)
+            return _move_native(addresses, lr, self.eps)
         finite = _all_finite([parameter.grad for parameter in parameters if parameter.grad is not None])
         _move_by_torch(parameters, moments, lr, self.eps)
         return finite
@@ -79,9 +79,9 @@ def _all_finite(gradients: list[Tensor]) -> bool:
 
     Nothing but this operation of torch's looks at a whole list; the scale by which it multiplies is 1.
     """
-    found, scale = (gradients[0].new_full((), value, dtype=torch.float32) for value in (0.0, 1.0))
-    torch._amp_foreach_non_finite_check_and_unscale_(gradients, found, scale)
-    return not bool(found)
+    not_finite, scale = (gradients[0].new_full((), value, dtype=torch.float32) for value in (0.0, 1.0))
+    torch._amp_foreach_non_finite_check_and_unscale_(gradients, not_finite, scale)
+    return not bool(not_finite)
 
 
 def _move_by_torch(parameters: list[Tensor], moments: list[Moments], lr: float, eps: float) -> None:
@@ -123,10 +123,10 @@ def _addresses(tensors: list[Tensor]) -> Any:
     return (c_void_p * len(tensors))(*(tensor.data_ptr() for tensor in tensors))
 
 
-def _move_native(known: _Addresses, lr: float, eps: float) -> bool:
-    grads = [_laid_like(parameter) for parameter in known.parameters]  # Kept by name until they were read.
-    arrays = known.places, _addresses(grads), known.means, known.squares, known.steps
-    return bool(load().ash_adam(len(grads), *arrays, known.counts, lr, *BETAS, eps, torch.get_num_threads()))
+def _move_native(addresses: _Addresses, lr: float, eps: float) -> bool:
+    grads = [_laid_like(parameter) for parameter in addresses.parameters]  # Referenced until they were read.
+    arrays = addresses.places, _addresses(grads), addresses.means, addresses.squares, addresses.steps
+    return bool(load().ash_adam(len(grads), *arrays, addresses.counts, lr, *BETAS, eps, torch.get_num_threads()))
 
 
 def _laid_like(parameter: Tensor) -> Tensor:

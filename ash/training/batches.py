@@ -11,7 +11,6 @@ from torch import Tensor
 from ash.capture.dataset import Camera
 from ash.config import TrainingConfig
 from ash.files import InputError
-from ash.native.library import address, float32_on_cpu, load
 from ash.training.images import ReadAhead, TrainingImages, View
 
 CROP_MARGIN = 12  # Pixels around the subject, so that a Gaussian that strays outside the mask is still seen.
@@ -131,25 +130,10 @@ def make_batch(images: TrainingImages, frame: int, names: list[str], background:
     )
 
 
-def composite_naive(rgba: UInt8[Tensor, "h w 4"], background: Float[Tensor, " 3"]) -> tuple[Tensor, Tensor]:
-    """Straight RGBA over a background, `[h, w, 3]`, and its alpha, `[h, w]`, both in 0..1: the definition."""
+def composite(rgba: UInt8[Tensor, "h w 4"], background: Float[Tensor, " 3"]) -> tuple[Tensor, Tensor]:
+    """Straight RGBA over a background, `[h, w, 3]`, and its alpha, `[h, w]`, both in 0..1."""
     image = rgba.float() / 255
     return image[..., :3] * image[..., 3:] + (1 - image[..., 3:]) * background, image[..., 3]
-
-
-def composite(rgba: UInt8[Tensor, "h w 4"], background: Float[Tensor, " 3"]) -> tuple[Tensor, Tensor]:
-    """`composite_naive` in one native pass over the window, whose pixels must lie side by side in their rows.
-
-    On other devices than the CPU the definition itself runs.
-    """
-    if background.device.type != "cpu":
-        return composite_naive(rgba, background)
-    height, width = rgba.shape[:2]
-    assert rgba.stride()[1:] == (4, 1)
-    rgb, alpha = torch.empty(height, width, 3, device="cpu"), torch.empty(height, width, device="cpu")
-    outputs = address(float32_on_cpu("background", background)), address(rgb), address(alpha)
-    load().ash_composite(rgba.data_ptr(), rgba.stride(0), width, height, *outputs)
-    return rgb, alpha
 
 
 def crop_camera(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:

@@ -1,4 +1,4 @@
-"""Between torch and Warp: tensors as arrays, launches on torch's own stream, and whether a device can be used."""
+"""Torch and Warp: tensors as arrays, launches on torch's own stream, and whether a device can be used."""
 
 from collections.abc import Sequence
 from typing import Any

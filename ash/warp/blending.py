@@ -166,22 +166,22 @@ def blend_backward(
     thread = wp.tid()
     pixel = pixel_of(thread, width, height)
     start = starts[thread // PIXELS]
-    own = int(start)
+    last = int(start)
     through = wp.float32(1.0)
     g_left = wp.float32(0.0)
     g_look = wp.vec4()
     if pixel.inside:
-        own = lasts[pixel.index]
+        last = lasts[pixel.index]
         through = left[pixel.index]
         g_left = g_alphas[pixel.index] * through
         g_colour = g_rgb[pixel.index]
         g_look = wp.vec4(g_colour[0], g_colour[1], g_colour[2], g_depths[pixel.index])
-    farthest = wp.tile_max(wp.tile(own))[0]
+    farthest = wp.tile_max(wp.tile(last))[0]
     behind = wp.float32(0.0)  # Gradient times everything behind the pair, as it reaches the pixel.
     for step in range(farthest - start):
         pair = farthest - 1 - step
         entry = vec10()
-        if pair < own:
+        if pair < last:
             member = members[pair]
             shape, look = shapes[member], looks[member]
             offset = pixel.place - means2d[member]

@@ -185,20 +185,22 @@ class Footprint:
 @no_type_check
 def footprint_of(view: Pinhole, position: wp.vec3, rotation: wp.mat33, scales: wp.vec3, dilation: float):
     """Eq. 2."""
-    found = Footprint()
-    found.position = position
+    footprint = Footprint()
+    footprint.position = position
     for i in range(2):
-        found.tangent[i] = wp.clamp(position[i] / position[2], view.low[i], view.high[i])
+        footprint.tangent[i] = wp.clamp(position[i] / position[2], view.low[i], view.high[i])
         for j in range(3):
-            found.rows[i, j] = view.focal[i] / position[2] * (view.turn[i, j] - found.tangent[i] * view.turn[2, j])
-    found.halves = found.rows @ rotation @ wp.diag(scales)
-    first, second = found.halves[0], found.halves[1]
-    found.xx = wp.dot(first, first)
-    found.xy = wp.dot(first, second)
-    found.yy = wp.dot(second, second)
-    found.sharp = wp.length_sq(wp.cross(first, second))
-    found.det = found.sharp + dilation * (found.xx + found.yy) + dilation * dilation
-    return found
+            footprint.rows[i, j] = (
+                view.focal[i] / position[2] * (view.turn[i, j] - footprint.tangent[i] * view.turn[2, j])
+            )
+    footprint.halves = footprint.rows @ rotation @ wp.diag(scales)
+    first, second = footprint.halves[0], footprint.halves[1]
+    footprint.xx = wp.dot(first, first)
+    footprint.xy = wp.dot(first, second)
+    footprint.yy = wp.dot(second, second)
+    footprint.sharp = wp.length_sq(wp.cross(first, second))
+    footprint.det = footprint.sharp + dilation * (footprint.xx + footprint.yy) + dilation * dilation
+    return footprint
 
 
 @wp.func
@@ -249,16 +251,20 @@ def tile_box(centre: wp.vec2, reach: wp.vec2, columns: int, rows: int):
 
 @wp.func
 @no_type_check
-def compensation(found: Footprint):
+def compensation(footprint: Footprint):
     """The root of the ratio of determinants before and after dilation; its square is at least `COMPENSATION_MIN`."""
-    return wp.sqrt(wp.max(found.sharp / found.det, COMPENSATION_MIN))
+    return wp.sqrt(wp.max(footprint.sharp / footprint.det, COMPENSATION_MIN))
 
 
 @wp.func
 @no_type_check
-def conic_of(found: Footprint, dilation: float):
+def conic_of(footprint: Footprint, dilation: float):
     """The inverse of the dilated covariance: xx, xy, yy, 1 / px^2."""
-    return wp.vec3((found.yy + dilation) / found.det, -found.xy / found.det, (found.xx + dilation) / found.det)
+    return wp.vec3(
+        (footprint.yy + dilation) / footprint.det,
+        -footprint.xy / footprint.det,
+        (footprint.xx + dilation) / footprint.det,
+    )
 
 
 @wp.func
@@ -319,20 +325,20 @@ def project(
         centre[i] = wp.float32(exact)
     means2d[thread] = centre
     position = wp.vec3(wp.float32(placed[0]), wp.float32(placed[1]), wp.float32(placed[2]))
-    found = footprint_of(view, position, rotation_of(quat / length_of(quat)), scales[number], dilation)
-    if not found.det > 0.0:
+    footprint = footprint_of(view, position, rotation_of(quat / length_of(quat)), scales[number], dilation)
+    if not footprint.det > 0.0:
         return
     opacity = opacities[number]
     if compensate != 0:
-        opacity *= compensation(found)
+        opacity *= compensation(footprint)
     basis = harmonics(wp.normalize(mean - view.centre), coefficients)
     colour = colour_of(basis, sh, number, coefficients)
-    conic = conic_of(found, dilation)
+    conic = conic_of(footprint, dilation)
     shapes[thread] = wp.vec4(conic[0], conic[1], conic[2], opacity)
     looks[thread] = wp.vec4(wp.max(colour[0], 0.0), wp.max(colour[1], 0.0), wp.max(colour[2], 0.0), position[2])
     if opacity < ALPHA_MIN:
         return
     reach = 2.0 * wp.log(opacity / ALPHA_MIN)
     columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    extent = wp.vec2(wp.sqrt(reach * (found.xx + dilation)), wp.sqrt(reach * (found.yy + dilation)))
+    extent = wp.vec2(wp.sqrt(reach * (footprint.xx + dilation)), wp.sqrt(reach * (footprint.yy + dilation)))
     boxes[thread] = tile_box(centre, extent, columns, rows)

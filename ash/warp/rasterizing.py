@@ -45,23 +45,23 @@ def edges_of(corners: wp.array(dtype=wp.vec3d), face: wp.vec3i):
 def distances_at(edges: wp.mat33d, x: int, y: int):
     """Of a pixel's centre to the edges, in their own units; inside all are at least 0."""
     column, row = wp.float64(x) + wp.float64(0.5), wp.float64(y) + wp.float64(0.5)
-    found = wp.vec3d()
+    distances = wp.vec3d()
     for i in range(3):
-        found[i] = edges[i, 0] * column + edges[i, 1] * row + edges[i, 2]
-    return found
+        distances[i] = edges[i, 0] * column + edges[i, 1] * row + edges[i, 2]
+    return distances
 
 
 @wp.func
 @no_type_check
 def depth_at(corners: wp.array(dtype=wp.vec3d), face: wp.vec3i, edges: wp.mat33d, x: int, y: int, near: wp.float64):
     """The depth at a pixel's centre as a whole number; `FARTHEST` where the triangle is not seen."""
-    found = distances_at(edges, x, y)
+    distances = distances_at(edges, x, y)
     zero = wp.float64(0.0)
     for i in range(3):
         keeps = edges[i, 0] > zero or (edges[i, 0] == zero and edges[i, 1] > zero)  # Of the pixels on this edge.
-        if not (found[i] > zero or (found[i] == zero and keeps)):
+        if not (distances[i] > zero or (distances[i] == zero and keeps)):
             return wp.int64(FARTHEST)
-    total = found[0] + found[1] + found[2]
+    total = distances[0] + distances[1] + distances[2]
     depth = wp.abs(wp.dot(edges[0], corners[face[0]])) / total
     if not (total > zero and depth >= near):
         return wp.int64(FARTHEST)
@@ -149,9 +149,9 @@ def place_pixels(
     if triangles[pixel] == NO_TRIANGLE:
         triangles[pixel] = -1
         return
-    found = distances_at(edges_of(corners, faces[triangles[pixel]]), pixel % width, pixel // width)
-    found = found / (found[0] + found[1] + found[2])
-    weights[pixel] = wp.vec3(wp.float32(found[0]), wp.float32(found[1]), wp.float32(found[2]))
+    distances = distances_at(edges_of(corners, faces[triangles[pixel]]), pixel % width, pixel // width)
+    distances = distances / (distances[0] + distances[1] + distances[2])
+    weights[pixel] = wp.vec3(wp.float32(distances[0]), wp.float32(distances[1]), wp.float32(distances[2]))
     depths[pixel] = wp.float32(wp.cast(nearest[pixel], wp.float64))
 
 

@@ -65,7 +65,7 @@ class _ProjectByWarp(Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         arrays = list(ctx.saved_tensors)
-        whole = [grad.contiguous() for grad in grads[:3]]  # Kept by name: an array does not keep what it points at.
+        whole = [grad.contiguous() for grad in grads[:3]]  # An array holds no reference to what it points at.
         given = [array(grad, dtype) for grad, dtype in zip(whole, (wp.vec2, wp.vec4, wp.vec4), strict=True)]
         made = [torch.empty_like(tensor) for tensor in arrays[:5]]
         outputs = [array(tensor, dtype) for tensor, dtype in zip(made, GAUSSIANS[:5], strict=True)]
@@ -131,13 +131,13 @@ class _BlendByWarp(Function):
         view, pairs = ctx.view, ctx.pairs
         means2d, shapes, looks, left, lasts = ctx.saved_tensors
         device = means2d.device
-        whole = [grad.contiguous() for grad in grad_images]  # Kept by name: an array does not keep what it points at.
+        whole = [grad.contiguous() for grad in grad_images]  # An array holds no reference to what it points at.
         given = [array(grad, dtype) for grad, dtype in zip(whole, (wp.vec3, wp.float32, wp.float32), strict=True)]
         entries = torch.zeros(len(pairs.members), blending.ENTRY, device=device)
-        kept = [array(left, wp.float32), array(lasts, wp.int32), *given, array(pairs.slots, wp.int64)]
+        inputs = [array(left, wp.float32), array(lasts, wp.int32), *given, array(pairs.slots, wp.int64)]
         places = array(entries, blending.vec10)
         splats = _splats(pairs, means2d, shapes, looks)
-        arguments = [*splats, view.width, view.height, *kept, places]
+        arguments = [*splats, view.width, view.height, *inputs, places]
         launch(blending.blend_backward, _threads(pairs), arguments, device)
         grads = [torch.empty_like(tensor) for tensor in (means2d, shapes, looks)]
         listed = [array(pairs.order, wp.int64), array(pairs.ends, wp.int64), array(pairs.boxes, wp.vec4i)]

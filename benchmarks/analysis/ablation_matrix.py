@@ -9,7 +9,7 @@ import pandas as pd
 
 from benchmarks.analysis.results import RunTables
 from benchmarks.analysis.style import style_of
-from synth.presets import RUNGS
+from synth.presets import FACTORS
 
 REFERENCE = "ash"
 NOT_ABLATIONS = ("static", "nearest", "ddc")  # other methods than ASH without one component
@@ -70,7 +70,7 @@ class AblationEffect:
 
 def is_strength(scene: str) -> bool:
     """Whether a scene is a factor scene at another strength than 1."""
-    return any(scene == f"{factor}{end}" for factor in RUNGS for end, strength in STRENGTHS.items() if strength != 1)
+    return any(scene == f"{factor}{end}" for factor in FACTORS for end, strength in STRENGTHS.items() if strength != 1)
 
 
 def effects(table: pd.DataFrame, split: str) -> list[AblationEffect]:
@@ -122,7 +122,7 @@ def strength_curves(table: pd.DataFrame, split: str) -> pd.DataFrame:
     """
     by_place = {(effect.scene, effect.row): effect for effect in effects(table, split)}
     rows = []
-    for factor in RUNGS:
+    for factor in FACTORS:
         scenes = {0.0: ZERO_STRENGTH} | {strength: f"{factor}{end}" for end, strength in STRENGTHS.items()}
         for row in EXPECTED[factor]:
             found = {s: by_place[scenes[s], row] for s in sorted(scenes) if (scenes[s], row) in by_place}

@@ -18,7 +18,6 @@ from benchmarks.cell.methods import ON_EXACT, WRONG_BY_MM
 PAPER_DB = {"novel_view": {"tight": 4.6, "loose": 7.4}, "novel_pose": {"tight": 1.1, "loose": 0.7}}
 LEARNED = {"images": ("ash", "ddc"), "scans": ("by_scans", "ddc_by_scans")}  # rows by what their templates learned from
 PLACED = ("ash", "by_scans", "by_graph", "unlearned")  # ASH on other templates
-LEVEL_TITLES = dict(zip(ON_EXACT, ("ASH", "DDC", "fixed mesh, best texture"), strict=True))
 PLANTED = "planted"
 
 

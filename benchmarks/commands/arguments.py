@@ -26,7 +26,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from ash.fields import Changes, changed, flat, suggest
 from ash.files import InputError
-from benchmarks.aliases import OLD_FIELDS
+from benchmarks.aliases import OLD_FIELDS, OLD_SIZES
 
 Command = Callable[[], int]  # Does its work, and returns the exit code.
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -101,7 +101,14 @@ def read_command(command: type[Any], name: str, tokens: Sequence[str]) -> Comman
         config = None if known is None else known.settings()
         wanted = command if config is None else _with_settings(command, config)
     flags = _flags(command, config)
-    return cast(Command, _read(wanted, f"{own_name()} {name}", [_current_flag(t, flags) for t in tokens], flags))
+    return cast(Command, _read(wanted, f"{own_name()} {name}", _current_tokens(tokens, flags), flags))
+
+
+def _current_tokens(tokens: Sequence[str], flags: tuple[str, ...]) -> list[str]:
+    current = [_current_flag(token, flags) for token in tokens]
+    return [
+        OLD_SIZES.get(t, t) if before == "--size" else t for before, t in zip(["", *current], current, strict=False)
+    ]
 
 
 def _current_flag(token: str, flags: tuple[str, ...]) -> str:

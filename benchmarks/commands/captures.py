@@ -60,7 +60,7 @@ class SynthCommand:
     """
 
     scene: Positional[str]  # its name
-    size: str = "quick"  # of the capture: ci, rung, quick, long, table or paper
+    size: str = "quick"  # of the capture: ci, factor, quick, long, table or paper
     out: Folder | None = None  # default: data/SCENE-SIZE-SEED
     seed: Seed = 0  # root seed of the scene
     subject: Seed = 0  # who it is: body, skin, hair, clothes and prints follow from the number

@@ -94,26 +94,6 @@ class DoctorCommand:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SuitesCommand:
-    """Print our suites, each as the file that makes it: a copy of one is a start for your own (`run FILE.toml`)."""
-
-    name: Positional[str] = ""  # only this one
-
-    def __call__(self) -> int:
-        """Print them."""
-        from ash.fields import suggest
-        from benchmarks.suites.files import suite_files
-
-        known = suite_files()
-        if self.name and self.name not in known:
-            raise InputError(f"unknown suite {self.name!r}, {suggest(self.name, tuple(known))}")
-        for name, path in known.items():
-            if self.name in ("", name):
-                print(f"# {name}.toml\n{path.read_text()}")
-        return DONE
-
-
-@dataclass(frozen=True, kw_only=True)
 class TestCommand:
     """Run every check that CI runs; what follows -- goes to pytest."""
 

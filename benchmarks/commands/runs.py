@@ -39,7 +39,7 @@ LpipsWeights = Annotated[Path | None, arg(metavar="FILE")]
 class RunCommand:
     """Run a suite: capture, train, evaluate, report.
 
-    SUITE is one of ours (`suites` prints them) or a file of yours. Flags narrow or widen it.
+    SUITE is one of ours (`run --list` prints them) or a file of yours. Flags narrow or widen it.
 
     On a cluster whose machines share a disk, as a Slurm array of 20 jobs, each one core, all into one folder; each job
     resumes if started again: `ash-bench synth tight`, `ash-bench synth loose` once, then `sbatch --array=1-20 --wrap
@@ -49,11 +49,11 @@ class RunCommand:
     started with `--resources GPU=1`.
     """
 
-    suite: Positional[str] = "quick"  # quick, ci, table, ... or FILE.toml
+    suite: Positional[str] = ""  # quick (the default), ci, table, ... or FILE.toml
     methods: Names = ()  # only these rows, or installed methods besides
     scenes: Names = ()  # only these rows, or other scenes
     capture: UseAppendAction[tuple[Path, ...]] = ()  # in place of the scenes: a finished capture; may be repeated
-    size: str | None = None  # of scenes: ci, rung, quick, long, table or paper
+    size: str | None = None  # of scenes: ci, factor, quick, long, table or paper
     preset: str | None = None  # budget of the methods
     device: DeviceName = CPU  # where methods learn and draw that can choose: cpu, cuda, cuda:1, or auto
     seeds: CountIfAny = None  # train every method with so many seeds
@@ -67,9 +67,12 @@ class RunCommand:
     lpips_weights: LpipsWeights = None  # AlexNet's, of torchvision; default: torch's cache; without them LPIPS is n/a
     retry_failed: FlagCreatePairsOff[bool] = False  # run cells again that failed before
     dry_run: FlagCreatePairsOff[bool] = False  # print cells, hours and gigabytes, and do nothing
+    list: FlagCreatePairsOff[bool] = False  # print the suites as TOML, or only SUITE: a copy is a start for your own
 
     def __call__(self) -> int:
         """Captures, cells, report."""
+        if self.list:
+            return self._print_suites()
         from benchmarks.provenance import cores
         from benchmarks.suites.captures import require_kept_apart
         from benchmarks.suites.runs import RunOptions
@@ -98,11 +101,23 @@ class RunCommand:
             return DONE
         return run_and_report(suite, options)
 
+    def _print_suites(self) -> int:
+        from ash.fields import suggest
+        from benchmarks.suites.files import suite_files
+
+        known = suite_files()
+        if self.suite and self.suite not in known:
+            raise InputError(f"unknown suite {self.suite!r}, {suggest(self.suite, tuple(known))}")
+        for name, path in known.items():
+            if self.suite in ("", name):
+                print(f"# {name}.toml\n{path.read_text()}")
+        return DONE
+
     def _chosen(self) -> "Suite":
         """The suite, as the flags have it."""
         from benchmarks.suites.files import find_suite
 
-        suite = find_suite(self.suite)
+        suite = find_suite(self.suite or "quick")
         return suite.narrowed(
             scenes=self._scenes(suite),
             methods=self.methods,

@@ -1,27 +1,33 @@
 """Two runs side by side, before and after: each row of both, what changed in it, and the worst frames of each."""
 
-import base64
-import io
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from PIL import Image
 
 from ash.capture.formats import load_capture
 from ash.files import InputError, write_atomic
+from benchmarks.analysis.error_attribution import psnr_of
 from benchmarks.analysis.results import RANKED_SPLITS, Quantity, foreground, load, samples_of
 from benchmarks.analysis.statistics import compare_samples, corrected
 from benchmarks.analysis.style import SPLIT_NAMES
-from benchmarks.cell.cells import Cell, CellResult, ViewScore, read_result, stored_prediction
-from benchmarks.cell.metrics import METRICS, on_black
-from benchmarks.cell.views import View
-from benchmarks.report.page import environment
-from benchmarks.report.pictures import crop_of, on_paper
+from benchmarks.cell.cells import Cell, CellResult, read_result
+from benchmarks.cell.metrics import METRICS
+from benchmarks.report import pictures
+from benchmarks.report.content import Block, Mark, Report, Section, Strip, Strips, Table, Text
+from benchmarks.report.page import render
+from benchmarks.report.pictures import Album, Shown
 from benchmarks.suites.runs import Run, results_of
 
+NAMES = ("Before", "After")
+ABOUT = (
+    "In brackets: the 95 % interval of the change, over seeds, or in pairs over subjects where both have several. "
+    "Better or worse: p below 5 % after Holm's correction over all rows, and a change above the metric's margin. "
+    "Equivalent: the interval lies within that margin, or the predictions are identical. n/a: in one run only."
+)
+NO_PICTURES = "No pictures: the capture or the stored predictions are missing."
 QUANTITIES = (
     foreground("novel_view"),
     foreground("novel_pose"),
@@ -39,18 +45,6 @@ COLUMNS = ["scene", "method", "what", "unit", "before", "after", "change", "low"
 Rows = dict[tuple[str, str], list[tuple[Cell, CellResult]]]
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class WorstFrame:
-    """A view that is among the worst of one of the runs, as both draw it. Pictures are data URIs."""
-
-    title: str
-    before_db: float
-    after_db: float
-    truth: str
-    before: str
-    after: str
-
-
 def write_comparison(before: Run, after: Run, out: Path) -> str:
     """Write compare.html and compare.csv into `out`; returns the table for the terminal, its verdict first.
 
@@ -62,13 +56,21 @@ def write_comparison(before: Run, after: Run, out: Path) -> str:
         raise InputError(f"{before.folder} and {after.folder}: no scene and method in common, expected at least one")
     table = changes(old, new)
     write_atomic(out / "compare.csv", table.to_csv(index=False, float_format="%.6g").encode())
-    shown, verdict = printed(table), verdict_of(table)
-    frames = {key: list(_worst_frames(old[key][0], new[key][0])) for key in old if key in new}
-    page = (
-        environment("html")
-        .get_template("compare.html")
-        .render(before=before, after=after, verdict=verdict, changes=shown.to_dict("records"), frames=frames)
-    )
+    shown, verdict, album = printed(table), verdict_of(table), Album()
+    kinds: dict[str, Mark] = {"better": "best", "worse": "second"}
+    last = len(shown.columns) - 2
+    marks = {(i, last): kinds[kind] for i, kind in enumerate(table["verdict"]) if kind in kinds}
+    groups = [
+        (f"{key[1]} on {key[0]}: the worst frames", tuple(_worst_frames(old[key][0], new[key][0], album)))
+        for key in old
+        if key in new
+    ]
+    groups = [(name, strips) for name, strips in groups if strips]
+    about = f"Before: {before.folder} ({before.suite}). After: {after.folder} ({after.suite}). {ABOUT}"
+    blocks: list[Block] = [Text(text=about), Table(frame=shown.set_index("scene"), corner="scene", marks=marks)]
+    blocks.append(Strips(file="", title="", groups=tuple(groups)) if groups else Text(text=NO_PICTURES))
+    section = Section(title="Before and after", headline=verdict, blocks=tuple(blocks))
+    page = render(Report(title="ash-bench: before and after", sections=(section,)), "html", album)
     write_atomic(out / "compare.html", page.encode())
     return f"{verdict}\n\n{shown.to_string(index=False)}"
 
@@ -158,53 +160,22 @@ def _predictions(cells: list[tuple[Cell, CellResult]]) -> set[tuple[int, int, st
     }
 
 
-def _worst_frames(before: tuple[Cell, CellResult], after: tuple[Cell, CellResult]) -> Iterator[WorstFrame]:
-    """The worst views of each run that the other has as well, of the first seed; none where pictures are gone."""
-    scores = [{_key(view): view for view in result.views} for _, result in (before, after)]
-    shared = [key for key in scores[0] if key in scores[1] and key[0] in RANKED_SPLITS]  # not training views
+def _worst_frames(before: tuple[Cell, CellResult], after: tuple[Cell, CellResult], album: Album) -> Iterator[Strip]:
+    """The worst views of each run that the other has as well, of the first seed; none where pictures are missing."""
+    shown = [Shown(cell=cell, result=result) for cell, result in (before, after)]
+    views = [{(view.split, view.camera, view.frame): view for view in each.result.views} for each in shown]
+    shared = [key for key in views[0] if key in views[1] and key[0] in RANKED_SPLITS]  # not training views
     chosen: dict[tuple[str, str, int], str] = {}
-    for name, views in zip(("before", "after"), scores, strict=True):
-        for key in sorted(shared, key=lambda key, views=views: _db(views[key]))[:WORST]:  # type: ignore[misc]
-            chosen[key] = "before and after" if key in chosen else name
-    for key, run in chosen.items():
-        try:
-            truth, drawn = _pixels(before[0], after[0], key)
-        except InputError:
-            return
-        yield WorstFrame(
-            title=f"{SPLIT_NAMES[key[0]].words}, camera {key[1]}, frame {key[2]}: among the worst {run}",
-            before_db=_db(scores[0][key]),
-            after_db=_db(scores[1][key]),
-            truth=truth,
-            before=drawn[0],
-            after=drawn[1],
-        )
-
-
-def _key(view: ViewScore) -> tuple[str, str, int]:
-    return view.split, view.camera, view.frame
-
-
-def _db(view: ViewScore) -> float:
-    return view.scores["foreground", "psnr"]
-
-
-def _pixels(before: Cell, after: Cell, key: tuple[str, str, int]) -> tuple[str, list[str]]:
-    """The truth of a view and what both runs drew, cropped alike to the subject."""
-    capture = load_capture(before.capture_folder)
-    split, camera, frame = key
-    view = View(split=split, camera=camera, frame=frame)
-    images = [on_black(capture.image(camera, frame))]
-    images += [stored_prediction(cell, load_capture(cell.capture_folder), view) for cell in (before, after)]
-    if len({image.shape for image in images}) > 1:
-        raise InputError(f"{after.folder}: its pictures have another size than those of {before.folder}")
-    crop = crop_of(images)
-    truth, *drawn = (_uri(image[crop]) for image in images)
-    return truth, drawn
-
-
-def _uri(image: np.ndarray) -> str:
-    """RGBA on black as a data URI, on the report's paper."""
-    buffer = io.BytesIO()
-    Image.fromarray(on_paper(image)).save(buffer, format="PNG")
-    return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+    for name, own in zip(NAMES, views, strict=True):
+        for key in sorted(shared, key=lambda key, own=own: psnr_of(own[key]))[:WORST]:  # type: ignore[misc]
+            chosen[key] = "before and after" if key in chosen else name.lower()
+    try:
+        capture = load_capture(before[0].capture_folder)
+        for key, run in chosen.items():
+            frames = pictures.compare(capture, shown, views[0][key], with_errors=False)
+            truth, *drawn = frames.images
+            named = (replace(frame, caption=name) for frame, name in zip(drawn, NAMES, strict=True))
+            title = f"{frames.title}: among the worst {run}"
+            yield replace(frames, title=title, images=(truth, *named)).strip(album)
+    except InputError:
+        return

@@ -3,7 +3,6 @@
 A table is a DataFrame of texts. The page and the Markdown are two templates over these classes.
 """
 
-import base64
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
@@ -103,22 +102,7 @@ class Flipbook:
     chart: Figure
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Sheet:
-    """A PNG of pictures that an earlier report left; `data` is the file's content."""
-
-    kind: ClassVar[str] = "sheet"
-    file: str
-    title: str
-    data: bytes
-
-    @property
-    def uri(self) -> str:
-        """The picture as a data URI."""
-        return f"data:image/png;base64,{base64.b64encode(self.data).decode()}"
-
-
-Block = Text | Bullets | Table | Figure | Strips | Flipbook | Sheet
+Block = Text | Bullets | Table | Figure | Strips | Flipbook
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -3,30 +3,15 @@
 import pandas as pd
 
 from benchmarks.analysis import pareto
-from benchmarks.analysis.results import FRAME_MS, RANKED_SPLITS, Quantity, RunTables, foreground, samples_of
+from benchmarks.analysis.results import FRAME_MS, RANKED_SPLITS, RunTables, foreground, samples_of
 from benchmarks.analysis.statistics import intervals
-from benchmarks.analysis.style import EXACT, SPLIT_NAMES, style_of
+from benchmarks.analysis.style import EXACT, SPLIT_NAMES
 from benchmarks.cell.methods import WRONG_BY_MM
 from benchmarks.report import charts, vega
-from benchmarks.report.vega import Figure, Series
+from benchmarks.report.vega import Figure
 
-STAGES = {
-    "stg1_ms": Series(title="Stg.1 template", colour="#2f6fde"),
-    "stg2_ms": Series(title="Stg.2 textures", colour="#2a9d8f"),
-    "stg3_ms": Series(title="Stg.3 decoders", colour="#dd6b20"),
-    "stg4_ms": Series(title="Stg.4 skin and draw", colour="#9b59b6"),
-    "": Series(title="other", colour="#8a94a3"),
-}
-STAGE_METRICS = tuple(stage for stage in STAGES if stage)
-MANY_DIFFERENCES = 5  # rows from which on they are drawn as well as listed
 PLANTED = {method for mm, row in WRONG_BY_MM.items() if mm > 0 for method in row}  # They have a chart of their own.
 SPAN_DB = 9.0  # below the best point: lower points are named in the subtitle and not drawn
-VERDICTS = {
-    "better": Series(title="ASH is better", colour=vega.BLUE),
-    "worse": Series(title="ASH is worse", colour=vega.ORANGE),
-    "equivalent": Series(title="equivalent", colour="#2a9d8f"),
-    "unclear": Series(title="unclear", colour=vega.LINE),
-}
 
 
 def speed_figure(tables: RunTables, scene: str) -> Figure | None:
@@ -77,28 +62,6 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
     return Figure(name=scene, title="Accuracy against speed", caption=caption, panels=panels, series=series)
 
 
-def differences_figure(table: pd.DataFrame, scene: str, *, over: str) -> Figure | None:
-    """`differences` of a scene, where they are so many that a table is hard to read. `over`: unit of the intervals."""
-    if not len(table) or table.groupby("split").size().max() < MANY_DIFFERENCES:
-        return None
-    rows = table.assign(
-        panel=table["split"].map(lambda split: SPLIT_NAMES[split].title),
-        row=table["method"].map(lambda method: style_of(method).title),
-        series=table["verdict"].map(lambda verdict: VERDICTS[verdict].title),
-    )
-    series = tuple(series for verdict, series in VERDICTS.items() if (table["verdict"] == verdict).any())
-    known = f"with the 95 % interval over {over}; arrows: it is cut" if over else "of one seed, without intervals"
-    return Figure(
-        name=f"effects_{scene}",
-        title="Differences",
-        caption=f"Foreground PSNR of ASH minus that of the row, {known}.",
-        panels=charts.forest(
-            rows[["panel", "row", "mean", "low", "high", "series"]], series, x="ASH minus the row [dB]"
-        ),
-        series=series,
-    )
-
-
 def training_figure(tables: RunTables, scene: str) -> Figure | None:
     """Foreground PSNR of reserved training views over seconds of training, first seed of the first capture."""
     curves = tables.curves[tables.curves["scene"] == scene]
@@ -123,30 +86,6 @@ def training_figure(tables: RunTables, scene: str) -> Figure | None:
     )
 
 
-def stage_figure(tables: RunTables, scene: str) -> Figure | None:
-    """Milliseconds per frame by stage; what no stage claims is shown as other."""
-    rows = []
-    for method in tables.methods(scene):
-        whole = tables.get(scene, method, FRAME_MS)
-        stages = {stage: tables.get(scene, method, Quantity("speed", "", stage)) for stage in STAGE_METRICS}
-        if whole is None or tables.failed(scene, method) or all(row is None for row in stages.values()):
-            continue
-        parts = {stage: 0.0 if row is None else row.value for stage, row in stages.items()}
-        parts[""] = max(0.0, whole.value - sum(parts.values()))
-        name = style_of(method).title
-        rows += [{"row": name, "series": STAGES[stage].title, "value": value} for stage, value in parts.items()]
-    if not rows:
-        return None
-    return Figure(
-        name=f"stages_{scene}",
-        title="Time per stage",
-        caption="One frame on one core, median after warm-up, by the paper's stages.",
-        panels=charts.bars(pd.DataFrame(rows), tuple(STAGES.values()), x="ms per frame"),
-        series=tuple(STAGES.values()),
-        columns=1,
-    )
-
-
 def line_figure(
     table: pd.DataFrame,
     methods: list[str],
@@ -159,13 +98,14 @@ def line_figure(
     y_title: str = "foreground PSNR [dB]",
     size: tuple[int, int] = (390, 240),
     log: bool = False,
+    rules: pd.DataFrame | None = None,
+    columns: int = 2,
 ) -> Figure:
     """A line per method through `table` (panel, method, psnr, the column `x`, and low, high, scale where known)."""
     series = vega.series_of(methods)
     names = {method: each.title for method, each in zip(methods, series, strict=True)}
     samples = table.assign(series=table["method"].map(names), x=table[x].astype(float), y=table["psnr"])
-    kept = [column for column in ("panel", "scale", "series", "x", "y", "low", "high") if column in samples]
-    panels = charts.lines(samples[kept], series, x=x_title, y=y_title, size=size, log=log)
-    return Figure(
-        name=name, title=title, caption=caption, panels=panels, series=series, columns=2 if len(panels) > 1 else 1
-    )
+    shown = [column for column in ("panel", "scale", "series", "x", "y", "low", "high") if column in samples]
+    panels = charts.lines(samples[shown], series, x=x_title, y=y_title, size=size, log=log, rules=rules)
+    columns = min(columns, len(panels))
+    return Figure(name=name, title=title, caption=caption, panels=panels, series=series, columns=columns)

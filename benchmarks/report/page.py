@@ -122,10 +122,14 @@ def render(report: Report, form: Literal["html", "md"], album: Album | None = No
     text = template.render(
         report=report,
         album=[] if album is None else album.pictures,
-        library=Markup(vega.library()) if form == "html" else "",
+        library=Markup(vega.library()) if form == "html" and _has_charts(report) else "",
         dark_rules=Markup(vega.dark_rules(".vega ")),
     )
     return text if form == "html" else "\n".join(_without_blank_runs(text.splitlines())) + "\n"
+
+
+def _has_charts(report: Report) -> bool:
+    return any(isinstance(block, Figure | content.Flipbook) for section in report.sections for block in section.blocks)
 
 
 def environment(form: Literal["html", "md"]) -> Environment:

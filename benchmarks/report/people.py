@@ -12,10 +12,9 @@ from benchmarks.analysis.results import RANKED_SPLITS, RunTables, foreground, sa
 from benchmarks.analysis.statistics import spreads
 from benchmarks.analysis.style import SPLIT_NAMES, is_ours, style_of
 from benchmarks.cell.cells import CellResult
-from benchmarks.report import charts, pictures, vega
+from benchmarks.report import pictures
 from benchmarks.report.content import Block, Bullets, Strips, Table, Text
 from benchmarks.report.pictures import Album, Frames, Shown
-from benchmarks.report.vega import Figure
 from benchmarks.suites.runs import Run
 
 REFERENCE = "ash"
@@ -54,25 +53,7 @@ def blocks(tables: RunTables, scene: str) -> tuple[Block, ...]:
     if not len(table):
         return ()
     others = list(table["method"].unique())
-    series = vega.series_of(others)
-    titles = {method: each.title for method, each in zip(others, series, strict=True)}
-    points = table.assign(
-        panel=table["split"].map(lambda split: SPLIT_NAMES[split].title),
-        row=table["who"],
-        mean=table["lead"],
-        low=float("nan"),
-        high=float("nan"),
-        series=table["method"].map(titles),
-    )
-    figure = Figure(
-        name=f"people_{scene}",
-        title="Subject by subject",
-        caption="Foreground PSNR of ASH minus that of each method, a row per subject. Right of the line ASH is ahead.",
-        panels=charts.forest(
-            points[["panel", "row", "mean", "low", "high", "series"]], series, x="ASH minus the method [dB]"
-        ),
-        series=series,
-    )
+    titles = {method: style_of(method).title for method in others}
     said, found = [], []
     for split, here in table.groupby("split", sort=False):
         for method in others:
@@ -82,7 +63,6 @@ def blocks(tables: RunTables, scene: str) -> tuple[Block, ...]:
         wide.insert(0, f"{style_of(REFERENCE).title} [dB]", here.groupby("who")["ash"].first().map("{:.2f}".format))
         found.append(Table(title=SPLIT_NAMES[str(split)].title, corner="subject", frame=wide))
     return (
-        figure,
         Bullets(items=tuple(said)),
         *found,
         _spread_table(tables, scene, [REFERENCE, *others]),

@@ -26,6 +26,7 @@ from benchmarks.report.content import Strip
 PAPER = 236  # grey behind the subject: dark hair and light cloth are both visible
 MARGIN = 0.06
 FLIP_WHITE = 0.7  # The error at which the error map's colours end.
+TRACKS = ("novel_pose", "novel_view", "far_pose", "near_pose")  # splits in the order of the page
 QUALITY = 88  # of WebP; what is scored are the stored PNGs.
 
 
@@ -83,28 +84,16 @@ class Frames:
 
 
 def tracks(capture: Capture, shown: Sequence[Shown], album: Album, *, room: int) -> list[dict[str, Any]]:
-    """Pictures of all methods by camera, frame after frame, until the album has grown by `room` bytes.
+    """Pictures of all methods on the first camera of each split, of as many frames as `room` bytes allow.
 
-    The first camera of each split is always there, of as many frames, evenly spread, as there is room for; further
-    cameras are there if all of theirs fit. A track is {"title", "split", "camera", "frames", "width", "height",
-    "truth": places in the album by frame, "pictures": the same by method, "psnr": dB by method}.
+    A track is {"title", "frames", "width", "height", "truth": places in the album by frame, "pictures": the same by
+    method, "psnr": dB by method}.
     """
-    splits = ("novel_pose", "novel_view", "far_pose", "near_pose")
-    places = [(split, camera) for split in splits for camera in _cameras(shown[0].result, split)]
-    places.sort(key=lambda place: _cameras(shown[0].result, place[0]).index(place[1]))  # Stable: all splits in turn.
-    found: list[dict[str, Any]] = []
-    start = album.size
-    for split, camera in places:
-        frames = sorted(v.frame for v in shown[0].result.views if (v.split, v.camera) == (split, camera))
-        left = room - (album.size - start)
-        if not any(track["split"] == split for track in found):
-            track = _track(capture, shown, album, split, camera, frames, room=left // 2)
-        elif _cost(found) * len(frames) < left:
-            track = _track(capture, shown, album, split, camera, frames, room=left)
-        else:
-            continue
-        found.append(track)
-    return found
+    views = {split: [v for v in shown[0].result.views if v.split == split] for split in TRACKS}
+    views = {split: own for split, own in views.items() if own}
+    return [
+        _track(capture, shown, album, split, own[0].camera, room=room // len(views)) for split, own in views.items()
+    ]
 
 
 def choose_views(result: CellResult, split: str, count: int = 2) -> list[ViewScore]:
@@ -175,45 +164,35 @@ def on_paper(on_black: np.ndarray) -> np.ndarray:
 
 
 def _track(
-    capture: Capture, shown: Sequence[Shown], album: Album, split: str, camera: str, frames: list[int], *, room: int
+    capture: Capture, shown: Sequence[Shown], album: Album, split: str, camera: str, *, room: int
 ) -> dict[str, Any]:
+    scores = [{v.frame: psnr_of(v) for v in s.result.views if (v.split, v.camera) == (split, camera)} for s in shown]
+    frames = sorted(scores[0])
     truths = {frame: metrics.on_black(capture.image(camera, frame)) for frame in frames}
     crop = crop_of(list(truths.values()))
-    scores = [{v.frame: psnr_of(v) for v in s.result.views if (v.split, v.camera) == (split, camera)} for s in shown]
-    kept, keys = [frames[0]], {}
-    before = album.size
-    for frame in (frames[0], *frames[1:]):
-        if frame != frames[0] and frame not in kept:
-            continue
-        images = [truths[frame]]
-        images += [stored_prediction(s.cell, capture, View(split=split, camera=camera, frame=frame)) for s in shown]
+    keys: dict[int, list[int]] = {}
+
+    def add(frame: int) -> None:
+        view = View(split=split, camera=camera, frame=frame)
+        images = [truths[frame], *(stored_prediction(s.cell, capture, view) for s in shown)]
         keys[frame] = [album.add(on_paper(image[crop])) for image in images]
-        if frame == frames[0]:
-            fit = max(1, room // max(1, album.size - before))
-            kept = [frames[i] for i in spread(len(frames), min(len(frames), fit))]
-    shape = truths[frames[0]][crop].shape
-    kept = sorted(keys)
+
+    before = album.size
+    add(frames[0])
+    fit = max(1, room // max(1, album.size - before))
+    for index in spread(len(frames), min(len(frames), fit)):
+        if frames[index] not in keys:
+            add(frames[index])
+    chosen, shape = sorted(keys), truths[frames[0]][crop].shape
     return {
         "title": f"{SPLIT_NAMES[split].words.capitalize()}, camera {camera}",
-        "split": split,
-        "camera": camera,
-        "frames": kept,
+        "frames": chosen,
         "width": shape[1],
         "height": shape[0],
-        "truth": [keys[frame][0] for frame in kept],
-        "pictures": [[keys[frame][1 + i] for frame in kept] for i in range(len(shown))],
-        "psnr": [[round(score[frame], 3) for frame in kept] for score in scores],
-        "bytes": album.size - before,
+        "truth": [keys[frame][0] for frame in chosen],
+        "pictures": [[keys[frame][1 + i] for frame in chosen] for i in range(len(shown))],
+        "psnr": [[round(score[frame], 3) for frame in chosen] for score in scores],
     }
-
-
-def _cost(tracks: Sequence[dict[str, Any]]) -> float:
-    """Bytes per frame so far."""
-    return sum(track["bytes"] for track in tracks) / sum(len(track["frames"]) for track in tracks)
-
-
-def _cameras(result: CellResult, split: str) -> list[str]:
-    return list(dict.fromkeys(view.camera for view in result.views if view.split == split))
 
 
 def compare(capture: Capture, shown: Sequence[Shown], view: ViewScore, *, with_errors: bool = True) -> Frames:

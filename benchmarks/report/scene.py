@@ -10,11 +10,11 @@ from ash.files import InputError
 from benchmarks.analysis import differences, paper
 from benchmarks.analysis.error_attribution import REGIONS
 from benchmarks.analysis.results import HELD_OUT_SPLITS, MOTION_SPLITS, RANKED_SPLITS, Quantity, RunTables, foreground
-from benchmarks.analysis.style import EXACT, SPLIT_NAMES, is_ours, style_of
+from benchmarks.analysis.style import SPLIT_NAMES, is_ours, style_of
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS
 from benchmarks.report import charts, figures, people, pictures, sentences, tables, vega
-from benchmarks.report.content import Block, Bullets, Flipbook, Mark, Section, Sheet, Strips, Table, Text
+from benchmarks.report.content import Block, Bullets, Flipbook, Mark, Section, Strips, Table, Text
 from benchmarks.report.pictures import Album, Shown
 from benchmarks.report.vega import Figure
 from benchmarks.suites.runs import Run
@@ -22,7 +22,10 @@ from benchmarks.suites.runs import Run
 IMAGE_SPLITS = (*RANKED_SPLITS, "train_view")  # in the order of the columns
 COSTS = (
     "frame_ms",
-    *figures.STAGE_METRICS,
+    "stg1_ms",
+    "stg2_ms",
+    "stg3_ms",
+    "stg4_ms",
     "train_s",
     "train_cpu_s",
     "settled_s",
@@ -36,9 +39,8 @@ COSTS = (
 ON_SHEETS = ("ash", "ddc", "ash_truth", "ddc_truth")
 AT_MOST_ON_SHEETS = 5
 WORST, FEW_WORST, MANY = 3, 1, 24  # worst frames of each method; of more than so many methods on all scenes, one
-COLOURS = ("blue", "orange", "red", "ochre", "grey")  # of the regions
 SHEETS = {"pictures": "Truth, methods and errors", "pictures_people": "All subjects", "worst": "The worst frames"}
-EARLIER = "Sheets of an earlier report of this run: the capture or the pictures of its cells are missing now."
+COLOURS = ("blue", "orange", "red", "ochre", "grey")  # of the regions
 SMOKE_TESTS = ("ci",)  # sizes and presets
 QUALITY_NOTE = (
     "Quality on the foreground, LPIPS on the whole frame, IoU on the silhouette. Best and second best are marked among "
@@ -62,10 +64,6 @@ DIFFERENCES_NOTE = (
 DETECTABLE_NOTE = (
     "The smallest true difference that so many captures (subjects in this outfit) show with 80 % power, from the "
     "spread of the differences over the captures here: of the median row, and of the row that spreads most."
-)
-EXACT_NOTE = (
-    "Foreground PSNR. Gaussians can leave a wrong template, a textured mesh cannot: the difference between the two "
-    "depends on the template's error, and can change its sign."
 )
 CONVENTIONS_NOTE = (
     "One set of predictions, scored in four ways. The release scores only inside the eroded mask; whole frames are "
@@ -111,16 +109,15 @@ def scene_report(data: SceneData) -> SceneReport:
         (QUALITY_NOTE, *((APART_NOTE,) if quality.below else ()), VALUES_NOTE, detectable(found, scene, ranked))
     )
     picture_sections, sheets = _picture_sections(data, capture, shown, trouble)
-    drawn = [figures.training_figure(found, scene), figures.stage_figure(found, scene)]
+    training = figures.training_figure(found, scene)
     sections = [
         Section(title=scene, headline=sentences.headline(found, scene), blocks=tuple(_opening(data, capture))),
         Section(title=quality.title, blocks=(_untitled(quality), *seen, Text(text=note, note=True), *doubts)),
         Section(title=cost.title, blocks=(_untitled(cost), Text(text=COST_NOTE, note=True), *doubts)),
         Section(title=f"Differences to ASH on {scene}", blocks=tuple(difference_blocks(found, scene, ranked))),
         Section(title=f"Subject by subject on {scene}", blocks=people.blocks(found, scene)),
-        Section(title=f"Given the exact surface on {scene}", blocks=tuple(_exact(found, scene))),
         *picture_sections,
-        Section(title=f"Time on {scene}", blocks=tuple(figure for figure in drawn if figure)),
+        Section(title=f"Training on {scene}", blocks=(training,) if training else ()),
         Section(title=f"All other numbers of {scene}", blocks=more, folded=True),
         Section(
             title=f"The same renders of {scene} by other conventions", blocks=_conventions(found, scene), folded=True
@@ -177,8 +174,7 @@ def detectable(found: RunTables, scene: str, ranked: pd.DataFrame) -> str:
 
 def difference_blocks(found: RunTables, scene: str, ranked: pd.DataFrame) -> list[Block]:
     """The differences with intervals and verdicts, and what more captures would show."""
-    figure = figures.differences_figure(ranked, scene, over=found.unit(scene))
-    blocks: list[Block] = [figure] if figure else []
+    blocks: list[Block] = []
     if not ranked["p"].notna().any():
         return blocks
     others = tuple(split for split in MOTION_SPLITS if split not in RANKED_SPLITS)
@@ -241,27 +237,6 @@ def _more_tables(found: RunTables, scene: str) -> tuple[Table, ...]:
     return tuple(table for table in built if table.heads)
 
 
-def _exact(found: RunTables, scene: str) -> list[Block]:
-    """ASH and DDC with their own template and with the exact surface, on each split."""
-    blocks: list[Block] = []
-    rows = (*EXACT, *EXACT.values())
-    for split in RANKED_SPLITS if found.whole(scene, *rows) else ():
-        means = found.values(scene, foreground(split), rows)
-        if len(means) == len(rows):
-            own, exact = [means[m] for m in EXACT], [means[m] for m in EXACT.values()]
-            gain = [f"{b - a:+.2f}" for a, b in zip(own, exact, strict=True)]
-            columns = {"own template [dB]": own, "exact surface [dB]": exact}
-            texts = {
-                name: [*(f"{v:.2f}" for v in values), f"{values[0] - values[1]:+.2f}"]
-                for name, values in columns.items()
-            }
-            index = [*(style_of(method).title for method in EXACT), "ASH minus DDC"]
-            frame = pd.DataFrame(texts | {"gain [dB]": [*gain, ""]}, index=index)
-            title = SPLIT_NAMES[split].title
-            blocks.append(Table(title=title, frame=frame, marks={(2, 0): "strong", (2, 1): "strong"}, below=1))
-    return [*blocks, Text(text=EXACT_NOTE, note=True)] if blocks else []
-
-
 def _conventions(found: RunTables, scene: str) -> tuple[Block, ...]:
     blocks: list[Block] = []
     for split, metric in [(split, metric) for split in RANKED_SPLITS for metric in ("psnr", "ssim")]:
@@ -317,9 +292,10 @@ def _picture_sections(
         subjects, subject_sheet = people.pictured(data.run, data.results, data.tables, data.scene, data.album)
         strips, worst_sheet = _worst(data, capture, shown)
     except InputError as error:
-        earlier = _earlier_sheets(data)
-        reason = Text(text=EARLIER if earlier else trouble or _no_pictures(data, error), note=True)
-        return [Section(title=title, blocks=(*earlier, reason))], {sheet.file: sheet.data for sheet in earlier}
+        files = {f"{kind}_{data.scene}.png": name for kind, name in SHEETS.items()}  # of an earlier report
+        earlier = [Strips(file=f, title=name, groups=()) for f, name in files.items() if (data.run.folder / f).exists()]
+        reason = Text(text=trouble or _no_pictures(data, error), note=True)
+        return [Section(title=title, blocks=(*earlier, reason))], {}
     note = (
         "Cropped to the subject, on grey; compressed for this page, while scores come from the stored pictures. First "
         "seed. Difference: that to the truth, four times enlarged."
@@ -335,14 +311,6 @@ def _picture_sections(
         blocks = (strips, Text(text=text, note=True))
         sections.append(Section(title=f"The worst frames on {data.scene}, by image region", blocks=blocks))
     return sections, sheets | subject_sheet | worst_sheet
-
-
-def _earlier_sheets(data: SceneData) -> tuple[Sheet, ...]:
-    """What an earlier report left in the run's folder, for cells whose pictures are missing."""
-    places = {title: data.run.folder / f"{kind}_{data.scene}.png" for kind, title in SHEETS.items()}
-    return tuple(
-        Sheet(file=path.name, title=title, data=path.read_bytes()) for title, path in places.items() if path.is_file()
-    )
 
 
 def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Flipbook, dict[str, bytes]]:

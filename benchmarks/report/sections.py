@@ -12,7 +12,7 @@ from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS, PROTOCOL
 from benchmarks.report import charts, vega
-from benchmarks.report.content import Block, Bullets, Mark, Section, Table, Text
+from benchmarks.report.content import Block, Bullets, Section, Table, Text
 from benchmarks.report.figures import line_figure
 from benchmarks.report.glossary import GLOSSARY
 from benchmarks.report.tables import text_of
@@ -110,43 +110,23 @@ def _matrix(tables: RunTables, found: Sequence[ablation_matrix.AblationEffect], 
         told += f" Verdicts on ASH with them: {', '.join(f'{count} {verdict}' for verdict, count in counts.items())}."
         blocks.append(Text(text=f"{told} {'Contradictions:' if said else 'No contradictions.'}"))
         blocks += [Bullets(items=tuple(said))] if said else []
-    texts: dict[str, list[str]] = {}
-    marks: dict[tuple[int, int], Mark] = {}
-    for k, component in enumerate(components):
-        column = [by_place.get((scene, component)) for scene in scenes]
-        texts[f"{component} [dB lost]"] = [
-            "n/a" if each is None else f"{each.text.replace(' dB', '', 1)} {each.verdict}" for each in column
-        ]
-        kinds: dict[str, Mark] = {"better": "best", "worse": "second"}
-        marks |= {(i, k): kinds[each.verdict] for i, each in enumerate(column) if each and each.verdict in kinds}
-    table = Table(title=SPLIT_NAMES[split].title, corner="scene", frame=pd.DataFrame(texts, index=scenes), marks=marks)
-    return [*blocks, table]
+    return blocks
 
 
 def _strengths(table: pd.DataFrame, split: str) -> list[Block]:
     words = SPLIT_NAMES[split].words
-    rows = list(dict.fromkeys(table["row"]))
-    series = [
-        Series(title=table.loc[table["row"] == row, "component"].iloc[0], colour=plain.colour, shape=plain.shape)
-        for row, plain in zip(rows, vega.series_of(rows), strict=True)
-    ]
-    samples = table.assign(panel=table["scene"], series=table["component"], x=table["strength"], y=table["mean"])
-    zero = pd.DataFrame({"panel": table["scene"].unique(), "y": 0.0, "text": ""})
-    panels = charts.lines(
-        samples[["panel", "series", "x", "y", "low", "high"]],
-        series,
-        x="strength of the phenomenon",
-        y="dB lost",
-        size=(230, 170),
-        rules=zero,
-    )
-    figure = Figure(
+    figure = line_figure(
+        table.assign(panel=table["scene"], method=table["row"], psnr=table["mean"]),
+        list(dict.fromkeys(table["row"])),
         name=f"strength_{split}",
         title=f"Loss against strength, {words}",
         caption=f"Foreground PSNR lost without a component that the scene should need, {words}, by the phenomenon's "
         "strength (1: the factor scene; 0: the scene without any). Whiskers: 95 % interval.",
-        panels=panels,
-        series=tuple(series),
+        x="strength",
+        x_title="strength of the phenomenon",
+        y_title="dB lost",
+        size=(230, 170),
+        rules=pd.DataFrame({"panel": table["scene"].unique(), "y": 0.0, "text": ""}),
         columns=3,
     )
     said = []
@@ -192,58 +172,52 @@ def _sufficient(tables: RunTables, chosen_on: RunTables | None) -> list[Block]:
 
 def template_errors(tables: RunTables) -> list[Section]:
     """Quality, and ASH minus DDC, against the template's error, where templates of known error were run."""
-    margins, levels = template_error.margins(tables), template_error.levels(tables)
+    margins = template_error.margins(tables)
     if not len(margins):
         return []
-    levels = levels.merge(margins[["scene", "split"]].drop_duplicates())
 
     def panel(table: pd.DataFrame) -> pd.Series:
         return table["scene"] + ", " + table["split"].map(lambda split: SPLIT_NAMES[split].words)
 
-    titles = {m: title for m, title in template_error.LEVEL_TITLES.items() if m in set(levels["method"])}
-    styles = [Series(title=title, colour=style_of(method).colour) for method, title in titles.items()]
-    pair = [
+    levels = template_error.levels(tables).merge(margins[["scene", "split"]].drop_duplicates())
+    level_figure = line_figure(
+        levels.assign(panel=panel(levels)),
+        list(levels["method"].unique()),
+        name="levels",
+        title="Quality against the template's error",
+        caption="Foreground PSNR when a method is given a template of known error (the exact surface, displaced "
+        f"smoothly). {WHISKERS}",
+        x="error_mm",
+        x_title="template error [mm rms]",
+    )
+    pair = (
         Series(title="planted error", colour=vega.BLUE),
         Series(title="learned template", colour=vega.ORANGE, shape="square"),
-    ]
+    )
     rules = [(place, 0.0, "") for place in panel(margins).unique()]
     for scene, split in margins[["scene", "split"]].drop_duplicates().itertuples(index=False):
         if (db := template_error.PAPER_DB[split].get(scene)) is not None:
             rules.append((f"{scene}, {SPLIT_NAMES[split].words}", db, f"the paper's {db:+.1f} dB"))
-    level_rows = levels.assign(
-        panel=panel(levels), series=levels["method"].map(titles), x=levels["error_mm"], y=levels["psnr"]
-    )
     kinds = (margins["template"] == template_error.PLANTED).map({True: pair[0].title, False: pair[1].title})
-    margin_rows = margins.assign(panel=panel(margins), series=kinds, x=margins["error_mm"], y=margins["mean"])
-    columns, x, size = ["panel", "series", "x", "y", "low", "high"], "template error [mm rms]", (390, 240)
-    mesh = "A fixed mesh with the best texture shows what the geometry allows. " if "oracle_texture" in titles else ""
-    blocks = (
-        Figure(
-            name="levels",
-            title="Quality against the template's error",
-            caption="Foreground PSNR when a method is given a template of known error (the exact surface, displaced "
-            f"smoothly). {mesh}{WHISKERS}",
-            panels=charts.lines(level_rows[columns], styles, x=x, y="foreground PSNR [dB]", size=size),
-            series=tuple(styles),
-        ),
-        Figure(
-            name="margin",
-            title="ASH minus DDC against the template's error",
-            caption="Foreground PSNR of ASH minus DDC when both are given such a template, and on templates that both "
-            f"learned. {WHISKERS}",
-            panels=charts.lines(
-                margin_rows[columns],
-                pair,
-                x=x,
-                y="ASH minus DDC [dB]",
-                size=size,
-                rules=pd.DataFrame(rules, columns=["panel", "y", "text"]),
-            ),
-            series=tuple(pair),
-        ),
-        Bullets(items=tuple(template_error.sentences(tables, margins))),
+    rows = margins.assign(panel=panel(margins), series=kinds, x=margins["error_mm"], y=margins["mean"])
+    panels = charts.lines(
+        rows[["panel", "series", "x", "y", "low", "high"]],
+        pair,
+        x="template error [mm rms]",
+        y="ASH minus DDC [dB]",
+        size=(390, 240),
+        rules=pd.DataFrame(rules, columns=["panel", "y", "text"]),
     )
-    return [Section(title="Quality against the template's error", blocks=blocks)]
+    margin_figure = Figure(
+        name="margin",
+        title="ASH minus DDC against the template's error",
+        caption="Foreground PSNR of ASH minus DDC when both are given such a template, and on templates that both "
+        f"learned. {WHISKERS}",
+        panels=panels,
+        series=pair,
+    )
+    said = Bullets(items=tuple(template_error.sentences(tables, margins)))
+    return [Section(title=level_figure.title, blocks=(level_figure, margin_figure, said))]
 
 
 def training_cost(tables: RunTables) -> list[Section]:

@@ -28,6 +28,7 @@ from tomlkit.items import AbstractTable, Table
 from ash.capture.manifest import read_manifest
 from ash.fields import WRITTEN, Changes, for_json, suggest
 from ash.files import InputError, hash_of, open_regular
+from benchmarks.aliases import OLD_SIZES, OLD_SUITES
 from benchmarks.cell.methods import configured, find_method
 from benchmarks.suites.stress import Stress
 from benchmarks.suites.suites import MethodSpec, SceneSpec, Suite, varied_name
@@ -69,7 +70,7 @@ def our_rows() -> frozenset[tuple[str, str, str]]:
 def find_suite(name: str | Path) -> Suite:
     """A suite of ours by name, or anyone's by its file."""
     known = suite_files()
-    path = known.get(str(name), Path(name))
+    path = known.get(OLD_SUITES.get(str(name), str(name)), Path(name))
     if path.suffix != ".toml":
         raise InputError(f"unknown suite {str(name)!r}, {suggest(str(name), (*known, 'FILE.toml'))}")
     return read_suite(path)
@@ -113,6 +114,7 @@ class _Reader:
                 raise InputError(f"{self.path}: expected the key {key!r}")
         plain = {"about": "", "size": "quick", **content}
         plain = {key: self.checked(key, value) for key, value in plain.items() if key in PLAIN}
+        plain["size"] = OLD_SIZES.get(plain["size"], plain["size"])
         size, preset = plain["size"], plain["preset"]
         scenes = tuple(self.scene(index, row, size) for index, row in enumerate(self.rows(content, "scenes")))
         methods = tuple(self.method(index, row, preset) for index, row in enumerate(self.rows(content, "methods")))

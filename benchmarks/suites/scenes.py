@@ -11,7 +11,7 @@ from benchmarks.suites.progress import Progress
 from synth.presets import SCENES, scene, skinned
 from synth.scene import Scene
 
-SPLATS = "splats"  # The first rung, drawn by `benchmarks.suites.splats`.
+SPLATS = "splats"  # The first factor scene, drawn by `benchmarks.suites.splats`.
 
 
 def scene_names() -> tuple[str, ...]:

@@ -1,7 +1,7 @@
-"""The first rung, `splats`: images of known Gaussians, so that no light, cloth or pose stands between them and ASH.
+"""The factor scene `splats`: images of known Gaussians, without light, cloth or articulation.
 
 They are none of ASH's: more than it has texels, at other places, of other shapes. Training must approximate them.
-The rung is drawn here and not in `synth`, which makes the truth that the splatter is judged by and so must not know it.
+It is drawn here and not in `synth`, which makes the truth that the splatter is judged by and so must not know it.
 """
 
 from collections.abc import Sequence

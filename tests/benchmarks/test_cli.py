@@ -148,7 +148,7 @@ def test_a_methods_mistake_comes_with_file_and_line(capture: Path, tmp_path: Pat
 
 
 def test_suites_are_printed_as_files(tmp_path: Path, capsys) -> None:
-    assert cli.main(["suites", "quick"]) == arguments.DONE
+    assert cli.main(["run", "quick", "--list"]) == arguments.DONE
     (tmp_path / "copy.toml").write_text(capsys.readouterr().out)
     mine, ours = find_suite(tmp_path / "copy.toml"), find_suite("quick")
     assert replace(mine, name="quick") == ours
@@ -225,7 +225,7 @@ def test_dry_run_starts_nothing(tmp_path: Path, capsys) -> None:
 
 
 def test_unknown_names(capture: Path, tmp_path: Path, capsys) -> None:
-    assert "unknown suite 'nosuch', expected one of budget, ci, ladder, " in refused(capsys, "run", "nosuch")
+    assert "unknown suite 'nosuch', expected one of budget, ci, factors, " in refused(capsys, "run", "nosuch")
     assert "unknown suite 'qiuck', did you mean quick?" in refused(capsys, "run", "qiuck")
     assert "unknown method 'nosuch', expected one of" in refused(capsys, "train", "nosuch", str(capture))
     assert "expected a shard i/n" in refused(capsys, "run", "ci", "--shard", "3/2", "--dry-run")

@@ -92,12 +92,12 @@ def _some_samples(vertices: Tensor, topology: Topology, camera: Camera) -> MeshV
     viewmat, K = (torch.from_numpy(matrix).to(vertices) for matrix in (camera.viewmat, camera.K))
     corners = project_vertices(vertices, viewmat, K)
     covered = torch.arange(7, device=vertices.device)
-    seen = Rasterized(
+    drawn = Rasterized(
         triangle=torch.zeros(height, width, dtype=torch.int32, device=vertices.device),
         barycentric=vertices.new_zeros(height, width, 3),
         depth=vertices.new_zeros(height, width),
     )
-    return MeshView(camera=camera, corners=corners, drawn=seen, covered=covered, seen=torch.zeros_like(covered))
+    return MeshView(camera=camera, corners=corners, drawn=drawn, covered=covered, seen=torch.zeros_like(covered))
 
 
 def as_if_averaged(mean: NeighbourMean, x: Tensor) -> Tensor:

@@ -259,7 +259,7 @@ def test_wrong_folders_are_refused(tmp_path: Path, folder: Path, monkeypatch: py
 def test_names_and_sizes_are_checked():
     with pytest.raises(InputError, match=r"expected one of .*mannequin"):
         presets.scene("mannekin", size="ci")
-    with pytest.raises(InputError, match="expected one of ci, rung, quick"):
+    with pytest.raises(InputError, match="expected one of ci, factor, quick"):
         presets.scene("loose", size="huge")
     with pytest.raises(InputError, match="held out"):
         Rig(cameras=4, held_out=4)

@@ -19,7 +19,7 @@ from ash.capture.dataset import Capture, image_path
 from ash.capture.formats import load_capture
 from ash.devices import CPU
 from ash.files import InputError
-from ash.training.batches import composite_naive, draw_ahead, draw_batch, sampled
+from ash.training.batches import draw_ahead, draw_batch, sampled
 from ash.training.images import STEPS_AHEAD, ReadAhead, load_training_images, read_crop
 
 STEPS = 24
@@ -82,9 +82,10 @@ def test_with_little_room_and_readers_the_batches_are_those_of_the_whole_images(
                 left, top = np.round(whole.K[:2, 2] - camera.K[:2, 2]).astype(int)
                 image = capture.image(camera.name, batch.frame)
                 window = np.ascontiguousarray(image[top : top + camera.height, left : left + camera.width])
-                expected, alpha = composite_naive(torch.from_numpy(window), batch.background)
+                rgb, alpha = np.split(window / np.float32(255), [3], axis=2)
+                expected = torch.from_numpy(rgb * alpha) + (1 - torch.from_numpy(alpha)) * batch.background
                 torch.testing.assert_close(target, expected, rtol=0, atol=2e-7)
-                assert torch.equal(mask, alpha) and float(mask.sum()) == pytest.approx(
+                assert torch.equal(mask, torch.from_numpy(alpha[..., 0])) and float(mask.sum()) == pytest.approx(
                     image[..., 3].sum() / 255, rel=1e-5
                 )
             if not crop:

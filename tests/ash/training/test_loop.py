@@ -21,7 +21,7 @@ from ash.files import InputError
 from ash.protocol import StageClock
 from ash.training import loop, stopping
 from ash.training.adam import Adam
-from ash.training.batches import composite, composite_naive, draw_batch, make_batch
+from ash.training.batches import draw_batch, make_batch
 from ash.training.images import load_training_images
 from ash.training.loop import Diverged, Interrupted
 
@@ -240,17 +240,6 @@ def test_reserved_views_are_never_trained_on(capture):
         seen = {(camera.name, batch.frame) for camera in batch.cameras}
         assert not seen & set(images.reserved)
         assert len(seen) == 4 - sum(frame == batch.frame for _, frame in images.reserved)
-
-
-def test_a_window_over_a_background_is_its_definition():
-    rgba = np.random.default_rng(0).integers(0, 256, (30, 40, 4), np.uint8)
-    rgba[:4, :, 3], rgba[4:8, :, 3] = 0, 255
-    for window in map(torch.from_numpy, (rgba, rgba[3:20, 5:38])):
-        for background in (torch.zeros(3), torch.tensor([0.2, 0.5, 0.9])):
-            rgb, alpha = composite(window, background)
-            expected_rgb, expected_alpha = composite_naive(window, background)
-            torch.testing.assert_close(rgb, expected_rgb, rtol=0, atol=2e-7)
-            assert torch.equal(alpha, expected_alpha)
 
 
 def test_equal_seeds_give_equal_bits_and_other_seeds_do_not(capture, tmp_path):

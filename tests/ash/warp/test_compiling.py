@@ -21,8 +21,8 @@ values_and_gradients(splat_warp, random_scene(cameras=2), torch.float32)
 def test_a_splatter_that_finds_the_copy_compiles_nothing(tmp_path: Path) -> None:
     copy_compiled(torch.device("cpu"), tmp_path)
     before = _files(tmp_path)
-    found = os.environ | {"WARP_CACHE_PATH": str(tmp_path), "PYTHONPATH": str(TESTS)}
-    subprocess.run([sys.executable, "-c", LEARNS], env=found, check=True)
+    env = os.environ | {"WARP_CACHE_PATH": str(tmp_path), "PYTHONPATH": str(TESTS)}
+    subprocess.run([sys.executable, "-c", LEARNS], env=env, check=True)
     assert _files(tmp_path) == before
 
 

@@ -112,7 +112,7 @@ def test_quality_on_templates_of_known_error_has_a_curve_per_method_and_shows_no
     (section,) = sections.template_errors(tables)
     levels = next(block for block in section.blocks if isinstance(block, Figure))
     assert levels.file == "chart_levels.svg"
-    assert "fixed mesh, best texture" in "".join(ElementTree.fromstring(levels.svg()).itertext())
+    assert "best texture, exact mesh" in "".join(ElementTree.fromstring(levels.svg()).itertext())
 
 
 def test_ticks_that_would_lie_on_each_other_give_way_to_the_rounder_one() -> None:

@@ -126,7 +126,7 @@ def test_a_timed_frame_poses_its_own_template_and_not_that_of_the_frames_before(
 ) -> None:
     avatar, capture = trained
     template, posed, timed = avatar.module.template, [], []
-    anew, render = template.pose_anew, avatar.render
+    anew, render = template.pose_uncached, avatar.render
 
     def recorded(pose, *rest, **options):
         posed.clear()
@@ -134,7 +134,7 @@ def test_a_timed_frame_poses_its_own_template_and_not_that_of_the_frames_before(
         timed.append((pose.frame, *posed))
         return image
 
-    monkeypatch.setattr(template, "pose_anew", lambda pose: posed.append(pose.frame) or anew(pose))
+    monkeypatch.setattr(template, "pose_uncached", lambda pose: posed.append(pose.frame) or anew(pose))
     monkeypatch.setattr(avatar, "render", recorded)
     agreements(avatar, capture, threads=(1, 2))
     assert avatar.config.model.window > 1
@@ -166,7 +166,9 @@ def test_an_empty_image_does_not_agree(trained: Trained, monkeypatch: pytest.Mon
 
 def test_an_agreement_has_the_least_weight_of_the_decoders(trained: Trained, monkeypatch: pytest.MonkeyPatch) -> None:
     avatar, capture = trained
-    monkeypatch.setattr(TextureDrawer, "trust", lambda self, textures: 0.7 if self.novelty(textures) > 1e-3 else 1.0)
+    monkeypatch.setattr(
+        TextureDrawer, "decoder_weight", lambda self, textures: 0.7 if self.novelty(textures) > 1e-3 else 1.0
+    )
     new = agreements(avatar, capture)["new"]
     assert new.least_decoder_weight == 0.7
     assert f"of {len(NEW)} frames, decoder weight 0.70 or more" in new.line()

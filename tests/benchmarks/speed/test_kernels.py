@@ -6,8 +6,7 @@ import pytest
 
 import benchmarks.speed.kernels
 from ash.files import read_json
-from benchmarks.speed.kernels import SplatDetail, count_pairs, main
-from benchmarks.speed.scenes import splat_scene
+from benchmarks.speed.kernels import SplatDetail, count_pairs, main, splat_scene
 from benchmarks.speed.timing import WHOLE, Candidate, SpeedRow, as_json, rows_of, time_interleaved
 
 

@@ -105,7 +105,7 @@ def test_a_capture_that_is_there_is_a_scene(tmp_path: Path) -> None:
         ('"tight",', '"tihgt",', 2, "unknown scene 'tihgt', did you mean tight"),
         ("outfit.swing", "outfit.swnig", 2, "unknown key 'outfit.swnig', did you mean outfit.swing"),
         ("0.8", "8", 2, "swing is 8.0, expected 0 to 1"),
-        ('"ci"\nmethods', '"huge"\nmethods', 2, "unknown size 'huge', expected one of ci, rung, quick, long"),
+        ('"ci"\nmethods', '"huge"\nmethods', 2, "unknown size 'huge', expected one of ci, factor, quick, long"),
         ('    "ash"', '    "ahs"', 5, "unknown method 'ahs', did you mean ash"),
         ("model.width = 4", "model.width = 'x'", 6, "model.width: expected a whole number, got 'x'"),
         ("model.width = 4", "width = 4", 6, "unknown key 'width', did you mean model.width"),
@@ -172,7 +172,7 @@ def test_our_suites_are_such_files() -> None:
     assert set(suite_files()) >= {
         "quick",
         "table",
-        "ladder",
+        "factors",
         "stability",
         "template",
         "switches",

@@ -1,4 +1,4 @@
-"""The rung of known Gaussians: a capture like any other, in which the truth is what the splatter draws."""
+"""The factor scene of known Gaussians: a capture like any other, in which the truth is what the splatter draws."""
 
 from dataclasses import replace
 

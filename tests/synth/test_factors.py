@@ -1,4 +1,4 @@
-"""Every rung adds its phenomenon, and nothing else, to `skinned`."""
+"""Every factor scene adds its phenomenon, and nothing else, to `skinned`."""
 
 import multiprocessing
 from collections.abc import Iterator
@@ -32,7 +32,7 @@ def pool() -> Iterator[ProcessPoolExecutor]:
 
 
 def _tiny(scene: Scene, **changes) -> Scene:
-    """The rung with four small cameras and two frames of standing, 0.6 m apart on the floor."""
+    """The factor scene with four small cameras and two frames of standing, 0.6 m apart on the floor."""
     clips = tuple(Clip(generator="stand", frames=2, shift=(x, 0.0)) for x in (0.3, -0.3))
     small = replace(
         scene,
@@ -50,12 +50,12 @@ def _captured(scene: Scene, folder: Path, pool: ProcessPoolExecutor) -> Capture:
     return load_capture(make_capture(scene, folder, executor=pool))
 
 
-@pytest.mark.parametrize("name", presets.RUNGS)
+@pytest.mark.parametrize("name", presets.FACTORS)
 @pytest.mark.parametrize("size", presets.SIZES)
 def test_strength_zero_is_skinned_itself(name: str, size: str):
     """Equal parameters make equal bytes, so this is equality of every image."""
     skinned = presets.scene("skinned", size=size)
-    assert replace(presets.rung(name, size=size, strength=0.0), name="skinned") == skinned
+    assert replace(presets.factor_scene(name, size=size, strength=0.0), name="skinned") == skinned
     changed = presets.scene(name, size=size)
     different = [key for key in ("outfit", "light", "test") if getattr(changed, key) != getattr(skinned, key)]
     assert len(different) == 1
@@ -64,7 +64,7 @@ def test_strength_zero_is_skinned_itself(name: str, size: str):
 
 def test_unknown_rungs_are_refused():
     with pytest.raises(InputError, match="wrinkles, swing"):
-        presets.rung("creases", size="ci")
+        presets.factor_scene("creases", size="ci")
 
 
 def test_wrinkles_move_cloth_by_millimetres_and_depend_on_the_pose_only():
