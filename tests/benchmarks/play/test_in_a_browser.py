@@ -49,7 +49,7 @@ def shot(tab: Any) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB")).astype(int)
 
 
-def seen(tab: Any, *, unlike: np.ndarray | None = None) -> np.ndarray:
+def picture_of(tab: Any, *, unlike: np.ndarray | None = None) -> np.ndarray:
     """The page left of the panel once it shows an avatar, or another picture than before."""
     end = time.perf_counter() + PATIENCE
     while time.perf_counter() < end:
@@ -68,7 +68,7 @@ def standing(player: PlayServer, visit: Visitor) -> Iterator[Any]:
     visited = visit(player.url, size=WINDOW)
     assert "token" not in visited.page.url
     visited.page.get_by_text("Held-out motion, frame").first.wait_for(timeout=1000 * PATIENCE)
-    seen(visited.page)
+    picture_of(visited.page)
     visited.page.keyboard.press(" ")
     wait_for(lambda: not state_of(player).playing)
     time.sleep(0.5)
@@ -83,7 +83,7 @@ def tab(player: PlayServer, visit: Visitor) -> Iterator[Any]:
 
 
 def test_it_shows_turns_scrubs_and_switches(player: PlayServer, tab: Any) -> None:
-    first, view = seen(tab), state_of(player).viewpoint.viewmat
+    first, view = picture_of(tab), state_of(player).viewpoint.viewmat
     step = state_of(player).step
     tab.keyboard.press("ArrowRight")
     wait_for(lambda: state_of(player).step == (step + 1) % 2)
@@ -92,16 +92,16 @@ def test_it_shows_turns_scrubs_and_switches(player: PlayServer, tab: Any) -> Non
     tab.keyboard.press("e")
     wait_for(lambda: not state_of(player).error)
     np.testing.assert_array_equal(state_of(player).viewpoint.viewmat, view, "keys are commands and move no camera")
-    scrubbed = seen(tab, unlike=first)
+    scrubbed = picture_of(tab, unlike=first)
     tab.mouse.move(200, 200)
     tab.mouse.down()
     tab.mouse.move(230, 210, steps=5)
     tab.mouse.up()
-    turned = seen(tab, unlike=scrubbed)
+    turned = picture_of(tab, unlike=scrubbed)
     assert np.abs(state_of(player).viewpoint.viewmat - view).max() > 0.05
     tab.keyboard.press("m")
     tab.get_by_text(f"{player.avatars.titles[1]} · Held-out").first.wait_for(timeout=1000 * PATIENCE)
-    seen(tab, unlike=turned)
+    picture_of(tab, unlike=turned)
 
 
 def test_the_divider_is_dragged(player: PlayServer, tab: Any) -> None:
@@ -125,11 +125,11 @@ def test_the_divider_is_dragged(player: PlayServer, tab: Any) -> None:
 
 
 def test_light_and_dark_follow_the_system(player: PlayServer, tab: Any) -> None:
-    light = seen(tab)
+    light = picture_of(tab)
     assert not state_of(player).dark
     tab.emulate_media(color_scheme="dark")
     wait_for(lambda: state_of(player).dark)
-    dark = seen(tab, unlike=light)
+    dark = picture_of(tab, unlike=light)
     assert np.median(light[:, :40]) > 200 and np.median(dark[:, :40]) < 60
 
 
@@ -159,7 +159,7 @@ def test_a_chosen_camera_shows_its_view(player: PlayServer, tab: Any) -> None:
     wait_for(lambda: state_of(player).camera in cameras, PATIENCE)
     name = state_of(player).camera
     wait_for(lambda: np.abs(state_of(player).viewpoint.viewmat - cameras[name].viewmat).max() < 1e-3, PATIENCE)
-    seen(tab, unlike=before)
+    picture_of(tab, unlike=before)
     clip, state = player.clips[1], state_of(player)
     with torch.no_grad():
         through = resized(cameras[name], width=WINDOW[0], height=WINDOW[1])
@@ -230,15 +230,15 @@ class Fingers:
         self._wire = tab.context.new_cdp_session(tab)
 
     def drag(self, *paths: tuple[tuple[float, float], tuple[float, float]]) -> None:
-        """Each finger from a place to a place, all at once."""
+        """Each finger from a point to a point, all at once."""
         self._send("touchStart", [start for start, _ in paths])
         for share in np.linspace(0, 1, 9)[1:]:
             self._send("touchMove", [tuple((1 - share) * np.array(a) + share * np.array(b)) for a, b in paths])
             time.sleep(0.03)
         self._send("touchEnd", [])
 
-    def _send(self, kind: str, places: list[tuple[float, float]]) -> None:
-        points = [{"x": float(x), "y": float(y), "id": number} for number, (x, y) in enumerate(places)]
+    def _send(self, kind: str, positions: list[tuple[float, float]]) -> None:
+        points = [{"x": float(x), "y": float(y), "id": number} for number, (x, y) in enumerate(positions)]
         self._wire.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
 
 
@@ -247,14 +247,14 @@ def test_fingers_turn_the_view_come_closer_and_move_the_divider(player: PlayServ
     tab, fingers = visited.page, Fingers(visited.page)
     tab.get_by_text("Held-out motion, frame").first.wait_for(state="attached", timeout=1000 * PATIENCE)
     tab.get_by_text("Held-out motion, frame").first.wait_for(state="hidden", timeout=1000 * PATIENCE)
-    seen(tab)
+    picture_of(tab)
     tab.keyboard.press(" ")
     wait_for(lambda: not state_of(player).playing)
     time.sleep(0.5)
-    first, view = seen(tab), state_of(player).viewpoint
+    first, view = picture_of(tab), state_of(player).viewpoint
     target = np.array([0.0, 0.5, 0.0])  # the tube's middle
     fingers.drag(((100, 300), (220, 300)))
-    seen(tab, unlike=first)
+    picture_of(tab, unlike=first)
     turned = state_of(player).viewpoint
     reach, now = (np.linalg.norm(each.position - target) for each in (view, turned))
     assert np.linalg.norm(turned.position - view.position) > 0.2 and abs(now / reach - 1) < 0.05, "around the person"

@@ -71,8 +71,8 @@ def test_a_rig_gives_a_row_per_avatar_and_a_spiral_turns(tube_run: Path, tmp_pat
     assert film(tube_run, spiral, *more, "--frames", "0:3") == cli.DONE
     with open_avatars(tube_run) as avatars, Image.open(spiral) as image:
         assert image.n_frames == 3
-        places = [spiral_camera(avatars.capture, float(step), width=8, height=8).position for step in range(3)]
-    assert np.linalg.norm(places[1] - places[0]) > 0.01 and np.linalg.norm(places[2] - places[0]) > 0.02
+        positions = [spiral_camera(avatars.capture, float(step), width=8, height=8).position for step in range(3)]
+    assert np.linalg.norm(positions[1] - positions[0]) > 0.01 and np.linalg.norm(positions[2] - positions[0]) > 0.02
 
 
 def test_what_cannot_be_filmed_is_refused(tube_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
