@@ -1,5 +1,4 @@
 // Adam over many tensors in one call.
-#include <algorithm>
 #include <atomic>
 #include <cmath>
 
@@ -28,8 +27,8 @@ int ash_adam(int tensors, float* const* parameters, const float* const* grads, f
                             float(eps),
                             float(lr / (1 - std::pow(beta1, step))),
                             float(1 / std::sqrt(1 - std::pow(beta2, step)))};
-        in_parallel(threads, (counts[k] + RANGE - 1) / RANGE, [&](int64_t part) {
-            if (!kernels().adam(args, part * RANGE, std::min(counts[k], (part + 1) * RANGE))) finite = false;
+        in_ranges(threads, counts[k], RANGE, [&](int64_t, int64_t first, int64_t last) {
+            if (!kernels().adam(args, first, last)) finite = false;
         });
     }
     return finite;

@@ -26,7 +26,7 @@ struct Layer {  // weights and bias; a convolution's lie [out][tap][in], a trans
 };
 
 // Where factors are put in the order that products want, one layer after the other.
-struct Room {
+struct Scratch {
     float* packed = nullptr;
     bool halves = false;  // 3x3 convolutions in bfloat16, by the kernels of tiles.h
     Half *plane = nullptr, *weights = nullptr, *turned = nullptr, *pairs = nullptr;
@@ -35,8 +35,8 @@ struct Room {
 constexpr int BAND = 4;  // image rows handed out at once
 
 template <class Work> void in_bands(int threads, int height, const Work& work) {
-    in_parallel(threads, (height + BAND - 1) / BAND, [&](int64_t band) {
-        for (int y = int(band) * BAND; y < std::min(height, int(band + 1) * BAND); ++y) work(y);
+    in_ranges(threads, height, BAND, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t y = first; y < last; ++y) work(int(y));
     });
 }
 
@@ -71,14 +71,13 @@ inline Taps around(const Plane& in, int sign) {
 
 inline TilePlane tile_plane_of(const Plane& p) { return {p.first, p.height, p.width, p.channels, p.step}; }
 
-inline void convolve_in_tiles(const Plane& in, const TileConvolution& given, const Room& room, int threads) {
+inline void convolve_in_tiles(const Plane& in, const TileConvolution& given, const Scratch& scratch, int threads) {
     constexpr int64_t RANGE = 16;
     TileConvolution work = given;
-    work.plane = room.plane, work.weights = room.weights, work.inputs = in.channels;
-    tiles()->plane(tile_plane_of(in), room.plane);
+    work.plane = scratch.plane, work.weights = scratch.weights, work.inputs = in.channels;
+    tiles()->plane(tile_plane_of(in), scratch.plane);
     const int64_t blocks = tiles()->blocks(in.height, in.width);
-    in_parallel(threads, (blocks + RANGE - 1) / RANGE,
-                [&](int64_t part) { tiles()->convolve(work, part * RANGE, std::min(blocks, (part + 1) * RANGE)); });
+    in_ranges(threads, blocks, RANGE, [&](int64_t, int64_t first, int64_t last) { tiles()->convolve(work, first, last); });
 }
 
 inline void sum_pixels(const float* from, int64_t row, int64_t pixel, int height, int width, int channels, float* to) {
@@ -89,13 +88,13 @@ inline void sum_pixels(const float* from, int64_t row, int64_t pixel, int height
 }
 
 // A 3x3 convolution with ReLU.
-inline void forward(const Layer& layer, const Plane& in, const Plane& out, const Room& room, int threads) {
+inline void forward(const Layer& layer, const Plane& in, const Plane& out, const Scratch& scratch, int threads) {
     const int ci = in.channels, co = out.channels;
-    if (room.halves) {
-        tiles()->weights(layer.weights, co, ci, false, room.weights);
-        return convolve_in_tiles(in, {nullptr, nullptr, 0, tile_plane_of(out), layer.bias, nullptr, 0, true}, room, threads);
+    if (scratch.halves) {
+        tiles()->weights(layer.weights, co, ci, false, scratch.weights);
+        return convolve_in_tiles(in, {nullptr, nullptr, 0, tile_plane_of(out), layer.bias, nullptr, 0, true}, scratch, threads);
     }
-    float* const packed = room.packed;
+    float* const packed = scratch.packed;
     kernels().pack({layer.weights, co, 9, ci, int64_t(9) * ci, ci, 1, packed});
     Product product{};
     product.a_step = in.step, product.b = packed, product.c_step = out.step, product.start = layer.bias, product.relu = true;
@@ -103,14 +102,14 @@ inline void forward(const Layer& layer, const Plane& in, const Plane& out, const
 }
 
 // The gradient of its input, 0 where `active` (the input, if it came out of a ReLU) is not positive.
-inline void backward_input(const Layer& layer, const Plane& grad, const Plane& to, const Plane* active, const Room& room, int threads) {
+inline void backward_input(const Layer& layer, const Plane& grad, const Plane& to, const Plane* active, const Scratch& scratch, int threads) {
     const int ci = to.channels, co = grad.channels;
-    if (room.halves) {
-        tiles()->weights(layer.weights, co, ci, true, room.weights);
+    if (scratch.halves) {
+        tiles()->weights(layer.weights, co, ci, true, scratch.weights);
         const TileConvolution work{nullptr, nullptr, 0, tile_plane_of(to), nullptr, active ? active->first : nullptr, active ? active->step : 0, false};
-        return convolve_in_tiles(grad, work, room, threads);
+        return convolve_in_tiles(grad, work, scratch, threads);
     }
-    float* const packed = room.packed;
+    float* const packed = scratch.packed;
     kernels().pack({layer.weights, ci, 9, co, 1, ci, int64_t(9) * ci, packed});
     Product product{};
     product.a_step = grad.step, product.b = packed, product.c_step = to.step;
@@ -135,21 +134,21 @@ inline void correlate(const float* a, int64_t a_row, int64_t a_pixel, int rows, 
     }
 }
 
-inline void correlate_in_tiles(const Layer& layer, const Plane& grad, const Plane& in, const Room& room, int threads) {
+inline void correlate_in_tiles(const Layer& layer, const Plane& grad, const Plane& in, const Scratch& scratch, int threads) {
     const int height = grad.height, width = grad.width, ci = in.channels, co = grad.channels;
-    tiles()->plane(tile_plane_of(grad), room.plane);
-    tiles()->turned(room.plane, height, width, co, room.turned);
-    tiles()->plane(tile_plane_of(in), room.plane);
-    tiles()->pairs(room.plane, height, width, ci, room.pairs);
-    const TileCorrelation work{room.turned, room.pairs, height, width, co, ci, layer.grad_weights};
+    tiles()->plane(tile_plane_of(grad), scratch.plane);
+    tiles()->turned(scratch.plane, height, width, co, scratch.turned);
+    tiles()->plane(tile_plane_of(in), scratch.plane);
+    tiles()->pairs(scratch.plane, height, width, ci, scratch.pairs);
+    const TileCorrelation work{scratch.turned, scratch.pairs, height, width, co, ci, layer.grad_weights};
     in_parallel(threads, tiles()->correlations(co, ci), [&](int64_t piece) { tiles()->correlate(work, piece, piece + 1); });
 }
 
-inline void backward_weights(const Layer& layer, const Plane& grad, const Plane& in, const Room& room, int threads) {
+inline void backward_weights(const Layer& layer, const Plane& grad, const Plane& in, const Scratch& scratch, int threads) {
     const int ci = in.channels;
     const Taps taps = around(in, 1);
-    if (room.halves)
-        correlate_in_tiles(layer, grad, in, room, threads);
+    if (scratch.halves)
+        correlate_in_tiles(layer, grad, in, scratch, threads);
     else
         in_parallel(threads, 9, [&](int64_t t) {
             correlate(grad.first, grad.row(), grad.step, grad.channels, in.first + taps.at[t], in.row(), in.step, ci, grad.height, grad.width,

@@ -58,8 +58,8 @@ static bool grants_tiles() {
     return syscall(SYS_arch_prctl, REQUEST, TILE_DATA) == 0;
 }
 const TileKernels* tiles() {
-    static const TileKernels* const found = grants_tiles() ? &amx_kernels : nullptr;
-    return found;
+    static const TileKernels* const granted = grants_tiles() ? &amx_kernels : nullptr;
+    return granted;
 }
 #else
 const TileKernels* tiles() { return nullptr; }

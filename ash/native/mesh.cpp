@@ -11,8 +11,8 @@ extern "C" {
 void ash_skin_vertices(const float* joints, const int64_t* skin, const float* weights, int64_t count, int influences, int threads,
                        float* quats, float* translations) {
     constexpr int64_t RANGE = 1024;
-    ash::in_parallel(threads, (count + RANGE - 1) / RANGE, [&](int64_t part) {
-        for (int64_t v = part * RANGE; v < std::min(count, (part + 1) * RANGE); ++v) {
+    ash::in_ranges(threads, count, RANGE, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t v = first; v < last; ++v) {
             const float* strongest = joints + 8 * skin[v * influences];
             float sum[8] = {};
             for (int k = 0; k < influences; ++k) {

@@ -72,8 +72,7 @@ void ash_shade(const float* texture, int height, int width, const float* light, 
     constexpr int64_t RANGE = 1024;
     ShadeArgs args{texture, light, weights, uvs, normals, triangles, uv_faces, faces, height, width};
     args.colours = colours;
-    in_parallel(threads, (count + RANGE - 1) / RANGE,
-                [&](int64_t part) { kernels().shade(args, part * RANGE, std::min(count, (part + 1) * RANGE)); });
+    in_ranges(threads, count, RANGE, [&](int64_t, int64_t first, int64_t last) { kernels().shade(args, first, last); });
 }
 
 // Writes grad_texture, grad_light [9, 3] (if there is a light) and grad_weights (unless null); on one thread, as points share texels.

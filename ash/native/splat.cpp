@@ -173,10 +173,10 @@ int64_t ash_project(const float* means, const float* quats, const float* scales,
     args.means2d = means2d, args.packed = packed, args.depths = depths;
     Stopwatch watch(STAGE_PROJECT);
     std::atomic<int64_t> fault{INT64_MAX};
-    in_parallel(threads, ranges(count), [&](int64_t range) {
-        int64_t found = kernels().project(args, range * RANGE, std::min(count, (range + 1) * RANGE));
+    in_ranges(threads, count, RANGE, [&](int64_t, int64_t first, int64_t last) {
+        const int64_t here = kernels().project(args, first, last);
         // The lowest index is reported, whichever thread comes first.
-        for (int64_t now = fault; found && (found >> 4) < (now >> 4) && !fault.compare_exchange_weak(now, found);) {}
+        for (int64_t now = fault; here && (here >> 4) < (now >> 4) && !fault.compare_exchange_weak(now, here);) {}
     });
     return fault == INT64_MAX ? 0 : fault.load();
 }
@@ -197,9 +197,8 @@ int ash_project_backward(const float* means, const float* quats, const float* sc
     args.grad_opacities = grad_opacities, args.grad_sh = grad_sh;
     Stopwatch watch(STAGE_PROJECT_BACKWARD);
     std::vector<double> partial(grad_views ? size_t(ranges(count)) * cameras * 12 : 0, 0.0);
-    in_parallel(threads, ranges(count), [&](int64_t range) {
-        kernels().project_backward(args, range * RANGE, std::min(count, (range + 1) * RANGE),
-                                   grad_views ? partial.data() + range * cameras * 12 : nullptr);
+    in_ranges(threads, count, RANGE, [&](int64_t range, int64_t first, int64_t last) {
+        kernels().project_backward(args, first, last, grad_views ? partial.data() + range * cameras * 12 : nullptr);
     });
     for (int i = 0; grad_views && i < cameras * 12; ++i) {
         grad_views[i] = 0;
@@ -221,8 +220,8 @@ void* ash_blend(const float* means2d, const float* packed, const double* depths,
         Stopwatch watch(STAGE_LIST);
         d.splats.reserve(d.count), d.rects.reserve(d.count);
         const int columns = (width + TILE - 1) / TILE, rows = (height + TILE - 1) / TILE;
-        in_parallel(threads, ranges(d.count), [&](int64_t range) {
-            kernels().prepare(means2d, packed, columns, rows, d.splats.get(), d.rects.get(), range * RANGE, std::min(d.count, (range + 1) * RANGE));
+        in_ranges(threads, d.count, RANGE, [&](int64_t, int64_t first, int64_t last) {
+            kernels().prepare(means2d, packed, columns, rows, d.splats.get(), d.rects.get(), first, last);
         });
         list_entries(d, depths);
     }
@@ -251,9 +250,8 @@ int ash_blend_backward(void* handle, const float* rgb, const float* alpha, const
         in_parallel(threads, int64_t(d.tiles.size()), [&](int64_t tile) { kernels().blend_backward(args, d.tiles[tile]); });
     }
     Stopwatch watch(STAGE_GATHER);
-    in_parallel(threads, ranges(d.count), [&](int64_t range) {
-        kernels().gather(d.splats.get(), d.slots.get(), d.offsets.get(), range * RANGE, std::min(d.count, (range + 1) * RANGE),
-                         grad_means2d, grad_packed);
+    in_ranges(threads, d.count, RANGE, [&](int64_t, int64_t first, int64_t last) {
+        kernels().gather(d.splats.get(), d.slots.get(), d.offsets.get(), first, last, grad_means2d, grad_packed);
     });
     return 0;
 } catch (const std::bad_alloc&) {

@@ -1,7 +1,8 @@
-// Threads for one call: those of torch's own OpenMP runtime, where ash/native/library.py found it. Its idle threads spin for a while
-// after each of torch's operations, so that a second team would share the cores with them: by turns with convolutions, splatting on
-// threads of its own took 1.8 times as long. Without that runtime a call starts and joins its threads, about 20 microseconds each.
+// Threads for one call: those of torch's own OpenMP runtime, where ash/native/library.py found it. Its idle threads spin
+// after each of torch's operations and would share the cores with a second team: splatting on threads of its own, in turn with
+// convolutions, took 1.8 times as long. Without that runtime a call starts and joins its threads, about 20 microseconds each.
 #pragma once
+#include <algorithm>
 #include <atomic>
 #include <chrono>
 #include <cstdint>
@@ -34,6 +35,11 @@ template <class Work> void in_parallel(int threads, int64_t parts, const Work& w
     }
     run();
     for (auto& other : others) other.join();
+}
+
+// work(part, first, last) for [0, count) in ranges of `size`: fixed, so that sums per range do not depend on the threads.
+template <class Work> void in_ranges(int threads, int64_t count, int64_t size, const Work& work) {
+    in_parallel(threads, (count + size - 1) / size, [&](int64_t part) { work(part, part * size, std::min(count, (part + 1) * size)); });
 }
 
 // Seconds that the stages of the last calls took, for benchmarks. Calls at the same time mix their numbers.

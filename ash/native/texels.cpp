@@ -1,4 +1,4 @@
-// Texels to Gaussians: hands ranges of texels to the kernels. Ranges are fixed, so that sums do not depend on the threads.
+// Texels to Gaussians: hands ranges of texels to the kernels.
 #include <algorithm>
 #include <new>
 #include <vector>
@@ -8,16 +8,7 @@
 
 using namespace ash;
 
-namespace {
-
-constexpr int64_t RANGE = 2048;
-
-template <class Work> void in_ranges(int threads, int64_t count, const Work& work) {
-    in_parallel(threads, (count + RANGE - 1) / RANGE,
-                [&](int64_t part) { work(part, part * RANGE, std::min(count, (part + 1) * RANGE)); });
-}
-
-}  // namespace
+static constexpr int64_t RANGE = 2048;
 
 extern "C" {
 
@@ -25,7 +16,7 @@ extern "C" {
 void ash_place_texels(const float* vertices, const int* corners, const float* barycentric, int64_t count, int threads, float* quats,
                       float* translations, float* canonical, float* normals) {
     PlaceArgs args{vertices, barycentric, corners, quats, translations, canonical, normals};
-    in_ranges(threads, count, [&](int64_t, int64_t first, int64_t last) { kernels().place_texels(args, first, last); });
+    in_ranges(threads, count, RANGE, [&](int64_t, int64_t first, int64_t last) { kernels().place_texels(args, first, last); });
 }
 
 // light: [9, 3] or null.
@@ -36,7 +27,7 @@ void ash_pose(const float* raw, const float* canonical, const float* normals, co
     args.raw = raw, args.canonical = canonical, args.normals = normals, args.turns = turns, args.translations = translations;
     args.light = light, args.coefficients = coefficients, args.offset_unit = offset_unit, args.canonical_frame = canonical_frame;
     args.means = means, args.quats = quats, args.scales = scales, args.opacities = opacities, args.sh = sh;
-    in_ranges(threads, count, [&](int64_t, int64_t first, int64_t last) { kernels().pose(args, first, last); });
+    in_ranges(threads, count, RANGE, [&](int64_t, int64_t first, int64_t last) { kernels().pose(args, first, last); });
 }
 
 // grad_light: [9, 3], written; null without light. Returns 0, or 1 if memory is short.
@@ -50,7 +41,7 @@ int ash_pose_backward(const float* raw, const float* normals, const float* turns
     args.grad_means = grad_means, args.grad_quats = grad_quats, args.grad_scales = grad_scales;
     args.grad_opacities = grad_opacities, args.grad_sh = grad_sh, args.grad_raw = grad_raw;
     std::vector<double> sums(27 * ((count + RANGE - 1) / RANGE), 0.0);
-    in_ranges(threads, count, [&](int64_t part, int64_t first, int64_t last) {
+    in_ranges(threads, count, RANGE, [&](int64_t part, int64_t first, int64_t last) {
         kernels().pose_backward(args, first, last, sums.data() + 27 * part);
     });
     if (light) {

@@ -47,7 +47,7 @@ struct Network {
     Arena arena;
     Plane input;
     std::vector<Level> levels;
-    Room room;
+    Scratch scratch;
 
     explicit Network(const Shape& s) : shape(s), levels(s.levels + 1) {
         lay_out();
@@ -59,7 +59,7 @@ struct Network {
 
     int channels(int level) const { return shape.channels << level; }
 
-    // Room for the halves of every 3x3 convolution.
+    // Space for the halves of every 3x3 convolution.
     void lay_out_halves() {
         int64_t plane = 0, weights = 0, turned = 0, pairs = 0;
         auto convolution = [&](int level, int from, int to) {
@@ -73,7 +73,7 @@ struct Network {
             convolution(l, 2 * channels(l), channels(l));
         }
         auto halves = [&](int64_t count) { return reinterpret_cast<Half*>(arena.numbers((count + 1) / 2)); };
-        room.plane = halves(plane), room.weights = halves(weights), room.turned = halves(turned), room.pairs = halves(pairs);
+        scratch.plane = halves(plane), scratch.weights = halves(weights), scratch.turned = halves(turned), scratch.pairs = halves(pairs);
     }
 
     void lay_out() {
@@ -91,18 +91,18 @@ struct Network {
             widest = std::max(widest, int64_t(9) * (joined + 16) * (c + 16) * 2);
         }
         widest = std::max(widest, int64_t(9) * (shape.inputs + 16) * (shape.channels + 16));
-        room.packed = arena.numbers(widest);
-        room.halves = shape.halves != 0;
-        if (room.halves) lay_out_halves();
+        scratch.packed = arena.numbers(widest);
+        scratch.halves = shape.halves != 0;
+        if (scratch.halves) lay_out_halves();
     }
 };
 
 // Two convolutions, the gradient of whose result is in `at.grad`; that of the input goes to `to`, if it is wanted.
-void backward_block(const Layer* layers, const Level& at, const Plane& in, const Plane& middle, const Plane* to, const Room& room, int threads) {
-    backward_weights(layers[1], at.grad, middle, room, threads);
-    backward_input(layers[1], at.grad, at.grad_middle, &middle, room, threads);
-    backward_weights(layers[0], at.grad_middle, in, room, threads);
-    if (to) backward_input(layers[0], at.grad_middle, *to, nullptr, room, threads);
+void backward_block(const Layer* layers, const Level& at, const Plane& in, const Plane& middle, const Plane* to, const Scratch& scratch, int threads) {
+    backward_weights(layers[1], at.grad, middle, scratch, threads);
+    backward_input(layers[1], at.grad, at.grad_middle, &middle, scratch, threads);
+    backward_weights(layers[0], at.grad_middle, in, scratch, threads);
+    if (to) backward_input(layers[0], at.grad_middle, *to, nullptr, scratch, threads);
 }
 
 std::mutex free_mutex;
@@ -160,7 +160,7 @@ void backward_head(const Network& n, const Layer& head, const Plane& last, const
     const int lines = picked.picks ? std::max(1, std::min(height, 256 / width)) : height;  // as many as `correlate` takes at once
     std::vector<float> spread(picked.picks ? lines * line : 0), sums(outputs);
     const Plane& to = n.levels[0].grad;
-    kernels().pack({head.weights, last.channels, 1, outputs, 1, 0, last.channels, n.room.packed});
+    kernels().pack({head.weights, last.channels, 1, outputs, 1, 0, last.channels, n.scratch.packed});
     std::fill(head.grad_bias, head.grad_bias + outputs, 0.0f);
     for (int y = 0; y < height; y += lines) {
         const int count = std::min(lines, height - y);
@@ -175,7 +175,7 @@ void backward_head(const Network& n, const Layer& head, const Plane& last, const
         sum_pixels(here, line, outputs, count, width, outputs, sums.data());
         for (int c = 0; c < outputs; ++c) head.grad_bias[c] += sums[c];
         Product product{};
-        product.a_step = outputs, product.b = n.room.packed, product.c_step = to.step;
+        product.a_step = outputs, product.b = n.scratch.packed, product.c_step = to.step;
         product.active = last.at(y), product.active_step = last.step;
         const Plane part_of_it{to.at(y), count, width, to.channels, to.step};
         convolve(product, {1, {0}}, outputs, part_of_it, threads, [&](int i) { return here + i * line; });
@@ -205,8 +205,8 @@ void* ash_unet(const int* numbers, const float* texture, const int64_t* strides,
     for (int l = 0; l <= bottom; ++l) {
         Level& at = n.levels[l];
         if (l) pool(n.levels[l - 1].skip, at.pooled, threads);
-        forward(layers.down(l)[0], l ? at.pooled : n.input, at.middle, n.room, threads);
-        forward(layers.down(l)[1], at.middle, at.skip, n.room, threads);
+        forward(layers.down(l)[0], l ? at.pooled : n.input, at.middle, n.scratch, threads);
+        forward(layers.down(l)[1], at.middle, at.skip, n.scratch, threads);
     }
     const Level& lowest = n.levels[bottom];
     for (int y = 0; y < lowest.joined.height && shape.features; ++y)
@@ -214,18 +214,18 @@ void* ash_unet(const int* numbers, const float* texture, const int64_t* strides,
             std::copy(features, features + shape.features, lowest.joined.at(y, x) + n.channels(bottom));
     for (int l = bottom - 1; l >= 0; --l) {
         Level& at = n.levels[l];
-        forward_up(layers.up(l), l + 1 == bottom ? lowest.joined : n.levels[l + 1].merged, at.up, n.room.packed, threads);
-        forward(layers.merge(l)[0], at.joined, at.merged_middle, n.room, threads);
-        forward(layers.merge(l)[1], at.merged_middle, at.merged, n.room, threads);
+        forward_up(layers.up(l), l + 1 == bottom ? lowest.joined : n.levels[l + 1].merged, at.up, n.scratch.packed, threads);
+        forward(layers.merge(l)[0], at.joined, at.merged_middle, n.scratch, threads);
+        forward(layers.merge(l)[1], at.merged_middle, at.merged, n.scratch, threads);
     }
     const Plane& last = bottom ? n.levels[0].merged : n.levels[0].joined;
     const int64_t zero[1] = {0};
-    kernels().pack({layers.head().weights, shape.outputs, 1, last.channels, last.channels, 0, 1, n.room.packed});
+    kernels().pack({layers.head().weights, shape.outputs, 1, last.channels, last.channels, 0, 1, n.scratch.packed});
     const Picks picked{picks, lines, part};
     in_bands(threads, shape.height, [&](int y) {
         Product product{};
         product.a = last.at(y), product.a_step = last.step, product.a_inner = 1;
-        product.b = n.room.packed, product.b_inner = PRODUCT_COLUMNS, product.b_block = int64_t(last.channels) * PRODUCT_COLUMNS;
+        product.b = n.scratch.packed, product.b_inner = PRODUCT_COLUMNS, product.b_block = int64_t(last.channels) * PRODUCT_COLUMNS;
         product.a_at = product.b_at = zero, product.segments = 1, product.steps = last.channels;
         product.rows = shape.width, product.columns = shape.outputs, product.start = layers.head().bias;
         std::vector<float> line(picks ? shape.width * shape.outputs : 0);
@@ -251,26 +251,26 @@ int ash_unet_backward(void* handle, const float* grad, const float* const* weigh
     backward_head(n, head, last, grad, {picks, lines, part}, threads);
     for (int l = 0; l < bottom; ++l) {
         Level &at = n.levels[l], &below = n.levels[l + 1];
-        backward_block(layers.merge(l), at, at.joined, at.merged_middle, &at.grad_joined, n.room, threads);
+        backward_block(layers.merge(l), at, at.joined, at.merged_middle, &at.grad_joined, n.scratch, threads);
         const Plane grad_up = at.grad_joined.part(0, n.channels(l));
         const bool lowest = l + 1 == bottom;
         const Plane& in = lowest ? below.joined : below.merged;
         backward_up_weights(layers.up(l), grad_up, in, threads);
         const Plane active = lowest ? below.skip : below.merged;
-        backward_up_input(layers.up(l), grad_up, 0, below.grad, &active, n.room.packed, threads);
+        backward_up_input(layers.up(l), grad_up, 0, below.grad, &active, n.scratch.packed, threads);
         if (!lowest || !shape.features) continue;
         const Plane of_features = below.grad_joined.part(0, shape.features);  // that gradient is needed nowhere else
-        backward_up_input(layers.up(l), grad_up, n.channels(bottom), of_features, nullptr, n.room.packed, threads);
+        backward_up_input(layers.up(l), grad_up, n.channels(bottom), of_features, nullptr, n.scratch.packed, threads);
         sum_pixels(of_features.first, of_features.row(), of_features.step, of_features.height, of_features.width, shape.features,
                    grad_features);
     }
     for (int l = bottom; l > 0; --l) {
         Level &at = n.levels[l], &above = n.levels[l - 1];
-        backward_block(layers.down(l), at, at.pooled, at.middle, &at.grad_pooled, n.room, threads);
+        backward_block(layers.down(l), at, at.pooled, at.middle, &at.grad_pooled, n.scratch, threads);
         backward_pool(above.skip, at.pooled, at.grad_pooled, above.grad_joined.part(n.channels(l - 1), n.channels(l - 1)), above.grad,
                       threads);
     }
-    backward_block(layers.down(0), n.levels[0], n.input, n.levels[0].middle, nullptr, n.room, threads);
+    backward_block(layers.down(0), n.levels[0], n.input, n.levels[0].middle, nullptr, n.scratch, threads);
     return 0;
 } catch (const std::bad_alloc&) {
     return 1;

@@ -75,31 +75,31 @@ def is_strength(scene: str) -> bool:
 
 def effects(table: pd.DataFrame, split: str) -> list[AblationEffect]:
     """All cells of a split, from `differences`; components that scenes need first."""
-    found = []
+    cells = []
     for row in table[table["split"] == split].itertuples():
         mean, low, high, verdict = row.mean, row.low, row.high, row.verdict
         if row.method in ADDED:
             mean, low, high, verdict = -mean, -high, -low, FLIPPED.get(verdict, verdict)
         if row.method not in NOT_ABLATIONS[:2]:
-            found.append(
+            cells.append(
                 AblationEffect(scene=row.scene, row=row.method, mean=mean, low=low, high=high, verdict=verdict)
             )
-    order = [*COMPONENTS, *dict.fromkeys(effect.row for effect in found)]
-    return sorted(found, key=lambda effect: order.index(effect.row))
+    order = [*COMPONENTS, *dict.fromkeys(effect.row for effect in cells)]
+    return sorted(cells, key=lambda effect: order.index(effect.row))
 
 
 def matrix(tables: RunTables, table: pd.DataFrame, split: str) -> list[AblationEffect]:
     """The cells of the matrix; none of fewer than two scenes or without an ablation."""
-    found = [effect for effect in effects(table, split) if not is_strength(effect.scene)]
+    cells = [effect for effect in effects(table, split) if not is_strength(effect.scene)]
     scenes = [scene for scene in tables.scenes if REFERENCE in tables.methods(scene) and not is_strength(scene)]
-    return found if len(scenes) > 1 and any(effect.row not in NOT_ABLATIONS for effect in found) else []
+    return cells if len(scenes) > 1 and any(effect.row not in NOT_ABLATIONS for effect in cells) else []
 
 
-def surprises(found: list[AblationEffect]) -> list[str]:
+def surprises(cells: list[AblationEffect]) -> list[str]:
     """Sentences on the cells that contradict the expectation, with the result on the control scene, if it was run."""
-    by_place = {(effect.scene, effect.row): effect for effect in found}
-    said = []
-    for effect in found:
+    by_place = {(effect.scene, effect.row): effect for effect in cells}
+    sentences = []
+    for effect in cells:
         if effect.scene not in EXPECTED or effect.row not in COMPONENTS:
             continue
         text = f"{effect.scene}, {effect.component}: {effect.text}, {effect.verdict}"
@@ -112,8 +112,8 @@ def surprises(found: list[AblationEffect]) -> list[str]:
         control, differs = CONTROL_SCENES.get((effect.scene, effect.row), ("", ""))
         if (control, effect.row) in by_place:
             text += f" Control scene {control}, {differs}: {by_place[control, effect.row].text}."
-        said.append(text)
-    return said
+        sentences.append(text)
+    return sentences
 
 
 def strength_curves(table: pd.DataFrame, split: str) -> pd.DataFrame:
@@ -125,7 +125,7 @@ def strength_curves(table: pd.DataFrame, split: str) -> pd.DataFrame:
     for factor in FACTORS:
         scenes = {0.0: ZERO_STRENGTH} | {strength: f"{factor}{end}" for end, strength in STRENGTHS.items()}
         for row in EXPECTED[factor]:
-            found = {s: by_place[scenes[s], row] for s in sorted(scenes) if (scenes[s], row) in by_place}
-            if len(found) > 1 and 1.0 in found:
-                rows += [(factor, e.component, row, s, e.mean, e.low, e.high) for s, e in found.items()]
+            by_strength = {s: by_place[scenes[s], row] for s in sorted(scenes) if (scenes[s], row) in by_place}
+            if len(by_strength) > 1 and 1.0 in by_strength:
+                rows += [(factor, e.component, row, s, e.mean, e.low, e.high) for s, e in by_strength.items()]
     return pd.DataFrame(rows, columns=["scene", "component", "row", "strength", "mean", "low", "high"])

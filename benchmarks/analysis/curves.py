@@ -31,12 +31,12 @@ def time_to_quality(snapshots: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for (scene, split), here in snapshots.groupby(["scene", "split"], sort=False):
         marks = np.unique(here["seconds"].round())
-        for method, own in here.groupby("method", sort=False):
+        for method, runs in here.groupby("method", sort=False):
             for mark in marks:
-                scores = own.groupby(["capture", "seed"]).apply(_score_at, mark, include_groups=False)
+                scores = runs.groupby(["capture", "seed"]).apply(_score_at, mark, include_groups=False)
                 if scores.notna().all():
-                    found = mean_interval(independent(scores.groupby("capture").agg(list).to_dict()))
-                    rows.append((scene, split, method, mark, found.mean, found.low, found.high))
+                    interval = mean_interval(independent(scores.groupby("capture").agg(list).to_dict()))
+                    rows.append((scene, split, method, mark, interval.mean, interval.low, interval.high))
     return _table(rows, "scene", "split", "method", "seconds")
 
 
@@ -85,29 +85,29 @@ def data_scaling(rows: pd.DataFrame) -> pd.DataFrame:
     rows = rows[rows["axis"].isin(("", FOOTAGE_AXIS)) & (rows["status"] == "done")]
     rows = rows.assign(scene=rows["scene"].str.split(" ").str[0])
     scenes = rows.loc[rows["axis"] == FOOTAGE_AXIS, "scene"].unique()
-    found = []
+    records = []
     for (scene, severity), here in rows[rows["scene"].isin(scenes)].groupby(["scene", "severity"], sort=False):
         for split in HELD_OUT_SPLITS:
             for method, samples in samples_of(here, foreground(split)).items():
                 interval = mean_interval(independent(samples))
                 frames = FOOTAGE_FRAMES - int(severity)
-                found.append((scene, split, method, frames, interval.mean, interval.low, interval.high))
-    table = _table(found, "scene", "split", "method", "frames")
+                records.append((scene, split, method, frames, interval.mean, interval.low, interval.high))
+    table = _table(records, "scene", "split", "method", "frames")
     order = table["split"].map(HELD_OUT_SPLITS.index)
     return table.assign(order=order).sort_values(["scene", "order", "method", "frames"]).drop(columns="order")
 
 
 def frames_needed(table: pd.DataFrame) -> list[str]:
     """Sentences: at how many training frames a method is above static Gaussians on new poses."""
-    said = []
+    sentences = []
     for method in dict.fromkeys(table["method"]):
         for scene, here in table[table["split"] == "novel_pose"].groupby("scene", sort=False):
             wide = here.pivot(index="frames", columns="method", values="psnr")
             if method != STATIC and {method, STATIC} <= set(wide.columns):
                 rest = f"{style_of(STATIC).title} on {SPLIT_NAMES['novel_pose'].words}"
                 ahead = _when(wide[method] > wide[STATIC])
-                said.append(f"On {scene}, {style_of(method).title} is above {rest} {ahead}.")
-    return said
+                sentences.append(f"On {scene}, {style_of(method).title} is above {rest} {ahead}.")
+    return sentences
 
 
 def _when(ahead: pd.Series) -> str:
@@ -127,8 +127,8 @@ def novelty(images: pd.DataFrame) -> pd.DataFrame:
     Novel views of training poses stand at zero degrees; the frames of all novel poses are sorted by novelty into bins
     of equal number. Scenes whose frames fill fewer than two bins, or lie within a degree, have no curve.
     """
-    known = images[images["split"].isin(HELD_OUT_SPLITS) & images["novelty_deg"].notna()]
-    rows = [row for scene, here in known.groupby("scene", sort=False) for row in _novelty_of(str(scene), here)]
+    with_novelty = images[images["split"].isin(HELD_OUT_SPLITS) & images["novelty_deg"].notna()]
+    rows = [row for scene, here in with_novelty.groupby("scene", sort=False) for row in _novelty_of(str(scene), here)]
     return _table(rows, "scene", "method", "novelty_deg")
 
 
@@ -146,22 +146,26 @@ def _novelty_of(scene: str, images: pd.DataFrame) -> Iterator[tuple]:
     for index, mean_deg in degrees.items():
         here = means[means.index.get_level_values(1) == index]
         samples = {
-            str(method): own.groupby("capture").agg(list).to_dict()
-            for method, own in here.groupby("method", sort=False)
+            str(method): seeds.groupby("capture").agg(list).to_dict()
+            for method, seeds in here.groupby("method", sort=False)
         }
-        for method, found in intervals(samples).items():
-            yield scene, method, float(mean_deg), found.mean, found.low, found.high
+        for method, interval in intervals(samples).items():
+            yield scene, method, float(mean_deg), interval.mean, interval.low, interval.high
 
 
 def losses_by_novelty(table: pd.DataFrame) -> list[str]:
     """A sentence per scene: what each method loses from training poses to the most novel ones, least loss first."""
-    said = []
+    sentences = []
     for scene, here in table.groupby("scene", sort=False):
         ends = here.sort_values("novelty_deg").groupby("method", sort=False)
-        losses = {str(method): own["psnr"].iloc[0] - own["psnr"].iloc[-1] for method, own in ends if len(own) > 1}
+        losses = {
+            str(method): curve["psnr"].iloc[0] - curve["psnr"].iloc[-1] for method, curve in ends if len(curve) > 1
+        }
         names = ", ".join(
             f"{style_of(m).title} {loss:.1f} dB" for m, loss in sorted(losses.items(), key=lambda p: p[1])
         )
         first, last = here["novelty_deg"].min(), here["novelty_deg"].max()
-        said.append(f"On {scene}, from {first:.0f} to {last:.0f} degrees from the training poses, PSNR falls: {names}.")
-    return said
+        sentences.append(
+            f"On {scene}, from {first:.0f} to {last:.0f} degrees from the training poses, PSNR falls: {names}."
+        )
+    return sentences

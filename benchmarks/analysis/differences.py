@@ -22,14 +22,14 @@ def differences(
     """
     rows = []
     for scene in scenes or tables.scenes:
-        found = [
+        compared = [
             (split, method, comparison)
             for split in splits
             for method in tables.methods(scene, oracles=False)
             if method != reference
             and (comparison := compare(tables.of(scene), reference, method, foreground(split))) is not None
         ]
-        for (split, method, _), each in zip(found, corrected([each for *_, each in found]), strict=True):
+        for (split, method, _), each in zip(compared, corrected([each for *_, each in compared]), strict=True):
             rows.append({"scene": scene, "split": split, "method": method, **asdict(each), "verdict": each.verdict})
     return pd.DataFrame(rows, columns=COLUMNS)
 

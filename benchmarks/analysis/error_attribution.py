@@ -1,7 +1,7 @@
-"""Why the worst frames are bad: which truth channel explains the squared error of a prediction.
+"""Error attribution: which truth channel explains the squared error of a prediction.
 
 Every pixel that truth or prediction covers belongs to exactly one region, the first that applies: silhouette, occlusion
-edge, surface that no training view saw, surface seen at a grazing angle, the rest. A region explains a frame if it
+edge, surface that no training view shows, surface at a grazing angle, the rest. A region explains a frame if it
 holds the largest share of the squared error among those where errors are denser than on average.
 """
 
@@ -23,13 +23,13 @@ from benchmarks.cell.views import View
 from synth.truth.pixels import depth, normals, pixel_truth, points, surface_truth
 
 REGION_COLOURS = ("#2f6fde", "#dd6b20", "#c2415c", "#b8860b", "#c9ced6")
-REGIONS = ("silhouette", "occlusion edge", "never seen in training", "grazing view", "interior")
+REGIONS = ("silhouette", "occlusion edge", "not visible in training", "grazing view", "interior")
 EDGE_PX = 2  # half of an edge's width
 STEP_M = 0.04  # a jump in depth that is an edge
 GRAZING_COSINE = 0.35
 DENSER = 1.2  # error share over pixel share from which on a region may explain a frame
 NOVEL_QUARTILE = 0.75
-FRAMES_SEEN = 10  # training frames looked at for what was seen: a triangle hidden in all of them counts as never seen
+VISIBILITY_FRAMES = 10  # training frames; a triangle hidden in all of them counts as not visible
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -82,24 +82,32 @@ def worst_frames(
     chosen = list(worst_of_frame.values())[:count]
     if not chosen:
         return ()
-    seen = _seen_triangles(capture.folder, capture.identity)
+    visible_triangles = _visible_triangles(capture.folder, capture.identity)
     train = capture.splits["train"].frames
     frames = sorted({view.frame for view in views})
     novelty = dict(zip(frames, novelty_deg(capture.motion, train=train, test=frames), strict=True))
     ranks = {frame: _rank(list(novelty.values()), novelty[frame]) for frame in frames}
     return tuple(
-        _attribution(capture, cell, view, seen, novelty_deg=novelty[view.frame], novelty_rank=ranks[view.frame])
+        _attribution(
+            capture, cell, view, visible_triangles, novelty_deg=novelty[view.frame], novelty_rank=ranks[view.frame]
+        )
         for view in chosen
     )
 
 
 def _attribution(
-    capture: Capture, cell: Cell, view: ViewScore, seen: np.ndarray, *, novelty_deg: float, novelty_rank: float
+    capture: Capture,
+    cell: Cell,
+    view: ViewScore,
+    visible_triangles: np.ndarray,
+    *,
+    novelty_deg: float,
+    novelty_rank: float,
 ) -> ErrorAttribution:
     truth = metrics.on_black(capture.image(view.camera, view.frame))
     predicted = stored_prediction(cell, capture, View(split=view.split, camera=view.camera, frame=view.frame))
     masks = metrics.foreground(truth), metrics.foreground(predicted)
-    regions = region_map(capture, view.camera, view.frame, *masks, seen)
+    regions = region_map(capture, view.camera, view.frame, *masks, visible_triangles)
     error = ((truth[..., :3].astype(float) - predicted[..., :3]) ** 2).sum(-1)
     return ErrorAttribution(
         view=view,
@@ -123,9 +131,9 @@ def shares(regions: np.ndarray, error: np.ndarray) -> tuple[Share, ...]:
 
 
 def region_map(
-    capture: Capture, camera: str, frame: int, truth: np.ndarray, predicted: np.ndarray, seen: np.ndarray
+    capture: Capture, camera: str, frame: int, truth: np.ndarray, predicted: np.ndarray, visible: np.ndarray
 ) -> np.ndarray:
-    """Region of every pixel `[h, w]` from both masks `[h, w]`; `seen` `[f]`: the triangles that training views show."""
+    """Region of every pixel `[h, w]` from both masks `[h, w]`; `visible` `[f]`: triangles that training shows."""
     pixels = pixel_truth(capture, camera, frame)
     around = np.ones((2 * EDGE_PX + 1,) * 2, bool)
     band = binary_dilation(truth, around) & ~binary_erosion(truth, around)
@@ -136,7 +144,7 @@ def region_map(
     conditions = (
         band | (truth != predicted),
         hit & binary_dilation(_depth_steps(depth(capture, pixels), hit), around),
-        hit & ~seen[np.maximum(pixels.triangle, 0)],
+        hit & ~visible[np.maximum(pixels.triangle, 0)],
         hit & (cosine < GRAZING_COSINE),
     )
     regions = np.select(conditions, range(len(conditions)), default=len(conditions))
@@ -148,9 +156,9 @@ def _depth_steps(far: np.ndarray, hit: np.ndarray) -> np.ndarray:
     steps = np.zeros(far.shape, bool)
     for axis in (0, 1):
         bends = np.abs(np.diff(far, 2, axis=axis)) > STEP_M
-        known = binary_erosion(hit, np.ones((3, 1) if axis == 0 else (1, 3), bool))
+        inner = binary_erosion(hit, np.ones((3, 1) if axis == 0 else (1, 3), bool))
         middle = (slice(1, -1), slice(None)) if axis == 0 else (slice(None), slice(1, -1))
-        steps[middle] |= bends & known[middle]
+        steps[middle] |= bends & inner[middle]
     return steps
 
 
@@ -160,22 +168,22 @@ def psnr_of(view: ViewScore) -> float:
 
 
 @lru_cache(maxsize=1)
-def _seen_triangles(folder: Path, identity: str) -> np.ndarray:
+def _visible_triangles(folder: Path, identity: str) -> np.ndarray:
     """Which triangles `[f]` any training view shows, in frames spread over the training motion, and their neighbours.
 
-    Triangles may be smaller than pixels: between two that are hit lies one that is not, and is seen all the same. This
+    Triangles may be smaller than pixels: between two that are hit lies one that is not, and counts as visible too. This
     takes seconds, and is the same for every method; `identity` tells captures in one place apart.
     """
     capture = load_capture(folder)
     faces = surface_truth(capture).faces
-    seen = np.zeros(len(faces), bool)
+    visible = np.zeros(len(faces), bool)
     train = capture.splits["train"]
     # As many images whether all cameras saw a frame or a part of them: their frames lie the closer together.
-    for camera, frame in train.views[:: max(1, train.count // (FRAMES_SEEN * len(train.cameras)))]:
+    for camera, frame in train.views[:: max(1, train.count // (VISIBILITY_FRAMES * len(train.cameras)))]:
         triangle = read_arrays(pixels_path(capture.folder, camera, frame), expected=("triangle",))["triangle"]
-        seen[triangle[triangle >= 0]] = True
+        visible[triangle[triangle >= 0]] = True
     corners = np.zeros(faces.max() + 1, bool)
-    corners[faces[seen]] = True
+    corners[faces[visible]] = True
     return corners[faces].any(axis=1)
 
 

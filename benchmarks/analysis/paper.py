@@ -102,7 +102,7 @@ PAPER_TABLES = (
 
 def tables_beside(tables: RunTables) -> tuple[tuple[PaperTable, dict[str, float]], ...]:
     """The paper's tables of which at least two methods were run, and by split Kendall's tau of the orders by PSNR."""
-    found = []
+    beside = []
     for table in PAPER_TABLES:
         run = tables.methods(table.scene)
         table = replace(table, rows=tuple(_as_run(row, run) for row in table.rows))
@@ -114,8 +114,8 @@ def tables_beside(tables: RunTables) -> tuple[tuple[PaperTable, dict[str, float]
                 if len(means) == len(ours):
                     theirs = [row.view[0] if split == "novel_view" else row.pose[0] for row in ours]
                     taus[split] = kendall(theirs, list(means.values()))
-            found.append((table, taus))
-    return tuple(found)
+            beside.append((table, taus))
+    return tuple(beside)
 
 
 def _as_run(row: PaperRow, run: Collection[str]) -> PaperRow:
@@ -140,8 +140,8 @@ def conventions(tables: RunTables, scene: str, split: str, metric: str) -> tuple
     Oracles are left out; None where fewer than two methods were scored so.
     """
     names = tables.methods(scene, oracles=False)
-    found = {region: tables.values(scene, Quantity(split, region, metric), names) for region in CONVENTIONS}
-    values = pd.DataFrame(found, index=list(names))
+    by_region = {region: tables.values(scene, Quantity(split, region, metric), names) for region in CONVENTIONS}
+    values = pd.DataFrame(by_region, index=list(names))
     if len(names) < 2 or values.isna().any(axis=None):
         return None
     return values, [kendall(list(values["foreground"]), list(values[region])) for region in values]

@@ -48,22 +48,22 @@ def candidates(tables: RunTables, scene: str, split: str) -> tuple[Candidate, ..
     return tuple(Candidate(name=name, samples=on_shared[name], frame_ms=frames[name]) for name in names)
 
 
-def front(found: Sequence[Candidate]) -> tuple[str, ...]:
+def front(candidates: Sequence[Candidate]) -> tuple[str, ...]:
     """Names of those that no other beats in both quality and cost, cheapest first."""
 
     def dominates(a: Candidate, b: Candidate) -> bool:
         return a.psnr >= b.psnr and a.frame_ms <= b.frame_ms and (a.psnr, a.frame_ms) != (b.psnr, b.frame_ms)
 
-    kept = [each for each in found if not any(dominates(other, each) for other in found)]
-    return tuple(each.name for each in sorted(kept, key=lambda each: each.frame_ms))
+    front = [each for each in candidates if not any(dominates(other, each) for other in candidates)]
+    return tuple(each.name for each in sorted(front, key=lambda each: each.frame_ms))
 
 
-def smallest_sufficient(found: Sequence[Candidate], *, margin: float = SUFFICIENT_DB) -> Sufficient | None:
+def smallest_sufficient(candidates: Sequence[Candidate], *, margin: float = SUFFICIENT_DB) -> Sufficient | None:
     """The cheapest whose loss to the best is below the margin (one-sided 95 % bound); None where nothing is known."""
-    if not found:
+    if not candidates:
         return None
-    best = max(found, key=lambda each: each.psnr)
-    for candidate in sorted(found, key=lambda each: each.frame_ms):
+    best = max(candidates, key=lambda each: each.psnr)
+    for candidate in sorted(candidates, key=lambda each: each.frame_ms):
         loss = compare_samples(best.samples, candidate.samples, level=ONE_SIDED)
         if loss is None or math.isnan(loss.high):
             return None
@@ -78,8 +78,8 @@ def chosen_on_others(here: Sequence[Candidate], others: Sequence[Candidate]) -> 
     Among the methods that both have; None where the others bound nothing. The margin is `SUFFICIENT_DB`.
     """
     by_name = {each.name: each for each in here}
-    found = smallest_sufficient([each for each in others if each.name in by_name])
-    if found is None:
+    choice = smallest_sufficient([each for each in others if each.name in by_name])
+    if choice is None:
         return None
-    change = compare_samples(by_name[found.name].samples, by_name[found.best].samples, margin=SUFFICIENT_DB)
-    return None if change is None else (found, change)
+    change = compare_samples(by_name[choice.name].samples, by_name[choice.best].samples, margin=SUFFICIENT_DB)
+    return None if change is None else (choice, change)

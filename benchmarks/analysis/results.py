@@ -23,18 +23,8 @@ from benchmarks.suites.suites import capture_name
 from synth.person.cast import VALIDATION
 
 COLUMNS = (
-    "scene",
-    "method",
-    "seed",
-    "split",
-    "region",
-    "metric",
-    "value",
-    "unit",
-    "direction",
-    "protocol",
-    "subject",
-    "capture",
+    *("scene", "method", "seed", "split", "region", "metric", "value", "unit", "direction", "protocol"),
+    *("subject", "capture"),
 )
 KEYS = ["scene", "method", "split", "region", "metric"]
 PLACE = re.compile(r"(?P<scene>\S+)(?: (?P<axis>\w+)=(?P<severity>\S+))?")  # `CellConfig.place`
@@ -192,10 +182,10 @@ def samples_of(rows: pd.DataFrame, quantity: Quantity) -> dict[str, Samples]:
     chosen = rows[
         (rows["metric"] == quantity.metric) & (rows["split"] == quantity.split) & (rows["region"] == quantity.region)
     ]
-    found: dict[str, dict[str, list[float]]] = {}
+    samples: dict[str, dict[str, list[float]]] = {}
     for method, capture, value in zip(chosen["method"], chosen["capture"], chosen["value"], strict=True):
-        found.setdefault(method, {}).setdefault(capture, []).append(value)
-    return dict(found)
+        samples.setdefault(method, {}).setdefault(capture, []).append(value)
+    return dict(samples)
 
 
 def compare(rows: pd.DataFrame, a: str, b: str, quantity: Quantity, *, level: float = LEVEL) -> Comparison | None:
@@ -220,14 +210,14 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
     by_key: dict[tuple[str, ...], dict[str, list[float]]] = {}
     for key, values in rows.groupby([*KEYS, "capture"], sort=False)["value"].agg(list).items():
         by_key.setdefault(key[:-1], {})[key[-1]] = values
-    found = []
+    records = []
     for samples in by_key.values():
         values = independent(samples)
         interval = mean_interval(values)
         half = math.nan if interval.high is None else interval.high - interval.mean
-        found.append((interval.mean, half, min(values), max(values), len(values)))
+        records.append((interval.mean, half, min(values), max(values), len(values)))
     index = pd.MultiIndex.from_tuples(by_key, names=KEYS) if by_key else pd.MultiIndex.from_arrays([[]] * 5, names=KEYS)
-    return pd.DataFrame(found, index=index, columns=["value", "half_width", "least", "greatest", "n"])
+    return pd.DataFrame(records, index=index, columns=["value", "half_width", "least", "greatest", "n"])
 
 
 class RunTables:
@@ -269,8 +259,8 @@ class RunTables:
 
     def values(self, scene: str, quantity: Quantity, methods: Iterable[str]) -> dict[str, float]:
         """Means by method, of those that have the quantity."""
-        found = {method: self.get(scene, method, quantity) for method in methods}
-        return {method: float(row.value) for method, row in found.items() if row is not None}
+        rows = {method: self.get(scene, method, quantity) for method in methods}
+        return {method: float(row.value) for method, row in rows.items() if row is not None}
 
     def failed(self, scene: str, method: str) -> int:
         """How many cells of a method on a scene failed."""

@@ -18,7 +18,7 @@ def steps(rows: pd.DataFrame) -> pd.DataFrame:
     Failed cells count with the worst score. Cut training motion is no perturbation: see `curves.data_scaling`.
     """
     rows = _with_plain_scene(rows)
-    found = []
+    records = []
     for scene, here in rows.groupby("scene", sort=False):
         for axis in [name for name in AXES if name != FOOTAGE_AXIS and (here["axis"] == name).any()]:
             along = here[here["axis"].isin(("", axis))]
@@ -26,9 +26,9 @@ def steps(rows: pd.DataFrame) -> pd.DataFrame:
                 for severity, at in along.groupby("severity"):
                     for method, samples in samples_of(at, foreground(split)).items():
                         each = mean_interval(independent(samples))
-                        found.append((scene, axis, split, method, severity, each.mean, each.low, each.high))
+                        records.append((scene, axis, split, method, severity, each.mean, each.low, each.high))
     columns = ["scene", "axis", "split", "method", "severity", "psnr", "low", "high"]
-    table = pd.DataFrame(found, columns=columns).astype({"low": float, "high": float})
+    table = pd.DataFrame(records, columns=columns).astype({"low": float, "high": float})
     groups = table.groupby(["scene", "axis", "split", "method"])["severity"]
     return table[(groups.transform("min") == 0) & (groups.transform("size") > 1) | (table["method"] == TRIVIAL)]
 
@@ -39,15 +39,15 @@ def breakdowns(table: pd.DataFrame) -> pd.DataFrame:
     A method is broken where the upper bound of its interval lies below the midpoint between its score on the clean
     capture and the trivial method's; midpoint NaN: that was not run; breakdown NaN: it never is.
     """
-    found = []
+    records = []
     for (scene, axis, split), here in table.groupby(["scene", "axis", "split"], sort=False):
         floor = here[(here["method"] == TRIVIAL) & (here["severity"] == 0)]["psnr"]
-        for method, own in here[here["method"] != TRIVIAL].groupby("method", sort=False):
-            clean, worse = own.iloc[0]["psnr"], own.iloc[1:]
+        for method, curve in here[here["method"] != TRIVIAL].groupby("method", sort=False):
+            clean, worse = curve.iloc[0]["psnr"], curve.iloc[1:]
             midpoint = math.nan if floor.empty else (clean + floor.item()) / 2
             broken = worse.loc[worse["high"].fillna(worse["psnr"]) < midpoint, "severity"]
-            found.append((scene, axis, split, method, clean - worse["psnr"].min(), midpoint, broken.min()))
-    return pd.DataFrame(found, columns=["scene", "axis", "split", "method", "loss", "midpoint", "breakdown"])
+            records.append((scene, axis, split, method, clean - worse["psnr"].min(), midpoint, broken.min()))
+    return pd.DataFrame(records, columns=["scene", "axis", "split", "method", "loss", "midpoint", "breakdown"])
 
 
 def reliability(rows: pd.DataFrame, scene: str) -> pd.DataFrame:
@@ -55,16 +55,16 @@ def reliability(rows: pd.DataFrame, scene: str) -> pd.DataFrame:
     spread_db: standard deviation over the seeds of a clean capture on novel views (NaN: unknown).
     """
     rows = _with_plain_scene(rows)
-    found = []
+    records = []
     for method, here in rows[rows["scene"] == scene].groupby("method", sort=False):
         status = here.drop_duplicates(["seed", "axis", "severity", "capture"])["status"]
         failures = int((status != "done").sum())
         good = here[(here["axis"] == "") & (here["status"] == "done")]
         spread = spreads(samples_of(good, foreground()).get(method, {}))[1]
         low, high = wilson(failures, len(status))
-        found.append((method, len(status), failures, int((status == "diverged").sum()), low, high, spread))
+        records.append((method, len(status), failures, int((status == "diverged").sum()), low, high, spread))
     columns = ["method", "cells", "failures", "diverged", "low", "high", "spread_db"]
-    return pd.DataFrame(found, columns=columns).astype({"spread_db": float})
+    return pd.DataFrame(records, columns=columns).astype({"spread_db": float})
 
 
 def _with_plain_scene(rows: pd.DataFrame) -> pd.DataFrame:

@@ -18,7 +18,7 @@ Verdict = Literal["better", "worse", "equivalent", "unclear"]
 Samples = Mapping[str, Sequence[float]]  # values by capture, one for each seed
 
 LEVEL, ALPHA, POWER = 0.95, 0.05, 0.8
-ROUNDING = 1e-12  # a spread of this share of the difference
+ROUNDING = 1e-12  # as a share of the values: a smaller spread is none
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -67,43 +67,42 @@ def compare_samples(
     shared = [capture for capture in a if capture in b]
     if not shared:
         return None
-    if len(shared) > 1:
+    if pairs := len(shared) > 1:
         first, second = ([float(np.mean(samples[capture])) for capture in shared] for samples in (a, b))
-        spread = float(np.std(np.subtract(first, second), ddof=1))
     else:
         first, second = list(a[shared[0]]), list(b[shared[0]])
-        spread = math.nan
-        if min(len(first), len(second)) > 1:
-            spread = math.sqrt((float(np.var(first, ddof=1)) + float(np.var(second, ddof=1))) / 2)
     mean = float(np.mean(first) - np.mean(second))
-    found = Comparison(
-        mean=mean,
-        spread=spread,
-        captures=len(shared) if len(shared) > 1 else 0,
-        margin=margin,
-        higher_is_better=higher_is_better,
+    comparison = Comparison(
+        mean=mean, captures=len(shared) if pairs else 0, margin=margin, higher_is_better=higher_is_better
     )
-    if math.isnan(spread):
-        return found
-    if spread <= ROUNDING * abs(mean) or spread == 0:
-        return replace(found, low=mean, high=mean, p=float(mean == 0), spread=0.0, detectable=0.0)
-    test = stats.ttest_rel(first, second) if found.captures else stats.ttest_ind(first, second, equal_var=False)
-    interval = test.confidence_interval(level)
-    quantile = float(stats.t.ppf((1 + level) / 2, test.df))
-    error = (float(interval.high) - float(interval.low)) / (2 * quantile)
+    if min(len(first), len(second)) < 2:
+        return comparison
+    if pairs:
+        spread = float(np.std(np.subtract(first, second), ddof=1))
+        error, freedom = spread / math.sqrt(len(first)), len(first) - 1.0
+    else:
+        variances = [float(np.var(values, ddof=1)) for values in (first, second)]
+        parts = [variance / len(values) for variance, values in zip(variances, (first, second), strict=True)]
+        spread, error = math.sqrt(sum(variances) / 2), math.sqrt(sum(parts))
+        squares = sum(part**2 / (len(values) - 1) for part, values in zip(parts, (first, second), strict=True))
+        freedom = error**4 / squares if squares else 1.0
+    if spread <= ROUNDING * max(map(abs, [*first, *second])):
+        return replace(comparison, low=mean, high=mean, p=float(mean == 0), spread=0.0, detectable=0.0)
+    quantile = float(stats.t.ppf((1 + level) / 2, freedom))
     return replace(
-        found,
-        low=float(interval.low),
-        high=float(interval.high),
-        p=float(test.pvalue),
-        detectable=_noncentrality(float(test.df), quantile) * error,
+        comparison,
+        low=mean - quantile * error,
+        high=mean + quantile * error,
+        p=float(2 * stats.t.sf(abs(mean) / error, freedom)),
+        spread=spread,
+        detectable=_noncentrality(freedom, quantile) * error,
     )
 
 
 def corrected(comparisons: Sequence[Comparison]) -> list[Comparison]:
     """With p adjusted so that the chance of any false alarm among all of them is at most 5 % (Holm 1979)."""
-    known = [each.p for each in comparisons if not math.isnan(each.p)]
-    adjusted = iter(holm(known))
+    p_values = [each.p for each in comparisons if not math.isnan(each.p)]
+    adjusted = iter(holm(p_values))
     return [each if math.isnan(each.p) else replace(each, p=next(adjusted)) for each in comparisons]
 
 
@@ -149,17 +148,17 @@ def intervals(samples: Mapping[str, Samples]) -> dict[str, Interval]:
     Over several captures that all methods share, the common effect of a capture is removed first (Cousineau 2005, with
     the correction of Morey 2008), because subjects differ by more than methods do. Otherwise Student's interval.
     """
-    found = {method: mean_interval(independent(seeds)) for method, seeds in samples.items()}
+    by_method = {method: mean_interval(independent(seeds)) for method, seeds in samples.items()}
     first, *others = samples.values()
     shared = [capture for capture in first if all(capture in other for other in others)]
     if not others or len(shared) < 2:
-        return found
+        return by_method
     values = np.array([[np.mean(seeds[capture]) for capture in shared] for seeds in samples.values()])
     variances = (values - values.mean(0)).var(1, ddof=1) * len(samples) / len(others)
     halves = stats.t.ppf((1 + LEVEL) / 2, len(shared) - 1) * np.sqrt(variances / len(shared))
     return {
         method: Interval(mean=each.mean, low=each.mean - float(half), high=each.mean + float(half))
-        for (method, each), half in zip(found.items(), halves, strict=True)
+        for (method, each), half in zip(by_method.items(), halves, strict=True)
     }
 
 

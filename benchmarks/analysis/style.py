@@ -113,13 +113,13 @@ _USER_ROWS: ContextVar[dict[str, str]] = ContextVar("_USER_ROWS")  # titles by n
 def user_rows(configs: Iterable[CellConfig]) -> frozenset[str]:
     """Rows with a name of ours but another factory or other changes."""
     ours = our_rows() | {(name, factory, hash_of(changes)) for name, factory, changes in FORMER_ROWS}
-    found = set()
+    rows = set()
     for config in configs:
         changes = {key: value for key, value in config.changes.items() if key != "device"}
         plain = not config.factory and not changes  # the installed method itself
         if not plain and (config.method, config.source, hash_of(changes)) not in ours:
-            found.add(config.method)
-    return frozenset(found)
+            rows.add(config.method)
+    return frozenset(rows)
 
 
 @contextmanager
@@ -147,12 +147,12 @@ def titles_of(configs: Iterable[CellConfig], titles: Mapping[str, str] | None = 
 
 def style_of(method: str) -> MethodStyle:
     """The style of a method; an unknown one gets a colour by the sum of its letters, the same in every report."""
-    own = _USER_ROWS.get({})
-    if method in STYLES and method not in own:
+    titles = _USER_ROWS.get({})
+    if method in STYLES and method not in titles:
         return STYLES[method]
     name = method.rpartition(":")[2]
     title = name.replace("_", " ") if name != method else method  # A factory's name, where it came by its path.
-    return MethodStyle(title=own.get(method, title), colour=SPARE_COLOURS[sum(method.encode()) % len(SPARE_COLOURS)])
+    return MethodStyle(title=titles.get(method, title), colour=SPARE_COLOURS[sum(method.encode()) % len(SPARE_COLOURS)])
 
 
 def is_ours(method: str) -> bool:

@@ -32,12 +32,12 @@ def margins(tables: RunTables) -> pd.DataFrame:
         for template, (ash, ddc) in LEARNED.items():
             error = tables.get(scene, ash, Quantity(split, "", "template_mm"))
             pairs += [] if error is None else [(template, float(error.value), ash, ddc)]
-        found = [
+        records = [
             (scene, split, template, error, each.mean, each.low, each.high)
             for template, error, ash, ddc in pairs
             if (each := _whole_comparison(tables, scene, split, ash, ddc)) is not None
         ]
-        rows += found if sum(row[2] == PLANTED for row in found) > 1 else []
+        rows += records if sum(row[2] == PLANTED for row in records) > 1 else []
     return pd.DataFrame(rows, columns=["scene", "split", "template", "error_mm", "mean", "low", "high"])
 
 
@@ -53,8 +53,8 @@ def levels(tables: RunTables) -> pd.DataFrame:
         for column, method in enumerate(ON_EXACT):
             for mm, names in WRONG_BY_MM.items():
                 if samples.get(names[column]) and tables.whole(scene, names[column]):
-                    found = mean_interval(independent(samples[names[column]]))
-                    rows.append((scene, split, method, float(mm), found.mean, found.low, found.high))
+                    interval = mean_interval(independent(samples[names[column]]))
+                    rows.append((scene, split, method, float(mm), interval.mean, interval.low, interval.high))
     return pd.DataFrame(rows, columns=["scene", "split", "method", "error_mm", "psnr", "low", "high"]).astype(
         {"low": float, "high": float}
     )
@@ -76,7 +76,7 @@ def error_at(planted: pd.DataFrame, margin_db: float) -> float | None:
 
 def sentences(tables: RunTables, table: pd.DataFrame) -> list[str]:
     """The findings on `margins`, and where ASH on other templates lies."""
-    said, placed = [], []
+    lines, placed = [], []
     curves = levels(tables)
     for (scene, split), here in table.groupby(["scene", "split"], sort=False):
         where = f"On {scene}, {SPLIT_NAMES[split].words}"
@@ -95,7 +95,7 @@ def sentences(tables: RunTables, table: pd.DataFrame) -> list[str]:
             text += f"; on the template learned from {row.template} ({row.error_mm:.1f} mm) it is {row.mean:+.1f} dB"
             same = interpolated(planted["error_mm"], planted["mean"], row.error_mm)
             text += "" if same is None else f", on a planted error of that size {same:+.1f} dB"
-        said.append(text + ".")
+        lines.append(text + ".")
         ash = curves.query("scene == @scene and split == @split and method == @ON_EXACT[0]")
         parts = []
         for method in PLACED:
@@ -107,4 +107,4 @@ def sentences(tables: RunTables, table: pd.DataFrame) -> list[str]:
                 parts.append(part if same is None else f"{part} ({same:.1f})")
         if parts:
             placed.append(f"{where}, by template (in brackets: a planted error of that size): {'; '.join(parts)}.")
-    return said + placed
+    return lines + placed

@@ -2,11 +2,10 @@
 
 Three levels. Identical predictions prove that nothing changed. Otherwise qualities are compared over seeds as in every
 report (`statistics.compare_samples`, corrected over all comparisons): worse fails, and better is flagged as well, for a
-leak looks like progress. Costs: exact work counts,
-and, on a processor like the baseline's, peak memory and times of frames and training, these as a ratio to a reference
-workload that was timed between the frames, because the machine's mood is in both. Noise only ever adds, so that a time
-that fails is measured again before it is believed. A training that became much shorter is flagged as well: it may have
-left something out. Elsewhere memory and times are not judged.
+leak looks like progress. Costs: exact work counts, and, on a processor like the baseline's, peak memory and the times
+of frames and training. Times are ratios to a reference workload that is timed between the frames, so that the load of
+the machine cancels. Noise only adds to a time, so that a time that fails is measured again. A training that became much
+shorter is flagged as well. On another processor memory and times are not judged.
 """
 
 import math
@@ -28,8 +27,8 @@ Kind = Literal["presence", "quality", "time", "memory", "work"]
 FINE = ("pass", "not judged")
 Row = tuple[str, str]  # scene and method
 
-GATED = (  # (split, region, metric): few, so that the correction for many comparisons leaves power
-    ("train_view", "foreground", "psnr"),  # varies least between seeds: what a defect costs shows there first
+GATED = (  # (split, region, metric): few, so that Holm's correction leaves power
+    ("train_view", "foreground", "psnr"),  # varies least between seeds
     ("novel_view", "foreground", "psnr"),
     ("novel_pose", "foreground", "psnr"),
     ("near_pose", "foreground", "psnr"),
@@ -46,21 +45,21 @@ OF_VERDICT: dict[str, Verdict] = {
     "unclear": "pass",
 }
 SLOWER = 1.12  # ratio of minima over a baseline's thirteen cells and a run's three to thirteen
-TIMED_AGAIN = 10  # cells for times alone: for a baseline always, for a run one by one while a time fails
+TIMED_AGAIN = 10  # cells for times alone: always for a baseline, for a run one by one while a time fails
 OTHER_TRAINING = 1.25  # ratio of training times, either way
 STAGE_FLOOR = 0.1  # stages below this share of the reference workload are noise
 MORE_MEMORY = 1.10
 NOT_IN_BASELINE = "the baseline has no results of this row; --update-baseline adds it"
-SINGLE_SEED_FACTOR = 5.0  # one seed knows no spread: only losses of several margins are believed
+SINGLE_SEED_FACTOR = 5.0  # one seed has no spread: only losses of several margins fail
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class BaselineEntry:
-    """What the gate remembers of one method on one scene; lists run over seeds."""
+    """One method on one scene; lists run over seeds."""
 
     scene: str
     method: str
-    truth: str  # what its capture shows; equal on machines whose renders differ by rounding
+    truth: str  # hash of what its capture shows; equal on machines whose renders differ by rounding
     seeds: tuple[int, ...]
     predictions: tuple[str, ...]  # one digest per seed over all predicted images
     qualities: dict[str, tuple[float, ...]]
@@ -99,12 +98,12 @@ class Check:
 
 
 def summarise(suite: str, results: Sequence[CellResult], timed: Sequence[CellResult] = ()) -> Baseline:
-    """What the gate needs to know of a run; `timed`: more cells of its methods, for times alone."""
-    known = [result.provenance for result in results if result.provenance is not None]
+    """The numbers of a run that the gate compares; `timed`: more cells of its methods, for times alone."""
+    provenances = [result.provenance for result in results if result.provenance is not None]
     pairs = dict.fromkeys((result.config.place, result.config.method) for result in results)
     entries = [_entry(_of(pair, results), _of(pair, timed)) for pair in pairs]
-    commit = known[0].commit if known else "unknown"
-    machine = known[0].machine.get("processor", "unknown") if known else "unknown"
+    commit = provenances[0].commit if provenances else "unknown"
+    machine = provenances[0].machine.get("processor", "unknown") if provenances else "unknown"
     return Baseline(suite=suite, commit=commit, machine=machine, entries=tuple(entries))
 
 
@@ -123,8 +122,8 @@ def read_baseline(path: Path) -> Baseline:
     if isinstance(content, dict) and content.get("protocol", PROTOCOL) != PROTOCOL:
         raise InputError(f"{path}: expected protocol {PROTOCOL}, got {content['protocol']!r}; make a new baseline")
     try:
-        told: Baseline = from_json(Baseline, {name: value for name, value in content.items() if name != "protocol"})
-        return told
+        baseline: Baseline = from_json(Baseline, {name: value for name, value in content.items() if name != "protocol"})
+        return baseline
     except (AttributeError, ValueError) as error:
         raise InputError(f"{path}: expected a baseline of the gate ({error})") from error
 
@@ -154,20 +153,20 @@ def judge(baseline: Baseline, head: Baseline) -> list[Check]:
     """
     if baseline.suite != head.suite:
         raise InputError(f"expected a run of suite {baseline.suite}, as the baseline is, got {head.suite}")
-    found = {(entry.scene, entry.method): entry for entry in head.entries}
+    by_row = {(entry.scene, entry.method): entry for entry in head.entries}
     judged = {(entry.scene, entry.method) for entry in baseline.entries if entry.seeds}
     checks = [
         _check(entry, "present", "not judged", NOT_IN_BASELINE)
         for entry in head.entries
         if (entry.scene, entry.method) not in judged
     ]
-    if not judged & found.keys():
+    if not judged & by_row.keys():
         held = ", ".join(entry.title for entry in baseline.entries if entry.seeds) or "no finished cell"
         ran = ", ".join(entry.title for entry in head.entries) or "no finished cell"
         raise InputError(f"nothing was compared: the baseline has {held}; the run has {ran}")
     compared: list[tuple[BaselineEntry, BaselineEntry]] = []
     for base in baseline.entries:
-        now = found.get((base.scene, base.method))
+        now = by_row.get((base.scene, base.method))
         if (base.scene, base.method) not in judged:
             continue
         if now is None:
@@ -190,7 +189,7 @@ def judge_with_retries(
     results: Sequence[CellResult],
     remeasured: Callable[[Collection[Row], int], Sequence[CellResult]],
 ) -> tuple[Baseline, list[Check]]:
-    """What a run came to and the verdict on it, after the times that fail were measured up to `TIMED_AGAIN` times more.
+    """The numbers of a run and the checks, after times that fail were measured up to `TIMED_AGAIN` times more.
 
     `remeasured`: results of another cell for each of some rows; its second argument counts the calls.
     """
@@ -211,8 +210,8 @@ def markdown(baseline: Baseline, head: Baseline, checks: Sequence[Check]) -> str
     bad = [check for check in checks if check.verdict not in FINE]
     title = "passed" if not bad else f"**{len(bad)} of {len(checks)} checks did not pass**"
     lines = [f"## ash-bench gate: {title}", ""]
-    told = (head.suite, head.commit, baseline.commit, head.machine)
-    suite, commit, before, machine = map(escaping.markdown, told)
+    texts = (head.suite, head.commit, baseline.commit, head.machine)
+    suite, commit, before, machine = map(escaping.markdown, texts)
     lines.append(f"Suite {suite}, commit {commit} against baseline {before}, on {machine}.")
     if bad:
         lines += ["", *_rows(bad)]
@@ -301,10 +300,10 @@ def _quality_checks(compared: Sequence[tuple[BaselineEntry, BaselineEntry]]) -> 
                     tests += [(base, name, test, before, after)] if test else []
                 else:
                     checks.append(_single(base, name, before, after))
-    found = corrected([test for _, _, test, _, _ in tests])
+    corrected_tests = corrected([test for _, _, test, _, _ in tests])
     return checks + [
         _quality_check(base, name, test, before, after)
-        for (base, name, _, before, after), test in zip(tests, found, strict=True)
+        for (base, name, _, before, after), test in zip(tests, corrected_tests, strict=True)
     ]
 
 
@@ -334,7 +333,7 @@ def _quality_check(
 ) -> Check:
     detail = (
         f"{_means(name, before, after)} ({test.mean:+.4g} [{test.low:+.4g}, {test.high:+.4g}], p {test.p:.2g}, "
-        f"{test.verdict}; a change from {max(test.margin, test.detectable):.2g} on would be seen)"
+        f"{test.verdict}; detectable from {max(test.margin, test.detectable):.2g} on)"
     )
     return _check(entry, name, OF_VERDICT[test.verdict], detail, kind="quality", name=name)
 
@@ -344,7 +343,7 @@ def _single(entry: BaselineEntry, name: str, before: Sequence[float], after: Seq
         return _check(entry, name, "fail", "not measured", kind="quality", name=name)
     margin = METRICS[name.split("/")[-1]].abs_tol * SINGLE_SEED_FACTOR
     change = sum(after) / len(after) - sum(before) / len(before)
-    detail = f"{_means(name, before, after)} ({change:+.4g}; with one seed a change from {margin:g} on would be seen)"
+    detail = f"{_means(name, before, after)} ({change:+.4g}; with one seed detectable from {margin:g} on)"
     verdict: Verdict = _direction(name, change) if abs(change) > margin else "pass"
     return _check(entry, name, verdict, detail, kind="quality", name=name)
 
@@ -360,14 +359,14 @@ def _count_checks(base: BaselineEntry, now: BaselineEntry) -> list[Check]:
         after = now.counts.get(name)
         verdict: Verdict = "pass" if after == before else "fail"
         now_text = "not measured" if after is None else f"{after:g}"
-        detail = f"{before:g} -> {now_text} (any change is seen)"
+        detail = f"{before:g} -> {now_text} (any change fails)"
         checks.append(_check(base, name, verdict, detail, kind="work", name=name))
     return checks
 
 
 def _memory_check(base: BaselineEntry, now: BaselineEntry) -> Check:
     more = now.memory_mb > MORE_MEMORY * base.memory_mb
-    detail = f"{base.memory_mb:.0f} -> {now.memory_mb:.0f} MB (a rise from {MORE_MEMORY - 1:.0%} on is seen)"
+    detail = f"{base.memory_mb:.0f} -> {now.memory_mb:.0f} MB (a rise from {MORE_MEMORY - 1:.0%} on fails)"
     return _check(base, "peak memory", "fail" if more else "pass", detail, kind="memory")
 
 
@@ -380,7 +379,7 @@ def _time_checks(base: BaselineEntry, now: BaselineEntry) -> list[Check]:
         slower = OTHER_TRAINING if name == "training" else SLOWER
         detail = (
             f"{before:.4g} -> {after:.4g} times the reference workload ({after / before - 1:+.0%}; "
-            f"a rise from {slower - 1:.0%} on is seen)"
+            f"a rise from {slower - 1:.0%} on fails)"
         )
         verdict: Verdict = "fail" if after > slower * before else "pass"
         if name == "training" and after * OTHER_TRAINING < before:
@@ -395,6 +394,6 @@ def _elsewhere(base: BaselineEntry, baseline: Baseline, head: Baseline) -> Check
 
 
 def _rows(checks: Sequence[Check]) -> list[str]:
-    told = [(check.what, check.verdict, check.detail) for check in checks]
-    rows = ["| {} | {} | {} |".format(*map(escaping.markdown, row)) for row in told]
+    texts = [(check.what, check.verdict, check.detail) for check in checks]
+    rows = ["| {} | {} | {} |".format(*map(escaping.markdown, row)) for row in texts]
     return ["| check | verdict | detail |", "|---|---|---|", *rows]

@@ -1,4 +1,4 @@
-"""What the gate says to a developer: the verdict first and last, what moved, and where to look."""
+"""The gate's output for the terminal: the verdict first and last, what changed, and likely sources."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ from benchmarks.cell.methods import DECIDING_PACKAGES, find_method, named_method
 from benchmarks.gate.gate import FINE, Baseline, Check
 from benchmarks.report import escaping
 
-# Sources that decide a time, by its name, and a template; all else follows from where a method's factory is.
+# Sources that decide a time, by its name, and a template; for the rest, the module of a method's factory.
 STAGES = {
     "stg1": ("ash/template/",),
     "stg2": ("ash/textures.py", "ash/native/"),
@@ -24,14 +24,14 @@ SHOWN_FILES = 20
 
 
 def terminal(baseline: Baseline, head: Baseline, checks: Sequence[Check], changed: Sequence[str] | None) -> str:
-    """The verdict, what moved by how much, which part is suspect, and the verdict again."""
+    """The verdict, what changed by how much, likely sources, and the verdict again."""
     bad = [check for check in checks if check.verdict not in FINE]
     lines = [verdict(checks), f"suite {head.suite}, commit {head.commit} against baseline {baseline.commit}"]
     for check in bad:
         lines.append(f"  {check.verdict:22} {check.what}: {check.detail}")
     if bad:
         one_of_many = len({c.scene for c in bad}) < len({c.scene for c in checks})
-        lines += ["", f"What moved: {pattern(checks)}.", *likely_sources(bad, changed, one_of_many=one_of_many)]
+        lines += ["", f"What changed: {pattern(checks)}.", *likely_sources(bad, changed, one_of_many=one_of_many)]
     else:
         lines += [f"  {check.what}: {check.detail}" for check in checks]
     not_judged: dict[str, list[str]] = {}
@@ -51,7 +51,7 @@ def verdict(checks: Sequence[Check]) -> str:
 
 
 def pattern(checks: Sequence[Check]) -> str:
-    """Whether one method or all moved, on one scene or on all, in quality or in cost."""
+    """Whether one method or all changed, on one scene or on all, in quality or in cost."""
     bad = [check for check in checks if check.verdict not in FINE]
     methods = _share("method", {c.method for c in bad}, {c.method for c in checks})
     scenes = _share("scene", {c.scene for c in bad}, {c.scene for c in checks})
@@ -61,7 +61,7 @@ def pattern(checks: Sequence[Check]) -> str:
 
 
 def likely_sources(bad: Sequence[Check], changed: Sequence[str] | None, *, one_of_many: bool) -> list[str]:
-    """Where to look, and which files there changed since the baseline."""
+    """Likely sources, and which of them changed since the baseline."""
     places = _places(bad, one_of_many)
     lines = [f"Look at: {', '.join(places)}."]
     if changed is None:
@@ -77,28 +77,28 @@ def likely_sources(bad: Sequence[Check], changed: Sequence[str] | None, *, one_o
     return [*lines, *shown[:SHOWN_FILES], *more]
 
 
-def _share(word: str, moved: set[str], known: set[str]) -> str:
-    if moved == known:
-        return f"the only {word} ({', '.join(moved)})" if len(known) == 1 else f"all {len(known)} {word}s"
-    if len(moved) == 1:
-        return f"one {word} of {len(known)} ({', '.join(moved)})"
-    return f"{len(moved)} of {len(known)} {word}s ({', '.join(sorted(moved))})"
+def _share(word: str, changed: set[str], judged: set[str]) -> str:
+    if changed == judged:
+        return f"the only {word} ({', '.join(changed)})" if len(judged) == 1 else f"all {len(judged)} {word}s"
+    if len(changed) == 1:
+        return f"one {word} of {len(judged)} ({', '.join(changed)})"
+    return f"{len(changed)} of {len(judged)} {word}s ({', '.join(sorted(changed))})"
 
 
 def _places(bad: Sequence[Check], one_of_many: bool) -> tuple[str, ...]:
-    """Folders and files that can move these numbers; `one_of_many`: some scenes moved and others did not."""
-    found: list[str] = []
+    """Folders and files that can change these numbers; `one_of_many`: some scenes changed and others did not."""
+    places: list[str] = []
     methods = {check.method for check in bad}
     for check in bad:
         if check.kind == "time" and check.name in STAGES:
-            found += STAGES[check.name]
+            places += STAGES[check.name]
         elif check.name.endswith("template_mm"):
-            found += TEMPLATE
+            places += TEMPLATE
         elif len(methods) > 1:
-            found += MAKING_SCENES if one_of_many else SHARED
+            places += MAKING_SCENES if one_of_many else SHARED
         else:
-            found += sources_of(check.method)
-    return tuple(dict.fromkeys(found))
+            places += sources_of(check.method)
+    return tuple(dict.fromkeys(places))
 
 
 def sources_of(row: str) -> tuple[str, ...]:

@@ -25,7 +25,7 @@ NAMES = ("Before", "After")
 ABOUT = (
     "In brackets: the 95 % interval of the change, over seeds, or in pairs over subjects where both have several. "
     "Better or worse: p below 5 % after Holm's correction over all rows, and a change above the metric's margin. "
-    "Equivalent: the interval lies within that margin, or the predictions are identical. n/a: in one run only."
+    "Equivalent: the interval lies within that margin, or the predictions are identical. n/a: one value only."
 )
 NO_PICTURES = "No pictures: the capture or the stored predictions are missing."
 QUANTITIES = (
@@ -78,7 +78,7 @@ def write_comparison(before: Run, after: Run, out: Path) -> str:
 def changes(before: Rows, after: Rows) -> pd.DataFrame:
     """Every quantity of every row of either run: `COLUMNS`; p is corrected over all of them.
 
-    Verdict: on the run after; empty where one of the runs lacks the row.
+    Verdict: on the run after; empty where one of the runs lacks the row, or each has one value.
     """
     rows, tests = [], []
     for scene, method in dict.fromkeys([*before, *after]):
@@ -89,19 +89,23 @@ def changes(before: Rows, after: Rows) -> pd.DataFrame:
             old, new = (samples_of(table, quantity).get(method, {}) for table in tables)
             if not old and not new:
                 continue
-            means = [float(np.mean([np.mean(seeds) for seeds in own.values()])) if own else None for own in (old, new)]
+            means = [
+                float(np.mean([np.mean(seeds) for seeds in samples.values()])) if samples else None
+                for samples in (old, new)
+            ]
             test = compare_samples(new, old, margin=metric.abs_tol, higher_is_better=metric.direction == "up")
             same = quantity.split != "speed" and _predictions(pair[0]) == _predictions(pair[1]) != set()
             what = f"{metric.title}, {SPLIT_NAMES[quantity.split].words}"
             rows.append([scene, method, what, metric.unit, *means])
             tests.append((test, same))
-    known = iter(corrected([test for test, _ in tests if test is not None]))
-    found = []
+    corrected_tests = iter(corrected([test for test, _ in tests if test is not None]))
+    records = []
     for row, (test, same) in zip(rows, tests, strict=True):
-        each = None if test is None else next(known)
-        numbers = [None] * 5 if each is None else [each.mean, each.low, each.high, each.p, each.verdict]
-        found.append([*row, *numbers[:4], "equivalent" if same else numbers[4] or ""])
-    return pd.DataFrame(found, columns=COLUMNS)
+        each = None if test is None else next(corrected_tests)
+        verdict = "equivalent" if same else "" if each is None or pd.isna(each.p) else each.verdict
+        numbers = [None] * 4 if each is None else [each.mean, each.low, each.high, each.p]
+        records.append([*row, *numbers, verdict])
+    return pd.DataFrame(records, columns=COLUMNS)
 
 
 def verdict_of(table: pd.DataFrame) -> str:
@@ -166,8 +170,8 @@ def _worst_frames(before: tuple[Cell, CellResult], after: tuple[Cell, CellResult
     views = [{(view.split, view.camera, view.frame): view for view in each.result.views} for each in shown]
     shared = [key for key in views[0] if key in views[1] and key[0] in RANKED_SPLITS]  # not training views
     chosen: dict[tuple[str, str, int], str] = {}
-    for name, own in zip(NAMES, views, strict=True):
-        for key in sorted(shared, key=lambda key, own=own: psnr_of(own[key]))[:WORST]:  # type: ignore[misc]
+    for name, views_of_run in zip(NAMES, views, strict=True):
+        for key in sorted(shared, key=lambda key, views_of_run=views_of_run: psnr_of(views_of_run[key]))[:WORST]:  # type: ignore[misc]
             chosen[key] = "before and after" if key in chosen else name.lower()
     try:
         capture = load_capture(before[0].capture_folder)

@@ -52,13 +52,13 @@ class Table:
     @property
     def groups(self) -> list[tuple[str, int]]:
         """Column groups and how many columns each spans."""
-        found: list[tuple[str, int]] = []
+        spans: list[tuple[str, int]] = []
         for group, _ in self.heads:
-            if found and found[-1][0] == group:
-                found[-1] = (group, found[-1][1] + 1)
+            if spans and spans[-1][0] == group:
+                spans[-1] = (group, spans[-1][1] + 1)
             else:
-                found.append((group, 1))
-        return found
+                spans.append((group, 1))
+        return spans
 
     @property
     def rows(self) -> list[tuple[str, list[tuple[str, Mark]]]]:

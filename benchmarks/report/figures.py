@@ -38,11 +38,11 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
         for pair in [pair for pair in EXACT.items() if set(pair) <= set(shown)]:
             links += [{"panel": panel, "link": pair[0], "ms": frames[m], "psnr": shown[m].mean} for m in pair]
         ceilings = tables.values(scene, foreground(split, "noise_ceiling"), methods)
-        said = [f"noise ceiling {value:.1f} dB" for value in [*ceilings.values()][:1]]
-        said += [
+        subtitles = [f"noise ceiling {value:.1f} dB" for value in [*ceilings.values()][:1]]
+        subtitles += [
             f"{styles[m].title} {span.mean:.1f} dB, below the chart" for m, span in spans.items() if m not in shown
         ]
-        notes[panel] = "; ".join(said)
+        notes[panel] = "; ".join(subtitles)
     if not points:
         return None
     series = tuple(styles.values())

@@ -44,35 +44,35 @@ def write_report(run: Run, chosen_on: Run | None = None) -> list[str]:
 
 def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
     results = results_of(run)
-    found = RunTables(results, {cell.config.key: printable(cell.capture_folder.name) for cell in run.cells})
+    run_tables = RunTables(results, {cell.config.key: printable(cell.capture_folder.name) for cell in run.cells})
     album = Album()
-    many = sum(len(found.methods(scene)) for scene in found.scenes) > MANY
+    many = sum(len(run_tables.methods(scene)) for scene in run_tables.scenes) > MANY
     scenes = [
         scene_report(
             SceneData(
                 run=run,
-                tables=found,
+                tables=run_tables,
                 results=tuple(r for r in results if r.config.scene == scene and not r.config.axis),
                 scene=scene,
                 album=album,
-                room=PICTURE_BYTES // len(found.scenes),
+                room=PICTURE_BYTES // len(run_tables.scenes),
                 worst_frames=FEW_WORST if many else WORST,
             )
         )
-        for scene in found.scenes
+        for scene in run_tables.scenes
     ]
-    curves = [*sections.training_cost(found), *sections.template_errors(found)]
-    novelty = sections.novelty(found)
+    curves = [*sections.training_cost(run_tables), *sections.template_errors(run_tables)]
+    novelty = sections.novelty(run_tables)
     report = Report(
         title=f"Report of suite {run.suite}",
         sections=(
             Section(title="", blocks=(content.Text(text=run.about[:1].upper() + run.about[1:] + "."),)),
-            *sections.ablations(found, None if chosen_on is None else RunTables(results_of(chosen_on))),
-            *sections.stabilities(found),
+            *sections.ablations(run_tables, None if chosen_on is None else RunTables(results_of(chosen_on))),
+            *sections.stabilities(run_tables),
             *curves,
             *(section for scene in scenes for section in scene.sections),
             *novelty,
-            *sections.beside_the_paper(found, run.suite),
+            *sections.beside_the_paper(run_tables, run.suite),
             *sections.failed_cells(results, len(run.cells) - len(results)),
             sections.provenance(results, run.command),
             sections.glossary(),
@@ -81,14 +81,14 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
     files = {figure.file: figure.svg().encode() for figure in figures_of(report)}
     files |= {name: png for scene in scenes for name, png in scene.sheets.items()}
     files |= {
-        "results.csv": csv_of(_without_formulas(found.all_rows)).encode(),
+        "results.csv": csv_of(_without_formulas(run_tables.all_rows)).encode(),
         "tables.tex": _latex(scenes).encode(),
         "report.md": render(report, "md").encode(),
         "report.html": render(report, "html", album).encode(),
     }
     for name, data in files.items():
         write_atomic(run.folder / name, data)
-    return [*_terminal(found, [*curves, *novelty]), f"report: {run.folder / 'report.html'}"]
+    return [*_terminal(run_tables, [*curves, *novelty]), f"report: {run.folder / 'report.html'}"]
 
 
 def publish(run: Run, folder: Path) -> None:
@@ -134,20 +134,20 @@ def _has_charts(report: Report) -> bool:
 
 def environment(form: Literal["html", "md"]) -> Environment:
     """The templates, with the filters that they use: HTML escapes by itself, Markdown by `md`."""
-    found = Environment(
+    templates = Environment(
         loader=PackageLoader("benchmarks.report"),
         autoescape=form == "html",
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found.filters |= {
+    templates.filters |= {
         "md": escaping.markdown,
         "terms": _terms,
         "anchor": glossary.anchor,
         "meaning": glossary.meaning,
     }
-    return found
+    return templates
 
 
 def _without_formulas(rows: pd.DataFrame) -> pd.DataFrame:
@@ -155,11 +155,11 @@ def _without_formulas(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _latex(scenes: Iterable[SceneReport]) -> str:
-    found = [table for scene in scenes for table in scene.tables]
-    return LATEX_HEAD + "\n\n".join(f"% {escaping.one_line(t.title)}\n{tables.latex(t)}" for t in found) + "\n"
+    main_tables = [table for scene in scenes for table in scene.tables]
+    return LATEX_HEAD + "\n\n".join(f"% {escaping.one_line(t.title)}\n{tables.latex(t)}" for t in main_tables) + "\n"
 
 
-def _terminal(found: RunTables, curves: list[Section]) -> list[str]:
+def _terminal(run_tables: RunTables, curves: list[Section]) -> list[str]:
     """Findings, remarks and a short table of each scene."""
     lines = [
         item
@@ -169,11 +169,11 @@ def _terminal(found: RunTables, curves: list[Section]) -> list[str]:
         for item in block.items
     ]
     lines += [""] if lines else []
-    for scene in found.scenes:
+    for scene in run_tables.scenes:
         columns = [*tables.quality_columns(("psnr", "flip")), *tables.cost_columns(("frame_ms", "train_s"))]
-        short = tables.build(found, scene, columns, title="")
-        remarks = (f"- {remark}" for remark in sentences.remarks(found, scene))
-        lines += [sentences.headline(found, scene), *remarks, "", tables.plain(short), ""]
+        short = tables.build(run_tables, scene, columns, title="")
+        remarks = (f"- {remark}" for remark in sentences.remarks(run_tables, scene))
+        lines += [sentences.headline(run_tables, scene), *remarks, "", tables.plain(short), ""]
     return lines
 
 

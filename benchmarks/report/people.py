@@ -36,8 +36,8 @@ def leads(tables: RunTables, scene: str) -> pd.DataFrame:
     others = _others(tables, scene)
     for split in RANKED_SPLITS if others else ():
         means = {
-            method: {capture: float(np.mean(seeds)) for capture, seeds in own.items()}
-            for method, own in samples_of(tables.of(scene), foreground(split)).items()
+            method: {capture: float(np.mean(seeds)) for capture, seeds in samples_of_method.items()}
+            for method, samples_of_method in samples_of(tables.of(scene), foreground(split)).items()
         }
         for method in others:
             for capture, who in _names(tables, scene).items():
@@ -54,17 +54,17 @@ def blocks(tables: RunTables, scene: str) -> tuple[Block, ...]:
         return ()
     others = list(table["method"].unique())
     titles = {method: style_of(method).title for method in others}
-    said, found = [], []
+    sentences, split_tables = [], []
     for split, here in table.groupby("split", sort=False):
         for method in others:
-            said.append(_sentence(here[here["method"] == method]["lead"].round(2), str(split), method))
+            sentences.append(_sentence(here[here["method"] == method]["lead"].round(2), str(split), method))
         wide = here.pivot(index="who", columns="method", values="lead").reindex(here["who"].unique())[others]
         wide = wide.map("{:+.2f}".format).set_axis([f"minus {titles[method]}" for method in others], axis=1)
         wide.insert(0, f"{style_of(REFERENCE).title} [dB]", here.groupby("who")["ash"].first().map("{:.2f}".format))
-        found.append(Table(title=SPLIT_NAMES[str(split)].title, corner="subject", frame=wide))
+        split_tables.append(Table(title=SPLIT_NAMES[str(split)].title, corner="subject", frame=wide))
     return (
-        Bullets(items=tuple(said)),
-        *found,
+        Bullets(items=tuple(sentences)),
+        *split_tables,
         _spread_table(tables, scene, [REFERENCE, *others]),
         Text(text=NOTE, note=True),
     )
@@ -84,9 +84,9 @@ def _spread_table(tables: RunTables, scene: str, methods: Sequence[str]) -> Tabl
     texts: dict[tuple[str, str], list[str]] = {}
     for split in RANKED_SPLITS:
         samples = samples_of(tables.of(scene), foreground(split))
-        found = [spreads(samples.get(method, {})) for method in methods]
+        components = [spreads(samples.get(method, {})) for method in methods]
         for title, values in zip(
-            ("between captures [dB]", "between seeds [dB]"), zip(*found, strict=True), strict=True
+            ("between captures [dB]", "between seeds [dB]"), zip(*components, strict=True), strict=True
         ):
             texts[SPLIT_NAMES[split].title, title] = ["n/a" if v is None else f"{v:.2f}" for v in values]
     return Table(title="Spread of scores", frame=pd.DataFrame(texts, index=[style_of(m).title for m in methods]))
@@ -123,27 +123,27 @@ def _cells_by_subject(
 ) -> dict[str, tuple[Path, list[Shown]]]:
     """The capture's folder, and the first cell of each method on it, the reference first."""
     names, done = _names(tables, scene), {result.config.key: result for result in results}
-    found: dict[str, tuple[Path, dict[str, Shown]]] = {}
+    by_subject: dict[str, tuple[Path, dict[str, Shown]]] = {}
     for cell in run.cells:
         if cell.config.key in done and cell.config.method in methods:
-            _, cells = found.setdefault(names[cell.capture_folder.name], (cell.capture_folder, {}))
+            _, cells = by_subject.setdefault(names[cell.capture_folder.name], (cell.capture_folder, {}))
             cells.setdefault(cell.config.method, Shown(cell=cell, result=done[cell.config.key]))
     return {
         who: (folder, [cells[m] for m in methods])
-        for who, (folder, cells) in found.items()
+        for who, (folder, cells) in by_subject.items()
         if len(cells) == len(methods)
     }
 
 
 def _others(tables: RunTables, scene: str) -> list[str]:
     samples = samples_of(tables.of(scene), foreground())
-    own = samples.get(REFERENCE, {}).keys()
-    if len(own) < 2 or not tables.whole(scene, REFERENCE):
+    samples_of_method = samples.get(REFERENCE, {}).keys()
+    if len(samples_of_method) < 2 or not tables.whole(scene, REFERENCE):
         return []
     others = [
         row
         for row in tables.methods(scene, oracles=False)
-        if row != REFERENCE and tables.whole(scene, row) and own <= samples.get(row, {}).keys()
+        if row != REFERENCE and tables.whole(scene, row) and samples_of_method <= samples.get(row, {}).keys()
     ]
     return others if len(others) <= FEW else [row for row in others if row in RIVALS or not is_ours(row)][:FEW]
 

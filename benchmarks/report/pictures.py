@@ -90,9 +90,10 @@ def tracks(capture: Capture, shown: Sequence[Shown], album: Album, *, room: int)
     method, "psnr": dB by method}.
     """
     views = {split: [v for v in shown[0].result.views if v.split == split] for split in TRACKS}
-    views = {split: own for split, own in views.items() if own}
+    views = {split: views_of_split for split, views_of_split in views.items() if views_of_split}
     return [
-        _track(capture, shown, album, split, own[0].camera, room=room // len(views)) for split, own in views.items()
+        _track(capture, shown, album, split, views_of_split[0].camera, room=room // len(views))
+        for split, views_of_split in views.items()
     ]
 
 
@@ -114,7 +115,7 @@ def comparisons(capture: Capture, shown: Sequence[Shown]) -> list[Frames]:
 
 def worst(capture: Capture, shown: Shown, *, count: int) -> list[Frames]:
     """A method's worst novel poses: truth, prediction, FLIP error and regions."""
-    found = []
+    frames = []
     for attribution in worst_frames(capture, shown.cell, shown.result, count=count):
         view, truth, prediction = attribution.view, attribution.truth, attribution.predicted
         crop = crop_of([truth, prediction])
@@ -126,8 +127,8 @@ def worst(capture: Capture, shown: Shown, *, count: int) -> list[Frames]:
             Frame(caption="Regions", score="", pixels=_paint(attribution.map[crop])),
         )
         where = f"{shown.title}, camera {view.camera}, frame {view.frame}"
-        found.append(Frames(title=f"{where}. {attribution.explanation}", images=images))
-    return found
+        frames.append(Frames(title=f"{where}. {attribution.explanation}", images=images))
+    return frames
 
 
 def sheet(rows: Sequence[Frames], *, scale: int = 2) -> bytes:
@@ -205,12 +206,12 @@ def compare(capture: Capture, shown: Sequence[Shown], view: ViewScore, *, with_e
     noise = "" if ceiling is None else f"noise ceiling {ceiling:.1f} dB"
     images, errors = [Frame(caption="Truth", score=noise, pixels=on_paper(truth[crop]))], []
     for each, prediction in zip(shown, predictions, strict=True):
-        own = next(
+        scored = next(
             v for v in each.result.views if (v.split, v.camera, v.frame) == (view.split, view.camera, view.frame)
         )
-        images.append(Frame(caption=each.title, score=f"{psnr_of(own):.1f} dB", pixels=on_paper(prediction[crop])))
+        images.append(Frame(caption=each.title, score=f"{psnr_of(scored):.1f} dB", pixels=on_paper(prediction[crop])))
         if with_errors:
-            flip = own.scores["foreground", "flip"]
+            flip = scored.scores["foreground", "flip"]
             errors.append(Frame(caption="FLIP error", score=f"{flip:.3f}", pixels=_flip(prediction, truth, crop)))
     return Frames(
         title=f"{SPLIT_NAMES[view.split].words}, camera {view.camera}, frame {view.frame}",

@@ -1,5 +1,6 @@
 """What a report says of one scene: findings, tables, charts and pictures."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import pandas as pd
@@ -19,22 +20,9 @@ from benchmarks.report.pictures import Album, Shown
 from benchmarks.report.vega import Figure
 from benchmarks.suites.runs import Run
 
-IMAGE_SPLITS = (*RANKED_SPLITS, "train_view")  # in the order of the columns
 COSTS = (
-    "frame_ms",
-    "stg1_ms",
-    "stg2_ms",
-    "stg3_ms",
-    "stg4_ms",
-    "train_s",
-    "train_cpu_s",
-    "settled_s",
-    "steps",
-    "train_cameras",
-    "train_frames",
-    "peak_rss_mb",
-    "params",
-    "gaussians",
+    *("frame_ms", "stg1_ms", "stg2_ms", "stg3_ms", "stg4_ms", "train_s", "train_cpu_s", "settled_s", "steps"),
+    *("train_cameras", "train_frames", "peak_rss_mb", "params", "gaussians"),
 )
 ON_SHEETS = ("ash", "ddc", "ash_truth", "ddc_truth")
 AT_MOST_ON_SHEETS = 5
@@ -95,32 +83,35 @@ class SceneReport:
 
 def scene_report(data: SceneData) -> SceneReport:
     """The part of one scene."""
-    found, scene = data.tables, data.scene
+    run_tables, scene = data.tables, data.scene
     capture, shown, trouble = _pictured(data)
     exposed = sentences.exposed(data.results)
     doubts = [Text(text=doubt, note=True) for doubt in sentences.doubts(data.results)]
-    seen = [Text(text=each, note=True) for each in sentences.training_views(found, scene)]
+    seen = [Text(text=each, note=True) for each in sentences.training_views(run_tables, scene)]
     asked = [foreground("train_view"), *tables.quality_columns(("psnr", "gap", "ssim", "flip", "lpips", "iou"))]
-    quality = tables.build(found, scene, asked, title=f"Accuracy on {scene}", exposed=exposed)
-    cost = tables.build(found, scene, tables.cost_columns(COSTS), title=f"Cost on {scene}", exposed=exposed)
-    more = _more_tables(found, scene)
-    ranked = differences.differences(found, scenes=(scene,))
+    quality = tables.build(run_tables, scene, asked, title=f"Accuracy on {scene}", exposed=exposed)
+    costs = tables.cost_columns(COSTS)
+    cost = tables.build(run_tables, scene, costs, title=f"Cost on {scene}", exposed=exposed)
+    more = _other_numbers(run_tables, scene, [*asked, *costs])
+    ranked = differences.differences(run_tables, scenes=(scene,))
     note = " ".join(
-        (QUALITY_NOTE, *((APART_NOTE,) if quality.below else ()), VALUES_NOTE, detectable(found, scene, ranked))
+        (QUALITY_NOTE, *((APART_NOTE,) if quality.below else ()), VALUES_NOTE, detectable(run_tables, scene, ranked))
     )
     picture_sections, sheets = _picture_sections(data, capture, shown, trouble)
-    training = figures.training_figure(found, scene)
+    training = figures.training_figure(run_tables, scene)
     sections = [
-        Section(title=scene, headline=sentences.headline(found, scene), blocks=tuple(_opening(data, capture))),
+        Section(title=scene, headline=sentences.headline(run_tables, scene), blocks=tuple(_opening(data, capture))),
         Section(title=quality.title, blocks=(_untitled(quality), *seen, Text(text=note, note=True), *doubts)),
         Section(title=cost.title, blocks=(_untitled(cost), Text(text=COST_NOTE, note=True), *doubts)),
-        Section(title=f"Differences to ASH on {scene}", blocks=tuple(difference_blocks(found, scene, ranked))),
-        Section(title=f"Subject by subject on {scene}", blocks=people.blocks(found, scene)),
+        Section(title=f"Differences to ASH on {scene}", blocks=tuple(difference_blocks(run_tables, scene, ranked))),
+        Section(title=f"Subject by subject on {scene}", blocks=people.blocks(run_tables, scene)),
         *picture_sections,
         Section(title=f"Training on {scene}", blocks=(training,) if training else ()),
         Section(title=f"All other numbers of {scene}", blocks=more, folded=True),
         Section(
-            title=f"The same renders of {scene} by other conventions", blocks=_conventions(found, scene), folded=True
+            title=f"The same renders of {scene} by other conventions",
+            blocks=_conventions(run_tables, scene),
+            folded=True,
         ),
     ]
     return SceneReport(sections=tuple(s for s in sections if s.blocks), tables=(quality, cost, *more), sheets=sheets)
@@ -128,9 +119,9 @@ def scene_report(data: SceneData) -> SceneReport:
 
 def what_was_compared(data: SceneData, capture: Capture | None) -> str:
     """One paragraph: methods, scene, subjects, images, cameras, frames, preset and budget."""
-    found, scene, config = data.tables, data.scene, data.results[0].config
-    rows = found.of(scene)
-    methods = found.methods(scene)
+    run_tables, scene, config = data.tables, data.scene, data.results[0].config
+    rows = run_tables.of(scene)
+    methods = run_tables.methods(scene)
     presets = ", ".join(dict.fromkeys(result.config.preset for result in data.results))
     folders, subjects = (list(map(str, rows[name].unique())) for name in ("capture", "subject"))
     shown = f"capture {folders[0]}" if len(folders) == 1 else f"{len(folders)} captures, {folders[0]} to {folders[-1]}"
@@ -145,41 +136,44 @@ def what_was_compared(data: SceneData, capture: Capture | None) -> str:
         text += f" of {camera.width}x{camera.height} pixels"
     text += "."
     tests = []
-    images = found.images[found.images["scene"] == scene][["split", "camera", "frame"]].drop_duplicates()
-    for split, own in images[images["split"].isin(HELD_OUT_SPLITS)].groupby("split", sort=False):
-        cameras, frames = (_count(own[name].nunique(), name) for name in ("camera", "frame"))
-        tests.append(f"{len(own)} images of {SPLIT_NAMES[str(split)].words} ({cameras}, {frames})")
+    images = run_tables.images[run_tables.images["scene"] == scene][["split", "camera", "frame"]].drop_duplicates()
+    for split, images_of_split in images[images["split"].isin(HELD_OUT_SPLITS)].groupby("split", sort=False):
+        cameras, frames = (_count(images_of_split[name].nunique(), name) for name in ("camera", "frame"))
+        tests.append(f"{len(images_of_split)} images of {SPLIT_NAMES[str(split)].words} ({cameras}, {frames})")
     if tests:
         text += f" They are scored on {', '.join(tests[:-1])}{' and ' if tests[1:] else ''}{tests[-1]}."
     seconds = rows[(rows["metric"] == "train_s") & (rows["status"] == "done")]["value"]
     if len(seconds):
         text += f" A training took {seconds.min():.0f} to {seconds.max():.0f} s on one core,"
-        text += f" {_count(found.seeds, 'seed')} each."
+        text += f" {_count(run_tables.seeds, 'seed')} each."
     if config.size in SMOKE_TESTS or set(presets.split(", ")) & set(SMOKE_TESTS):
         text += " This is a smoke test: it shows that every part works, not which method is better."
     return text
 
 
-def detectable(found: RunTables, scene: str, ranked: pd.DataFrame) -> str:
+def detectable(run_tables: RunTables, scene: str, ranked: pd.DataFrame) -> str:
     """The smallest difference that a table of the scene can show, in one sentence."""
     known = ranked.dropna(subset=["detectable"]).groupby("split", sort=False)["detectable"]
-    smallest = [f"{own.quantile(interpolation='higher'):.2f} dB on {SPLIT_NAMES[split].words}" for split, own in known]
+    smallest = [
+        f"{images_of_split.quantile(interpolation='higher'):.2f} dB on {SPLIT_NAMES[split].words}"
+        for split, images_of_split in known
+    ]
     if not smallest:
         return "One value per row: differences between rows have no verdict."
     text = f"Smallest detectable difference to ASH, median row: {' and '.join(smallest)}"
-    if found.captures(scene) > 1:
-        return f"{text} ({found.captures(scene)} captures, compared in pairs)."
+    if run_tables.captures(scene) > 1:
+        return f"{text} ({run_tables.captures(scene)} captures, compared in pairs)."
     return f"{text} (seeds of one capture: it holds for this subject)."
 
 
-def difference_blocks(found: RunTables, scene: str, ranked: pd.DataFrame) -> list[Block]:
+def difference_blocks(run_tables: RunTables, scene: str, ranked: pd.DataFrame) -> list[Block]:
     """The differences with intervals and verdicts, and what more captures would show."""
     blocks: list[Block] = []
     if not ranked["p"].notna().any():
         return blocks
     others = tuple(split for split in MOTION_SPLITS if split not in RANKED_SPLITS)
-    beside = differences.differences(found, splits=others, scenes=(scene,))
-    test = "captures, paired t" if found.captures(scene) > 1 else "seeds, Welch"
+    beside = differences.differences(run_tables, splits=others, scenes=(scene,))
+    test = "captures, paired t" if run_tables.captures(scene) > 1 else "seeds, Welch"
     for title, table in (("", ranked), ("Near and far novel poses", beside)):
         if len(table):
             frame = pd.DataFrame(
@@ -220,27 +214,20 @@ def _untitled(table: Table) -> Table:
     return Table(frame=table.frame, marks=table.marks, below=table.below)
 
 
-def _more_tables(found: RunTables, scene: str) -> tuple[Table, ...]:
-    geometry = [Quantity(split, "", metric) for split in HELD_OUT_SPLITS for metric in ("template_mm", "surface_mm")]
-    geometry.append(foreground("novel_pose", "flicker"))
-    regions = (("full", "psnr"), ("release_crop", "psnr"), ("full", "ssim"), ("full", "flip"))
-    whole = [Quantity(split, region, metric) for split in IMAGE_SPLITS for region, metric in regions]
-    rest = [foreground("train_view", metric) for metric in ("psnr", "ssim", "flip")]
-    rest += [foreground(split, "noise_ceiling") for split in (*HELD_OUT_SPLITS, "train_view")]
-    rest += [Quantity(split, "", "novelty_deg") for split in MOTION_SPLITS]
-    asked = {
-        "Geometry against the truth, and flicker beyond the truth's own": geometry,
-        "Whole frame, and the crop of the released ASH code": whole,
-        "Training views, the noise ceiling of the renders, and the novelty of poses": rest,
-    }
-    built = [tables.build(found, scene, quantities, title=title) for title, quantities in asked.items()]
-    return tuple(table for table in built if table.heads)
+def _other_numbers(run_tables: RunTables, scene: str, shown: Sequence[Quantity]) -> tuple[Table, ...]:
+    """All quantities of the scene that no other table has, a table per split."""
+    keys = run_tables.of(scene)[["split", "region", "metric"]].drop_duplicates().itertuples(index=False)
+    quantities = [Quantity(*key) for key in keys if Quantity(*key) not in shown and key.metric != "failed"]
+    by_title: dict[str, list[Quantity]] = {SPLIT_NAMES[split].title: [] for split in SPLIT_NAMES}
+    for quantity in quantities:
+        by_title[SPLIT_NAMES[quantity.split].title].append(quantity)
+    return tuple(tables.build(run_tables, scene, own, title=title) for title, own in by_title.items() if own)
 
 
-def _conventions(found: RunTables, scene: str) -> tuple[Block, ...]:
+def _conventions(run_tables: RunTables, scene: str) -> tuple[Block, ...]:
     blocks: list[Block] = []
     for split, metric in [(split, metric) for split in RANKED_SPLITS for metric in ("psnr", "ssim")]:
-        if (scored := paper.conventions(found, scene, split, metric)) is not None:
+        if (scored := paper.conventions(run_tables, scene, split, metric)) is not None:
             values, taus = scored
             ranks, measure = values.rank(ascending=False, method="min").astype(int), METRICS[metric]
             texts = {
@@ -338,13 +325,13 @@ def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Fl
 
 
 def _worst(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Strips | None, dict[str, bytes]]:
-    found = {each.title: pictures.worst(capture, each, count=data.worst_frames) for each in shown}
-    found = {title: rows for title, rows in found.items() if rows}
-    if not found:
+    frames = {each.title: pictures.worst(capture, each, count=data.worst_frames) for each in shown}
+    frames = {title: rows for title, rows in frames.items() if rows}
+    if not frames:
         return None, {}
     file = f"worst_{data.scene}.png"
-    groups = tuple((title, tuple(row.strip(data.album) for row in rows)) for title, rows in found.items())
-    sheet = pictures.sheet(next(iter(found.values())))
+    groups = tuple((title, tuple(row.strip(data.album) for row in rows)) for title, rows in frames.items())
+    sheet = pictures.sheet(next(iter(frames.values())))
     return Strips(file=file, title="The worst frames", groups=groups), {file: sheet}
 
 

@@ -56,10 +56,10 @@ def ablations(tables: RunTables, chosen_on: RunTables | None = None) -> list[Sec
     ranked = differences(tables)
     blocks: list[Block] = []
     for split in RANKED_SPLITS:
-        found = ablation_matrix.matrix(tables, ranked, split)
-        if any(not pd.isna(effect.low) for effect in found):
-            blocks += [*_matrix(tables, found, split)]
-        elif found and not blocks:
+        effects = ablation_matrix.matrix(tables, ranked, split)
+        if any(not pd.isna(effect.low) for effect in effects):
+            blocks += [*_matrix(tables, effects, split)]
+        elif effects and not blocks:
             blocks = [Text(text=ONE_VALUE)]
     blocks += [Text(text=MATRIX_NOTE, note=True)] if len(blocks) > 1 else []
     sections = [Section(title="Components by scene", blocks=tuple(blocks))]
@@ -72,10 +72,10 @@ def ablations(tables: RunTables, chosen_on: RunTables | None = None) -> list[Sec
     return [section for section in sections if section.blocks]
 
 
-def _matrix(tables: RunTables, found: Sequence[ablation_matrix.AblationEffect], split: str) -> list[Block]:
-    scenes = [scene for scene in tables.scenes if any(effect.scene == scene for effect in found)]
-    components = list(dict.fromkeys(effect.component for effect in found))
-    by_place = {(effect.scene, effect.component): effect for effect in found}
+def _matrix(tables: RunTables, effects: Sequence[ablation_matrix.AblationEffect], split: str) -> list[Block]:
+    scenes = [scene for scene in tables.scenes if any(effect.scene == scene for effect in effects)]
+    components = list(dict.fromkeys(effect.component for effect in effects))
+    by_place = {(effect.scene, effect.component): effect for effect in effects}
     words = SPLIT_NAMES[split].words
     cells = pd.DataFrame(
         {
@@ -91,7 +91,7 @@ def _matrix(tables: RunTables, found: Sequence[ablation_matrix.AblationEffect], 
         for component in components
         for each in [by_place.get((scene, component))]
     )
-    framed = [effect for effect in found if effect.expected]
+    framed = [effect for effect in effects if effect.expected]
     figure = Figure(
         name=f"needs_{split}",
         title=f"Components by scene, {words}",
@@ -105,11 +105,11 @@ def _matrix(tables: RunTables, found: Sequence[ablation_matrix.AblationEffect], 
     blocks: list[Block] = [figure]
     if framed:
         counts = Counter(effect.verdict for effect in framed)
-        said = ablation_matrix.surprises(list(found))
-        told = f"On {words}, {len(framed)} components were removed from scenes that should need them."
-        told += f" Verdicts on ASH with them: {', '.join(f'{count} {verdict}' for verdict, count in counts.items())}."
-        blocks.append(Text(text=f"{told} {'Contradictions:' if said else 'No contradictions.'}"))
-        blocks += [Bullets(items=tuple(said))] if said else []
+        sentences = ablation_matrix.surprises(list(effects))
+        text = f"On {words}, {len(framed)} components were removed from scenes that should need them."
+        text += f" Verdicts on ASH with them: {', '.join(f'{count} {verdict}' for verdict, count in counts.items())}."
+        blocks.append(Text(text=f"{text} {'Contradictions:' if sentences else 'No contradictions.'}"))
+        blocks += [Bullets(items=tuple(sentences))] if sentences else []
     return blocks
 
 
@@ -129,12 +129,12 @@ def _strengths(table: pd.DataFrame, split: str) -> list[Block]:
         rules=pd.DataFrame({"panel": table["scene"].unique(), "y": 0.0, "text": ""}),
         columns=3,
     )
-    said = []
-    for (scene, component), own in table.groupby(["scene", "component"], sort=False):
-        course = ", ".join(f"{r.mean:+z.2f} dB at {r.strength:g}" for r in own.itertuples())
-        rises = "rises" if own["mean"].is_monotonic_increasing and own["mean"].is_unique else "does not rise"
-        said.append(f"{scene}, {component}: {course}; the loss {rises} with every step of strength.")
-    return [figure, Bullets(items=tuple(said))]
+    sentences = []
+    for (scene, component), curve in table.groupby(["scene", "component"], sort=False):
+        course = ", ".join(f"{r.mean:+z.2f} dB at {r.strength:g}" for r in curve.itertuples())
+        rises = "rises" if curve["mean"].is_monotonic_increasing and curve["mean"].is_unique else "does not rise"
+        sentences.append(f"{scene}, {component}: {course}; the loss {rises} with every step of strength.")
+    return [figure, Bullets(items=tuple(sentences))]
 
 
 def _sufficient(tables: RunTables, chosen_on: RunTables | None) -> list[Block]:
@@ -142,13 +142,13 @@ def _sufficient(tables: RunTables, chosen_on: RunTables | None) -> list[Block]:
     rows, judged = [], []
     for scene, split in [(scene, split) for scene in tables.scenes for split in RANKED_SPLITS]:
         competing, title = pareto.candidates(tables, scene, split), SPLIT_NAMES[split].title
-        found = pareto.smallest_sufficient(competing) if len(competing) >= MANY_ROWS else None
-        if found is not None:
+        sufficient = pareto.smallest_sufficient(competing) if len(competing) >= MANY_ROWS else None
+        if sufficient is not None:
             frames = {each.name: f"{each.frame_ms:.1f}" for each in competing}
-            params = text_of(tables.get(scene, found.name, Quantity("memory", "", "params")), METRICS["params"])
-            best = (style_of(found.best).title, frames[found.best])
-            names = (title, style_of(found.name).title, frames[found.name], params)
-            rows.append((scene, *names, f"{found.loss_bound_db:.2f}", *best))
+            params = text_of(tables.get(scene, sufficient.name, Quantity("memory", "", "params")), METRICS["params"])
+            best = (style_of(sufficient.best).title, frames[sufficient.best])
+            names = (title, style_of(sufficient.name).title, frames[sufficient.name], params)
+            rows.append((scene, *names, f"{sufficient.loss_bound_db:.2f}", *best))
         others = pareto.candidates(chosen_on, scene, split) if chosen_on and scene in chosen_on.scenes else ()
         if (choice := pareto.chosen_on_others(competing, others)) is not None:
             chosen, change = choice
@@ -216,8 +216,8 @@ def template_errors(tables: RunTables) -> list[Section]:
         panels=panels,
         series=pair,
     )
-    said = Bullets(items=tuple(template_error.sentences(tables, margins)))
-    return [Section(title=level_figure.title, blocks=(level_figure, margin_figure, said))]
+    sentences = Bullets(items=tuple(template_error.sentences(tables, margins)))
+    return [Section(title=level_figure.title, blocks=(level_figure, margin_figure, sentences))]
 
 
 def training_cost(tables: RunTables) -> list[Section]:
@@ -231,7 +231,7 @@ def training_cost(tables: RunTables) -> list[Section]:
     for name, title, x, x_title, table in asked:
         if len(table):
             words = table["split"].map(lambda split: SPLIT_NAMES[split].words)
-            said = curves.crossings(table) if name == "budget" else curves.frames_needed(table)
+            sentences = curves.crossings(table) if name == "budget" else curves.frames_needed(table)
             snapshots = "Snapshots: the learning rate falls only at the end of a training." if name == "budget" else ""
             figure = line_figure(
                 table.assign(panel=table["scene"] + ", " + words, scale=table["scene"]),
@@ -243,7 +243,7 @@ def training_cost(tables: RunTables) -> list[Section]:
                 x_title=x_title,
                 log=True,
             )
-            sections.append(Section(title=title, blocks=(figure, Bullets(items=tuple(said)))))
+            sections.append(Section(title=title, blocks=(figure, Bullets(items=tuple(sentences)))))
     return sections
 
 
@@ -270,22 +270,22 @@ def novelty(tables: RunTables) -> list[Section]:
 def stabilities(tables: RunTables) -> list[Section]:
     """Where methods fail, per scene with perturbed captures."""
     steps = stability.steps(tables.all_rows)
-    found = stability.breakdowns(steps)
-    return [_stability(tables, scene, own, steps) for scene, own in found.groupby("scene", sort=False)]
+    breakdowns = stability.breakdowns(steps)
+    return [_stability(tables, scene, group, steps) for scene, group in breakdowns.groupby("scene", sort=False)]
 
 
-def _stability(tables: RunTables, scene: str, found: pd.DataFrame, steps: pd.DataFrame) -> Section:
-    methods = list(found["method"].unique())
+def _stability(tables: RunTables, scene: str, breakdowns: pd.DataFrame, steps: pd.DataFrame) -> Section:
+    methods = list(breakdowns["method"].unique())
     series = vega.series_of(methods)
     names = {method: each.title for method, each in zip(methods, series, strict=True)}
     titles = {name: f"{axis.title} [{axis.unit}]" for name, axis in AXES.items()}
     caption = "Accuracy against severity, the clean capture at 0. A failed cell counts with the worst score."
-    caption += " Crossed: the breakdown point." if found["midpoint"].notna().any() else ""
+    caption += " Crossed: the breakdown point." if breakdowns["midpoint"].notna().any() else ""
     blocks: list[Block] = []
     for index, split in enumerate(RANKED_SPLITS):
         here = steps[(steps["scene"] == scene) & (steps["split"] == split)]
         floor = here[(here["method"] == stability.TRIVIAL) & (here["severity"] == 0)]
-        here = here[here["method"].isin(methods)].merge(found, on=["scene", "axis", "split", "method"])
+        here = here[here["method"].isin(methods)].merge(breakdowns, on=["scene", "axis", "split", "method"])
         samples = here.assign(
             panel=here["axis"].map(titles),
             series=here["method"].map(names),
@@ -308,11 +308,11 @@ def _stability(tables: RunTables, scene: str, found: pd.DataFrame, steps: pd.Dat
                 columns=3,
             )
         )
-    point = found["breakdown"].map("{:g}".format).where(found["breakdown"].notna(), "none")
-    point = point.where(found["midpoint"].notna(), "n/a")
-    text = point + found["loss"].map(" ({:.1f} dB lost at worst)".format)
-    place = found["axis"].map(titles) + ", " + found["split"].map(lambda split: SPLIT_NAMES[split].words)
-    wide = found.assign(text=text, place=place).pivot(index="place", columns="method", values="text")
+    point = breakdowns["breakdown"].map("{:g}".format).where(breakdowns["breakdown"].notna(), "none")
+    point = point.where(breakdowns["midpoint"].notna(), "n/a")
+    text = point + breakdowns["loss"].map(" ({:.1f} dB lost at worst)".format)
+    place = breakdowns["axis"].map(titles) + ", " + breakdowns["split"].map(lambda split: SPLIT_NAMES[split].words)
+    wide = breakdowns.assign(text=text, place=place).pivot(index="place", columns="method", values="text")
     wide = wide.loc[place.unique(), methods].fillna("n/a").set_axis([names[m] for m in methods], axis=1)
     title = "Breakdown point (and the worst loss along the axis)"
     blocks.append(Table(title=title, corner="axis", frame=wide))
@@ -346,15 +346,15 @@ def beside_the_paper(tables: RunTables, suite: str) -> list[Section]:
             for i, title in enumerate(("PSNR", "LPIPS")):
                 texts[group, title] = [f"{getattr(row, k)[i]:.2f}" for row in table.rows]
         for group, quantity, title in asked:
-            found = [tables.get(table.scene, row.method or "", quantity) for row in table.rows]
-            texts[group, title] = [text_of(row, METRICS[quantity.metric]) for row in found]
+            values = [tables.get(table.scene, row.method or "", quantity) for row in table.rows]
+            texts[group, title] = [text_of(row, METRICS[quantity.metric]) for row in values]
         frame = pd.DataFrame(texts, index=[row.title for row in table.rows])
         ours = sum(row.method in tables.methods(table.scene) for row in table.rows)
-        said = [
+        lines = [
             f"Kendall's tau, {SPLIT_NAMES[s].title.lower()}: {tau:+.2f} over {ours} methods" for s, tau in taus.items()
         ]
         blocks += [Table(title=table.title, frame=frame)]
-        blocks += [Bullets(items=(*said, *(row.note for row in table.rows if row.note)))]
+        blocks += [Bullets(items=(*lines, *(row.note for row in table.rows if row.note)))]
     note = Text(text=PAPER_NOTE.format(suite=suite), note=True)
     return [Section(title="Beside the paper", blocks=(*blocks, note))] if blocks else []
 
@@ -372,16 +372,16 @@ def failed_cells(results: Sequence[CellResult], missing: int) -> list[Section]:
 
 def provenance(results: Sequence[CellResult], command: str) -> Section:
     """Where the numbers come from; cells made at several places are listed with all of them."""
-    known = [result.provenance for result in results if result.provenance is not None]
-    facts = [("protocol", PROTOCOL), ("commit", _distinct(p.commit for p in known))]
+    provenances = [result.provenance for result in results if result.provenance is not None]
+    facts = [("protocol", PROTOCOL), ("commit", _distinct(p.commit for p in provenances))]
     facts.append(("code", _distinct(r.config.code for r in results)))
     for name in ("processor", "cores", "memory_gb", "system", "gpu", "python"):
-        facts.append((name.replace("_gb", " [GB]"), _distinct(p.machine.get(name, "unknown") for p in known)))
-    for name in sorted({name for p in known for name in p.versions}):
-        facts.append((name, _distinct(p.versions.get(name, "unknown") for p in known)))
+        facts.append((name.replace("_gb", " [GB]"), _distinct(p.machine.get(name, "unknown") for p in provenances)))
+    for name in sorted({name for p in provenances for name in p.versions}):
+        facts.append((name, _distinct(p.versions.get(name, "unknown") for p in provenances)))
     facts.append(("captures", _distinct(f"{r.config.scene} {r.config.size} {r.config.capture[:12]}" for r in results)))
     facts.append(("seeds", ", ".join(str(seed) for seed in sorted({r.config.seed for r in results}))))
-    facts.append(("sum of all cells [min]", f"{sum(p.wall_s for p in known) / 60:.1f}"))
+    facts.append(("sum of all cells [min]", f"{sum(p.wall_s for p in provenances) / 60:.1f}"))
     facts += [("command", command)] if command else []
     return Section(title="Provenance", blocks=(_facts("fact", facts), Text(text=PROVENANCE_NOTE, note=True)))
 

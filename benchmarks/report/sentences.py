@@ -70,21 +70,21 @@ def _ash_and_ddc(tables: RunTables, scene: str) -> str:
 
 def remarks(tables: RunTables, scene: str) -> list[str]:
     """What else must be known to read the numbers: the exact surface, cost, template, noise, seeds, failures."""
-    found = [FOR_VALIDATION] if tables.for_validation(scene) else []
-    found += [_exact(tables, scene), _cost(tables, scene), _template(tables, scene), _noise(tables, scene)]
+    lines = [FOR_VALIDATION] if tables.for_validation(scene) else []
+    lines += [_exact(tables, scene), _cost(tables, scene), _template(tables, scene), _noise(tables, scene)]
     outcomes = tables.outcomes[tables.outcomes["scene"] == scene]
     learned = outcomes[outcomes["template"] != ""].drop_duplicates(["method", "template"])
-    said = [f"{template} ({titles([*rows['method']])})" for template, rows in learned.groupby("template", sort=False)]
-    found.append(f"Templates: {'; '.join(said)}." if said else "")
+    kinds = [f"{template} ({titles([*rows['method']])})" for template, rows in learned.groupby("template", sort=False)]
+    lines.append(f"Templates: {'; '.join(kinds)}." if kinds else "")
     if dead := _with_outcome(tables, scene, "dead"):
-        found.append(sentence(f"The decoders have the same output in every frame: {titles(dead)}"))
+        lines.append(sentence(f"The decoders have the same output in every frame: {titles(dead)}"))
     if failed := [method for method in tables.methods(scene) if tables.failed(scene, method)]:
-        found.append(sentence(f"Failed, and scored with the worst value: {titles(failed)}"))
+        lines.append(sentence(f"Failed, and scored with the worst value: {titles(failed)}"))
     if not tables.unit(scene):
-        found.append("One seed: a difference of a few tenths of a dB may be chance; --seeds 3 gives intervals.")
+        lines.append("One seed: a difference of a few tenths of a dB may be chance; --seeds 3 gives intervals.")
     elif tables.captures(scene) == 1:
-        found.append("One capture: intervals are over seeds and hold for this subject; --subjects 8 adds others.")
-    return [remark for remark in found if remark]
+        lines.append("One capture: intervals are over seeds and hold for this subject; --subjects 8 adds others.")
+    return [remark for remark in lines if remark]
 
 
 def _exact(tables: RunTables, scene: str) -> str:
@@ -101,11 +101,11 @@ def _exact(tables: RunTables, scene: str) -> str:
 def _cost(tables: RunTables, scene: str) -> str:
     """Of many methods only the main two, the fastest and the slowest."""
     names = [method for method in tables.methods(scene, oracles=False) if tables.whole(scene, method)]
-    known = tables.values(scene, FRAME_MS, names)
-    if len(known) > FEW_METHODS:
-        ends = [pick(known, key=lambda name: known[name]) for pick in (min, max)]
-        known = {name: ms for name, ms in known.items() if name in ("ash", "ddc", *ends)}
-    parts = [f"{style_of(method).title} {ms:.0f} ms" for method, ms in known.items()]
+    frame_ms = tables.values(scene, FRAME_MS, names)
+    if len(frame_ms) > FEW_METHODS:
+        ends = [pick(frame_ms, key=lambda name: frame_ms[name]) for pick in (min, max)]
+        frame_ms = {name: ms for name, ms in frame_ms.items() if name in ("ash", "ddc", *ends)}
+    parts = [f"{style_of(method).title} {ms:.0f} ms" for method, ms in frame_ms.items()]
     return f"A frame takes {', '.join(parts)} on one core." if parts else ""
 
 
@@ -133,7 +133,7 @@ def _with_outcome(tables: RunTables, scene: str, condition: str) -> list[str]:
 
 def training_views(tables: RunTables, scene: str) -> list[str]:
     """How much of the capture training saw, of rows that the paper trained on a part of it: a sentence each."""
-    said = []
+    lines = []
     for method in [name for name in tables.methods(scene) if name in paper.SEEN]:
         counts = []
         for what in ("cameras", "frames"):
@@ -142,45 +142,45 @@ def training_views(tables: RunTables, scene: str) -> list[str]:
                 span = dict.fromkeys(f"{value:.0f}" for value in (seen.least, seen.greatest))  # Captures may differ.
                 counts.append(f"{' to '.join(span)} of {whole.value:.0f} {what}")
         if len(counts) == 2:
-            said.append(f"{style_of(method).title}: training saw {', '.join(counts)} (paper: {paper.SEEN[method]}).")
-    return said
+            lines.append(f"{style_of(method).title}: training saw {', '.join(counts)} (paper: {paper.SEEN[method]}).")
+    return lines
 
 
 def exposed(results: Sequence[CellResult]) -> tuple[str, ...]:
     """Methods that were not isolated; oracles are not meant to be."""
-    found = (r.config.method for r in results if r.isolated is False and not is_oracle(r.config.method))
-    return tuple(dict.fromkeys(found))
+    methods = (r.config.method for r in results if r.isolated is False and not is_oracle(r.config.method))
+    return tuple(dict.fromkeys(methods))
 
 
 def doubts(results: Sequence[CellResult]) -> tuple[str, ...]:
     """What was not enforced, other renderers and devices, and clocks that contradict each other."""
-    found = []
+    lines = []
     if names := exposed(results):
-        found.append(
+        lines.append(
             f"Not isolated: {titles(names)}. The system could not isolate the method's process: the truth was not given"
             " to it, and access to it was watched, but not made impossible."
         )
     for result in results:
         if result.evaluated_code:
-            found.append(f"{result.config.title}: scored by other code ({result.evaluated_code}) than trained it.")
+            lines.append(f"{result.config.title}: scored by other code ({result.evaluated_code}) than trained it.")
     for kind, words in DRAWN_BY.items():
         timed = dict.fromkeys(r.config.method for r in results if r.timing is not None and r.timing.drawn_by == kind)
-        found += [f"{titles([*timed])}: {words}."] if timed else []
+        lines += [f"{titles([*timed])}: {words}."] if timed else []
     for device in sorted({r.drawn_on for r in results} - {"", "cpu"}):
         drawn = dict.fromkeys(r.config.method for r in results if r.drawn_on == device)
-        found.append(f"{titles([*drawn])}: drawn on {device}, so that milliseconds are not those of one core.")
+        lines.append(f"{titles([*drawn])}: drawn on {device}, so that milliseconds are not those of one core.")
     for result in results:
         wall, cpu = (result.value("speed", "", f"train_{clock}_s") for clock in ("wall", "cpu"))
         if wall is None or cpu is None or abs(wall - cpu) < CLOCKS_APART_S + CLOCKS_APART * min(wall, cpu):
             continue
         why = "it was stopped, or shared its core" if wall > cpu else "it used more than one core"
-        found.append(f"{result.config.title} trained {wall:.0f} s by the clock and {cpu:.0f} s of CPU time: {why}.")
-    return tuple(found)
+        lines.append(f"{result.config.title} trained {wall:.0f} s by the clock and {cpu:.0f} s of CPU time: {why}.")
+    return tuple(lines)
 
 
 def frontier(tables: RunTables, scene: str) -> tuple[str, ...]:
     """The front of accuracy and speed, and the smallest sufficient method, by split."""
-    said = []
+    lines = []
     for split in RANKED_SPLITS:
         competing = pareto.candidates(tables, scene, split)
         if len(competing) < 2:
@@ -191,5 +191,5 @@ def frontier(tables: RunTables, scene: str) -> tuple[str, ...]:
             text += f" Smallest sufficient: {style_of(sufficient.name).title}, the cheapest that loses less than"
             text += f" {pareto.SUFFICIENT_DB} dB to {style_of(sufficient.best).title}"
             text += f" (95 % bound {sufficient.loss_bound_db:.2f} dB)."
-        said.append(text)
-    return tuple(said)
+        lines.append(text)
+    return tuple(lines)

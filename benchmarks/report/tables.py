@@ -36,13 +36,13 @@ def build(
 ) -> Table:
     """The table of a scene without the quantities that no method has. `exposed`: methods that were not isolated."""
     methods = sorted(tables.methods(scene), key=is_oracle)  # Stable: the order of methods within each half.
-    found = {q: [tables.get(scene, method, q) for method in methods] for q in quantities}
-    found = {q: rows for q, rows in found.items() if any(row is not None for row in rows)}
+    columns = {q: [tables.get(scene, method, q) for method in methods] for q in quantities}
+    columns = {q: rows for q, rows in columns.items() if any(row is not None for row in rows)}
     lost = [tables.failed(scene, method) == tables.cells["cells"][scene, method] for method in methods]
     names = [_name(tables, scene, method, exposed=method in exposed) for method in methods]
     texts: dict[tuple[str, str], list[str]] = {}
     marks: dict[tuple[int, int], Mark] = {}
-    for column, (quantity, rows) in enumerate(found.items()):
+    for column, (quantity, rows) in enumerate(columns.items()):
         measure = METRICS[quantity.metric]
         texts[head_of(quantity)] = [
             "failed" if gone else text_of(row, measure) for row, gone in zip(rows, lost, strict=True)

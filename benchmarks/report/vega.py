@@ -94,14 +94,14 @@ class Figure:
 
 def series_of(methods: Sequence[str]) -> tuple[Series, ...]:
     """The series of methods; those of one colour differ in shape."""
-    found: list[Series] = []
+    series: list[Series] = []
     for method in methods:
         style, hollow = style_of(method), is_oracle(method)
-        alike = sum((other.colour, other.hollow) == (style.colour, hollow) for other in found)
-        title = method if any(other.title == style.title for other in found) else style.title
+        alike = sum((other.colour, other.hollow) == (style.colour, hollow) for other in series)
+        title = method if any(other.title == style.title for other in series) else style.title
         shape = SHAPES[alike % len(SHAPES)]
-        found.append(Series(title=title, colour=style.colour, hollow=hollow, shape=shape))
-    return tuple(found)
+        series.append(Series(title=title, colour=style.colour, hollow=hollow, shape=shape))
+    return tuple(series)
 
 
 def dark_rules(scope: str = "") -> str:

@@ -1,18 +1,17 @@
 """Where a step of training spends its time, part by part: `ash-bench speed frame --profile`.
 
 The step is the loop's own. Its parts are timed from outside: a part's forward pass as it is called, its backward pass
-from the moment when the gradients of all that it returned are there until those of the part before it are. Time is the
-thread's CPU time, in which waiting for a core does not count. A step that draws static views or learns vertices
-besides is timed as a whole, and its parts are not.
+from the moment when the gradients of all that it returned are there until those of the part before it are. Parts are
+CPU time of the thread, in which waiting for a core does not count; "train_step" is wall time. A step that also draws
+static views or learns vertices is timed as a whole, and its parts are not.
 """
 
-import statistics
 import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,6 @@ import ash.training.loop
 from ash import presets
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture
-from ash.config import TrainingConfig
 from ash.devices import CPU, finish
 from ash.files import write_json
 from ash.gaussians.gaussians import Gaussians
@@ -35,12 +33,21 @@ from ash.training.batches import draw_batch
 from ash.training.images import TrainingImages, load_training_images
 from baselines.ddc import DdcAvatar, ddc
 from benchmarks.speed.frames import captured
+from benchmarks.speed.timing import (
+    Candidate,
+    SpeedRow,
+    as_json,
+    print_head,
+    print_rows,
+    rows_of,
+    time_interleaved,
+    torch_threads_restored,
+)
 
 STATIC, VERTICES = "step with static views", "step with vertices"  # Both at once in the mesh: the latter.
 FORWARD = ("batch", "decode", "pose", "draw", "loss")
 BACKWARD = ("loss backward", "draw backward", "pose backward", "decode backward")
 PARTS = (*FORWARD, *BACKWARD, "adam", "rest", "step")  # "step": the whole; "rest": what no other part holds
-KINDS = (*PARTS, STATIC, VERTICES)
 STEPS = 80
 SUBJECTS = (
     ("ash", "cpu", "float32"),
@@ -50,20 +57,8 @@ SUBJECTS = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class PartTime:
-    """One part of one method's step."""
-
-    method: str
-    preset: str
-    precision: str  # of the decoders
-    part: str
-    min_ms: float
-    median_ms: float
-
-
 class _Parts:
-    """Seconds of the parts of the step in progress on a device."""
+    """Seconds of the parts of one step on a device."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -103,7 +98,7 @@ class _Parts:
 
 
 def _tensors_in(result: Any) -> list[Tensor]:
-    """What the loss sees of a part's results."""
+    """The part's results that the loss depends on."""
     if isinstance(result, Gaussians):
         return [getattr(result, name) for name in result.__slots__]
     if isinstance(result, Splatted):
@@ -112,59 +107,45 @@ def _tensors_in(result: Any) -> list[Tensor]:
     return [part for part in parts if isinstance(part, Tensor)]
 
 
-def profile_step(
-    method: str, learner: AshAvatar | DdcAvatar, images: TrainingImages, preset: str, *, steps: int
-) -> list[PartTime]:
-    """The parts of so many steps, after an epoch that is not counted. The learner learns meanwhile."""
-    config = replace(learner.config.training, warmup="none", warmup_steps=0, steps=10**9)
-    samples = list(_profiled_steps(learner, images, config, steps))
-    return [
-        PartTime(
-            method=method,
-            preset=preset,
-            precision=config.precision,
-            part=part,
-            min_ms=1e3 * min(sample[part] for sample in samples if part in sample),
-            median_ms=1e3 * statistics.median(sample[part] for sample in samples if part in sample),
-        )
-        for part in KINDS
-        if any(part in sample for sample in samples)
-    ]
+def profiled(learner: AshAvatar | DdcAvatar, images: TrainingImages, name: str, folder: Path) -> Candidate:
+    """Steps of a training, to be timed; each returns the milliseconds of its parts. The learner learns meanwhile.
+
+    The first epoch is made at once: it poses each frame's template.
+    """
+    training = learner.config.training
+    first = training.warmup_steps  # Before, decoders do not take part.
+    config = replace(training, warmup="none", warmup_steps=0, steps=10**9)
+    trainer = ash.training.loop.Trainer(learner, config, images, folder)
+    epoch = len(images.frames)
+
+    def step(number: int) -> dict[str, float]:
+        trainer.step = first + number
+        parts = _Parts(learner.device)
+        start = parts.now()
+        with _timed_parts(parts, learner, trainer):
+            trainer.advance([parts.timed("batch", draw_batch)(images, config, 0, trainer.step)])
+        whole = parts.now() - start
+        if kind := _extra_work(learner, first + number):
+            return {kind: 1e3 * whole}
+        parts.split_backward()
+        seconds = parts.spent | {"rest": whole - sum(parts.spent.values()), "step": whole}
+        return {part: 1e3 * seconds[part] for part in PARTS if part in seconds}
+
+    for number in range(epoch):
+        step(number)
+    return Candidate(name=name, threads=1, call=lambda number: step(epoch + number))
 
 
-def _profiled_steps(
-    learner: AshAvatar | DdcAvatar, images: TrainingImages, config: TrainingConfig, steps: int
-) -> Iterator[dict[str, float]]:
-    first = learner.config.training.warmup_steps  # Before, decoders do not take part.
-    warm = len(images.frames)  # An epoch: each frame's template is posed once.
-    with tempfile.TemporaryDirectory() as folder:
-        run = ash.training.loop.Trainer(learner, config, images, Path(folder))
-        for number in range(steps + warm):
-            run.step = first + number
-            parts = _Parts(learner.device)
-            start = parts.now()
-            with _watched(parts, learner, run):
-                run.advance([parts.timed("batch", draw_batch)(images, config, 0, run.step)])
-            whole = parts.now() - start
-            if number < warm:
-                continue
-            if kind := _what_else(learner, first + number):
-                yield {kind: whole}
-            else:
-                parts.split_backward()
-                yield parts.spent | {"rest": whole - sum(parts.spent.values()), "step": whole}
-
-
-def _what_else(learner: AshAvatar | DdcAvatar, step: int) -> str:
-    """What a step learns besides; empty: nothing."""
+def _extra_work(learner: AshAvatar | DdcAvatar, step: int) -> str:
+    """What a step does besides; empty: nothing."""
     if isinstance(learner, DdcAvatar) and step % learner.config.vertices_every == 0:
         return VERTICES
     return STATIC if step % learner.config.training.static_every == 0 else ""
 
 
 @contextmanager
-def _watched(parts: _Parts, learner: AshAvatar | DdcAvatar, run: ash.training.loop.Trainer) -> Iterator[None]:
-    """Count the parts of the step that the body makes."""
+def _timed_parts(parts: _Parts, learner: AshAvatar | DdcAvatar, trainer: ash.training.loop.Trainer) -> Iterator[None]:
+    """Time the parts of the step that the body makes."""
     if isinstance(learner, AshAvatar):
         drawing = [(learner, "_decode", "decode"), (learner.module, "pose", "pose"), (learner.module, "draw", "draw")]
     else:
@@ -174,50 +155,38 @@ def _watched(parts: _Parts, learner: AshAvatar | DdcAvatar, run: ash.training.lo
             (learner.module, "see", "draw"),
             (learner.module, "draw", "draw"),
         ]
-    rest = [(ash.training.loop, "view_loss", "loss"), (run.optimiser, "step", "adam")]
+    rest = [(ash.training.loop, "view_loss", "loss"), (trainer.optimiser, "step", "adam")]
     with ExitStack() as stack:
         for owner, name, part in (*drawing, *rest):
             stack.enter_context(patch.object(owner, name, parts.timed(part, getattr(owner, name))))
         yield
 
 
-def profiles(capture: Capture, device: torch.device = CPU) -> Iterator[list[PartTime]]:
-    """The subjects' steps on one thread and a device, as they learn from a capture."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        images = load_training_images(capture, device)
+def profile_rows(capture: Capture, device: torch.device = CPU) -> list[SpeedRow]:
+    """The subjects' steps, interleaved, on one thread and a device, as they learn from a capture."""
+    images = load_training_images(capture, device)
+    candidates = []
+    with torch_threads_restored(), tempfile.TemporaryDirectory() as folder:
+        torch.set_num_threads(1)
         for method, preset, precision in SUBJECTS:
-            if precision == "bfloat16" and not (device.type != "cpu" or has_tiles()):
+            if precision == "bfloat16" and device == CPU and not has_tiles():
                 continue
-            recipe: presets.MethodFactory[Any] = presets.ash if method == "ash" else ddc
-            make = recipe.with_overrides({"training.precision": precision, "device": str(device)})
+            factory: presets.MethodFactory[Any] = presets.ash if method == "ash" else ddc
+            make = factory.with_overrides({"training.precision": precision, "device": str(device)})
             learner: AshAvatar | DdcAvatar = make(capture, seed=0, preset=preset)
-            yield profile_step(method, learner, images, preset, steps=STEPS)
-    finally:
-        torch.set_num_threads(before)
-
-
-def print_profile(profile: list[PartTime]) -> None:
-    """A line per part: least and median milliseconds."""
-    name = f"{profile[0].method}, {profile[0].preset}, {profile[0].precision}"
-    print(f"{name}: milliseconds of a training step on one thread, least and median")
-    for row in profile:
-        print(f"  {row.part:16} {row.min_ms:8.2f} {row.median_ms:8.2f}", flush=True)
+            name = f"{method} {preset} {precision}"
+            candidates.append(profiled(learner, images, name, Path(folder) / name))
+        samples = time_interleaved(candidates, rounds=STEPS, warm_up=False, device=device)
+    camera = next(iter(images.cameras.values()))
+    return rows_of("train_step", f"{camera.width}x{camera.height}", "forward+backward", samples, device)
 
 
 def main(json_path: Path | None, folder: Path | None, device: torch.device = CPU) -> int:
     """Print the profiles on a capture, and write them to `json_path`; returns the exit code."""
-    found: list[PartTime] = []
     print(f"device {device}")
-    for profile in profiles(captured(folder), device):
-        print_profile(profile)
-        found += profile
-    for method, preset in sorted({(row.method, row.preset) for row in found if row.precision == "bfloat16"}):
-        took = {
-            row.precision: row.min_ms for row in found if (row.method, row.preset, row.part) == (method, preset, "step")
-        }
-        print(f"{method}, {preset}: a step is {took['float32'] / took['bfloat16']:.2f} times as fast in bfloat16")
+    rows = profile_rows(captured(folder), device)
+    print_head()
+    print_rows(rows)
     if json_path is not None:
-        write_json(json_path, {"parts": [vars(part) for part in found], "device": str(device)})
+        write_json(json_path, {"rows": [as_json(row) for row in rows]})
     return 0

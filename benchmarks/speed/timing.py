@@ -115,7 +115,7 @@ def as_json(row: SpeedRow) -> dict[str, object]:
 def print_head() -> None:
     """The head of `print_rows`."""
     print(
-        f"{'what':14} {'size':9} {'pass':17} th {'by':18} {'min ms':>10} {'median ms':>10} {'naive/min':>9} {'1/s':>6}"
+        f"{'what':22} {'size':9} {'pass':17} th {'by':18} {'min ms':>10} {'median ms':>10} {'naive/min':>9} {'1/s':>6}"
     )
 
 
@@ -125,7 +125,7 @@ def print_rows(rows: Iterable[SpeedRow]) -> None:
         ratio = "" if math.isnan(row.ratio) else f"{row.ratio:.1f}"
         rate = f"{1e3 / row.median_ms:.1f}" if row.what in ("frame", "train_step") else ""
         print(
-            f"{row.what:14} {row.size:9} {row.pass_:17} {row.threads:2} {row.candidate:18}"
+            f"{row.what:22} {row.size:9} {row.pass_:17} {row.threads:2} {row.candidate:18}"
             f" {row.min_ms:10.2f} {row.median_ms:10.2f} {ratio:>9} {rate:>6}",
             flush=True,
         )

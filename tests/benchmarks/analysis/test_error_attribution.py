@@ -60,11 +60,11 @@ def test_regions_cover_truth_and_prediction_and_nothing_else(small_capture: Path
     camera, frame = capture.splits["novel_pose"].views[0]
     truth = metrics.foreground(metrics.on_black(capture.image(camera, frame)))
     predicted = np.roll(truth, 6, axis=1)
-    seen = error_attribution._seen_triangles(capture.folder, capture.identity)
-    regions = region_map(capture, camera, frame, truth, predicted, seen)
+    visible = error_attribution._visible_triangles(capture.folder, capture.identity)
+    regions = region_map(capture, camera, frame, truth, predicted, visible)
     assert ((regions >= 0) == (truth | predicted)).all()
     assert (regions[truth & ~predicted] == REGIONS.index("silhouette")).all()
-    hidden = region_map(capture, camera, frame, truth, truth, np.zeros_like(seen))
-    unseen = REGIONS.index("never seen in training")
-    assert (hidden == unseen).sum() > (region_map(capture, camera, frame, truth, truth, seen) == unseen).sum()
+    hidden = region_map(capture, camera, frame, truth, truth, np.zeros_like(visible))
+    unseen = REGIONS.index("not visible in training")
+    assert (hidden == unseen).sum() > (region_map(capture, camera, frame, truth, truth, visible) == unseen).sum()
     assert REGIONS.index("interior") not in hidden

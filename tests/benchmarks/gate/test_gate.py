@@ -239,13 +239,13 @@ def test_the_terminal_says_what_moved_and_where_to_look(moved: list[tuple[str, s
     changed = ("README.md", "baselines/ddc.py", "synth/posing.py", "benchmarks/cell/metrics.py")
     lines = terminal(base, head, checks, changed).splitlines()
     assert lines[0] == lines[-1] and lines[0].startswith("gate: FAILED")
-    assert any(line.startswith(f"What moved: {said}") for line in lines)
+    assert any(line.startswith(f"What changed: {said}") for line in lines)
     near = [line.removeprefix("  * ") for line in lines if line.startswith("  * ")]
     assert any(name.startswith(suspect) for name in near)
     assert len(near) == (2 if moved == PLACES else 1), "what all methods share is suspect where all scenes moved"
     assert not any("README" in line for line in lines)
     bad = next(line for line in lines if line.startswith("  fail"))
-    assert "25 -> 24 dB" in bad and "would be seen" in bad
+    assert "25 -> 24 dB" in bad and "detectable from" in bad
 
 
 def test_the_terminal_knows_time_from_quality_and_good_from_bad() -> None:
@@ -256,7 +256,7 @@ def test_the_terminal_knows_time_from_quality_and_good_from_bad() -> None:
     assert "a leak looks like progress" in terminal(BASE, better, judge(BASE, better), ())
     text = terminal(BASE, BASE, judge(BASE, BASE), ())
     assert text.splitlines()[0] == text.splitlines()[-1] == "gate: passed, 6 checks"
-    assert "identical predictions" in text and "What moved" not in text
+    assert "identical predictions" in text and "What changed" not in text
 
 
 def test_the_smallest_visible_change_is_seen() -> None:
@@ -265,7 +265,7 @@ def test_the_smallest_visible_change_is_seen() -> None:
     base = summarise("ci", run(list(rng.normal(25, 0.1, 5))))
     trial = judge(base, summarise("ci", run(list(rng.normal(25, 0.1, 5)))))
     detail = next(check.detail for check in trial if check.name == "novel_view/foreground/psnr")
-    smallest = float(detail.split("a change from ")[1].split()[0])
+    smallest = float(detail.split("detectable from ")[1].split()[0])
     found = 0
     for _ in range(50):
         head = summarise("ci", run(list(rng.normal(25 - 2 * smallest, 0.1, 5))))
