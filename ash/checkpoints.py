@@ -30,7 +30,8 @@ def load_module(module: torch.nn.Module, tensors: dict[str, Tensor], path: Path)
     """Load parameters and check that they fit and are finite."""
     if not all(torch.isfinite(tensor).all() for tensor in tensors.values()):
         raise InputError(f"{path}: holds NaN or infinity")
-    tensors = {OLD_NAMES.get(name, name): tensor for name, tensor in tensors.items()}
+    names = module.state_dict().keys()  # Of other modules, an old name may be the name in use.
+    tensors = {name if name in names else OLD_NAMES.get(name, name): tensor for name, tensor in tensors.items()}
     try:
         module.load_state_dict(tensors)
     except RuntimeError as error:

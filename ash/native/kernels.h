@@ -138,9 +138,9 @@ struct Triangle {
 struct RasterBand {
     int top, bottom;  // rows of the image, the last one excluded
     int64_t stride;   // of a row
-    double near;      // least depth that is seen
+    double near;      // least visible depth
     double* nearest;  // depths, infinite at first
-    int64_t* seen;    // triangles
+    int64_t* visible; // triangles
 };
 
 constexpr int PRODUCT_COLUMNS = 16;
@@ -172,7 +172,7 @@ struct Packing {
     float* to;
 };
 
-// What is wrong with an input, found while it is read. 0: nothing.
+// What is wrong with an input, noticed while it is read. 0: nothing.
 enum Fault : int64_t { FAULT_MEANS = 1, FAULT_QUATS, FAULT_ZERO_QUAT, FAULT_SCALES, FAULT_OPACITIES, FAULT_SH };
 
 struct Kernels {

@@ -72,16 +72,16 @@ struct Target {
     float *barycentric, *depth;
 };
 
-// Writes what the samples of a row see in the columns from `left` on, of which those not seen are written already.
-void write_row(const Triangle* triangles, const double* nearest, const int64_t* seen, int left, int right, int y, const Target& target) {
+// Writes the samples of a row from column `left` on; samples without a triangle are written already.
+void write_row(const Triangle* triangles, const double* nearest, const int64_t* visible, int left, int right, int y, const Target& target) {
     for (int x = left; x < right; ++x) {
-        if (seen[x] < 0) continue;
+        if (visible[x] < 0) continue;
         const int64_t pixel = int64_t(y) * target.width + x;
-        const Triangle& t = triangles[seen[x]];
+        const Triangle& t = triangles[visible[x]];
         double px = x + 0.5, py = y + 0.5, e[3];
         for (int i = 0; i < 3; ++i) e[i] = t.edges[i][0] * px + (t.edges[i][1] * py + t.edges[i][2]);
         const double sum = e[0] + e[1] + e[2];
-        target.triangle[pixel] = int(seen[x]);
+        target.triangle[pixel] = int(visible[x]);
         target.depth[pixel] = float(nearest[x]);
         for (int i = 0; i < 3; ++i) target.barycentric[3 * pixel + i] = float(e[i] / sum);
     }
@@ -118,11 +118,11 @@ int ash_rasterize(const double* vertices, const int* faces, int64_t face_count, 
         const RasterBand band{top, bottom, stride, near, all_nearest.get() + top * stride, all_seen.get() + top * stride};
         for (int y = 0; y < bottom - top && left < right; ++y) {
             std::fill(band.nearest + y * stride + left, band.nearest + y * stride + right + BEYOND, INFINITY);
-            std::fill(band.seen + y * stride + left, band.seen + y * stride + right + BEYOND, -1);
+            std::fill(band.visible + y * stride + left, band.visible + y * stride + right + BEYOND, -1);
         }
         kernels().raster_band(triangles.get(), members[number].data(), int64_t(members[number].size()), band);
         for (int y = top; y < bottom; ++y)
-            write_row(triangles.get(), band.nearest + (y - top) * stride, band.seen + (y - top) * stride, left, right, y, target);
+            write_row(triangles.get(), band.nearest + (y - top) * stride, band.visible + (y - top) * stride, left, right, y, target);
     });
     return 0;
 } catch (const std::bad_alloc&) {

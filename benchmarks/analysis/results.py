@@ -23,18 +23,8 @@ from benchmarks.suites.suites import capture_name
 from synth.person.cast import VALIDATION
 
 COLUMNS = (
-    "scene",
-    "method",
-    "seed",
-    "split",
-    "region",
-    "metric",
-    "value",
-    "unit",
-    "direction",
-    "protocol",
-    "subject",
-    "capture",
+    *("scene", "method", "seed", "split", "region", "metric", "value", "unit", "direction", "protocol"),
+    *("subject", "capture"),
 )
 KEYS = ["scene", "method", "split", "region", "metric"]
 PLACE = re.compile(r"(?P<scene>\S+)(?: (?P<axis>\w+)=(?P<severity>\S+))?")  # `CellConfig.place`
