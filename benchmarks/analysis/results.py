@@ -16,25 +16,15 @@ import pandas as pd
 from ash.files import InputError
 from benchmarks.analysis.statistics import LEVEL, Comparison, Samples, compare_samples, independent, mean_interval
 from benchmarks.analysis.style import is_ours
-from benchmarks.cell.cells import CellConfig, CellResult
-from benchmarks.cell.methods import is_oracle
 from benchmarks.cell.metrics import METRICS
+from benchmarks.cell.registry import is_oracle
+from benchmarks.cell.schema import CellConfig, CellResult
 from benchmarks.suites.suites import capture_name
 from synth.person.cast import VALIDATION
 
 COLUMNS = (
-    "scene",
-    "method",
-    "seed",
-    "split",
-    "region",
-    "metric",
-    "value",
-    "unit",
-    "direction",
-    "protocol",
-    "subject",
-    "capture",
+    *("scene", "method", "seed", "split", "region", "metric", "value", "unit", "direction", "protocol"),
+    *("subject", "capture"),
 )
 KEYS = ["scene", "method", "split", "region", "metric"]
 PLACE = re.compile(r"(?P<scene>\S+)(?: (?P<axis>\w+)=(?P<severity>\S+))?")  # `CellConfig.place`

@@ -18,7 +18,7 @@ Verdict = Literal["better", "worse", "equivalent", "unclear"]
 Samples = Mapping[str, Sequence[float]]  # values by capture, one for each seed
 
 LEVEL, ALPHA, POWER = 0.95, 0.05, 0.8
-ROUNDING = 1e-12  # a spread of this share of the difference
+ROUNDING = 1e-12  # as a share of the values: a smaller spread is none
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -67,36 +67,35 @@ def compare_samples(
     shared = [capture for capture in a if capture in b]
     if not shared:
         return None
-    if len(shared) > 1:
+    if pairs := len(shared) > 1:
         first, second = ([float(np.mean(samples[capture])) for capture in shared] for samples in (a, b))
-        spread = float(np.std(np.subtract(first, second), ddof=1))
     else:
         first, second = list(a[shared[0]]), list(b[shared[0]])
-        spread = math.nan
-        if min(len(first), len(second)) > 1:
-            spread = math.sqrt((float(np.var(first, ddof=1)) + float(np.var(second, ddof=1))) / 2)
     mean = float(np.mean(first) - np.mean(second))
     comparison = Comparison(
-        mean=mean,
-        spread=spread,
-        captures=len(shared) if len(shared) > 1 else 0,
-        margin=margin,
-        higher_is_better=higher_is_better,
+        mean=mean, captures=len(shared) if pairs else 0, margin=margin, higher_is_better=higher_is_better
     )
-    if math.isnan(spread):
+    if min(len(first), len(second)) < 2:
         return comparison
-    if spread <= ROUNDING * abs(mean) or spread == 0:
+    if pairs:
+        spread = float(np.std(np.subtract(first, second), ddof=1))
+        error, freedom = spread / math.sqrt(len(first)), len(first) - 1.0
+    else:
+        variances = [float(np.var(values, ddof=1)) for values in (first, second)]
+        parts = [variance / len(values) for variance, values in zip(variances, (first, second), strict=True)]
+        spread, error = math.sqrt(sum(variances) / 2), math.sqrt(sum(parts))
+        squares = sum(part**2 / (len(values) - 1) for part, values in zip(parts, (first, second), strict=True))
+        freedom = error**4 / squares if squares else 1.0
+    if spread <= ROUNDING * max(map(abs, [*first, *second])):
         return replace(comparison, low=mean, high=mean, p=float(mean == 0), spread=0.0, detectable=0.0)
-    test = stats.ttest_rel(first, second) if comparison.captures else stats.ttest_ind(first, second, equal_var=False)
-    interval = test.confidence_interval(level)
-    quantile = float(stats.t.ppf((1 + level) / 2, test.df))
-    error = (float(interval.high) - float(interval.low)) / (2 * quantile)
+    quantile = float(stats.t.ppf((1 + level) / 2, freedom))
     return replace(
         comparison,
-        low=float(interval.low),
-        high=float(interval.high),
-        p=float(test.pvalue),
-        detectable=_noncentrality(float(test.df), quantile) * error,
+        low=mean - quantile * error,
+        high=mean + quantile * error,
+        p=float(2 * stats.t.sf(abs(mean) / error, freedom)),
+        spread=spread,
+        detectable=_noncentrality(freedom, quantile) * error,
     )
 
 

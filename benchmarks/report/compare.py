@@ -13,8 +13,8 @@ from benchmarks.analysis.error_attribution import psnr_of
 from benchmarks.analysis.results import RANKED_SPLITS, Quantity, foreground, load, samples_of
 from benchmarks.analysis.statistics import compare_samples, corrected
 from benchmarks.analysis.style import SPLIT_NAMES
-from benchmarks.cell.cells import Cell, CellResult, read_result
 from benchmarks.cell.metrics import METRICS
+from benchmarks.cell.schema import Cell, CellResult, read_result
 from benchmarks.report import pictures
 from benchmarks.report.content import Block, Mark, Report, Section, Strip, Strips, Table, Text
 from benchmarks.report.page import render
@@ -25,7 +25,7 @@ NAMES = ("Before", "After")
 ABOUT = (
     "In brackets: the 95 % interval of the change, over seeds, or in pairs over subjects where both have several. "
     "Better or worse: p below 5 % after Holm's correction over all rows, and a change above the metric's margin. "
-    "Equivalent: the interval lies within that margin, or the predictions are identical. n/a: in one run only."
+    "Equivalent: the interval lies within that margin, or the predictions are identical. n/a: one value only."
 )
 NO_PICTURES = "No pictures: the capture or the stored predictions are missing."
 QUANTITIES = (
@@ -78,7 +78,7 @@ def write_comparison(before: Run, after: Run, out: Path) -> str:
 def changes(before: Rows, after: Rows) -> pd.DataFrame:
     """Every quantity of every row of either run: `COLUMNS`; p is corrected over all of them.
 
-    Verdict: on the run after; empty where one of the runs lacks the row.
+    Verdict: on the run after; empty where one of the runs lacks the row, or each has one value.
     """
     rows, tests = [], []
     for scene, method in dict.fromkeys([*before, *after]):
@@ -102,8 +102,9 @@ def changes(before: Rows, after: Rows) -> pd.DataFrame:
     records = []
     for row, (test, same) in zip(rows, tests, strict=True):
         each = None if test is None else next(corrected_tests)
-        numbers = [None] * 5 if each is None else [each.mean, each.low, each.high, each.p, each.verdict]
-        records.append([*row, *numbers[:4], "equivalent" if same else numbers[4] or ""])
+        verdict = "equivalent" if same else "" if each is None or pd.isna(each.p) else each.verdict
+        numbers = [None] * 4 if each is None else [each.mean, each.low, each.high, each.p]
+        records.append([*row, *numbers, verdict])
     return pd.DataFrame(records, columns=COLUMNS)
 
 

@@ -1,5 +1,6 @@
 """What a report says of one scene: findings, tables, charts and pictures."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import pandas as pd
@@ -11,30 +12,17 @@ from benchmarks.analysis import differences, paper
 from benchmarks.analysis.error_attribution import REGIONS
 from benchmarks.analysis.results import HELD_OUT_SPLITS, MOTION_SPLITS, RANKED_SPLITS, Quantity, RunTables, foreground
 from benchmarks.analysis.style import SPLIT_NAMES, is_ours, style_of
-from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS
+from benchmarks.cell.schema import CellResult
 from benchmarks.report import charts, figures, people, pictures, sentences, tables, vega
 from benchmarks.report.content import Block, Bullets, Flipbook, Mark, Section, Strips, Table, Text
 from benchmarks.report.pictures import Album, Shown
 from benchmarks.report.vega import Figure
 from benchmarks.suites.runs import Run
 
-IMAGE_SPLITS = (*RANKED_SPLITS, "train_view")  # in the order of the columns
 COSTS = (
-    "frame_ms",
-    "stg1_ms",
-    "stg2_ms",
-    "stg3_ms",
-    "stg4_ms",
-    "train_s",
-    "train_cpu_s",
-    "settled_s",
-    "steps",
-    "train_cameras",
-    "train_frames",
-    "peak_rss_mb",
-    "params",
-    "gaussians",
+    *("frame_ms", "stg1_ms", "stg2_ms", "stg3_ms", "stg4_ms", "train_s", "train_cpu_s", "settled_s", "steps"),
+    *("train_cameras", "train_frames", "peak_rss_mb", "params", "gaussians"),
 )
 ON_SHEETS = ("ash", "ddc", "ash_truth", "ddc_truth")
 AT_MOST_ON_SHEETS = 5
@@ -102,8 +90,9 @@ def scene_report(data: SceneData) -> SceneReport:
     seen = [Text(text=each, note=True) for each in sentences.training_views(run_tables, scene)]
     asked = [foreground("train_view"), *tables.quality_columns(("psnr", "gap", "ssim", "flip", "lpips", "iou"))]
     quality = tables.build(run_tables, scene, asked, title=f"Accuracy on {scene}", exposed=exposed)
-    cost = tables.build(run_tables, scene, tables.cost_columns(COSTS), title=f"Cost on {scene}", exposed=exposed)
-    more = _more_tables(run_tables, scene)
+    costs = tables.cost_columns(COSTS)
+    cost = tables.build(run_tables, scene, costs, title=f"Cost on {scene}", exposed=exposed)
+    more = _other_numbers(run_tables, scene, [*asked, *costs])
     ranked = differences.differences(run_tables, scenes=(scene,))
     note = " ".join(
         (QUALITY_NOTE, *((APART_NOTE,) if quality.below else ()), VALUES_NOTE, detectable(run_tables, scene, ranked))
@@ -225,21 +214,14 @@ def _untitled(table: Table) -> Table:
     return Table(frame=table.frame, marks=table.marks, below=table.below)
 
 
-def _more_tables(run_tables: RunTables, scene: str) -> tuple[Table, ...]:
-    geometry = [Quantity(split, "", metric) for split in HELD_OUT_SPLITS for metric in ("template_mm", "surface_mm")]
-    geometry.append(foreground("novel_pose", "flicker"))
-    regions = (("full", "psnr"), ("release_crop", "psnr"), ("full", "ssim"), ("full", "flip"))
-    whole = [Quantity(split, region, metric) for split in IMAGE_SPLITS for region, metric in regions]
-    rest = [foreground("train_view", metric) for metric in ("psnr", "ssim", "flip")]
-    rest += [foreground(split, "noise_ceiling") for split in (*HELD_OUT_SPLITS, "train_view")]
-    rest += [Quantity(split, "", "novelty_deg") for split in MOTION_SPLITS]
-    asked = {
-        "Geometry against the truth, and flicker beyond the truth's own": geometry,
-        "Whole frame, and the crop of the released ASH code": whole,
-        "Training views, the noise ceiling of the renders, and the novelty of poses": rest,
-    }
-    built = [tables.build(run_tables, scene, quantities, title=title) for title, quantities in asked.items()]
-    return tuple(table for table in built if table.heads)
+def _other_numbers(run_tables: RunTables, scene: str, shown: Sequence[Quantity]) -> tuple[Table, ...]:
+    """All quantities of the scene that no other table has, a table per split."""
+    keys = run_tables.of(scene)[["split", "region", "metric"]].drop_duplicates().itertuples(index=False)
+    quantities = [Quantity(*key) for key in keys if Quantity(*key) not in shown and key.metric != "failed"]
+    by_title: dict[str, list[Quantity]] = {SPLIT_NAMES[split].title: [] for split in SPLIT_NAMES}
+    for quantity in quantities:
+        by_title[SPLIT_NAMES[quantity.split].title].append(quantity)
+    return tuple(tables.build(run_tables, scene, own, title=title) for title, own in by_title.items() if own)
 
 
 def _conventions(run_tables: RunTables, scene: str) -> tuple[Block, ...]:

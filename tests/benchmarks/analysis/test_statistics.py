@@ -74,6 +74,10 @@ def test_without_any_spread_what_differs_is_significant() -> None:
     assert compared(seeds(1.0, 1.0), seeds(1.0, 1.0)).verdict == "equivalent"
     assert compared(seeds(2.0, 2.0), seeds(1.0, 1.0)).p == 0
     assert compared(captures(2.0, 3.0), captures(1.0, 2.0)).low == 1
+    constant = compared(seeds(1.0, 1.0, 1.0), seeds(2.0, 2.1, 2.3))
+    assert constant.p == pytest.approx(stats.ttest_1samp([2.0, 2.1, 2.3], 1.0).pvalue), "one side does not vary"
+    rounded = compared(seeds(0.1 + 0.2, 0.3), seeds(1.1 + 2.2, 3.3))
+    assert (rounded.low, rounded.p) == (rounded.mean, 0.0), "what differs by rounding does not vary"
 
 
 @pytest.mark.parametrize(
