@@ -84,9 +84,7 @@ class ExportCommand:
     split: str | None = None  # nerfstudio, colmap: train (default), novel_view, near_pose, novel_pose or far_pose
     frame: int | None = None  # nerfstudio, colmap: only this frame of the split
     motion: str = "test"  # avatars: test, train, walk, dance and so on, or a BVH or AMASS file
-    frames: Stretch = (
-        None  # avatars: A:B of the motion, from 0, B not included; default: all, of ply, spz, gltf the first
-    )
+    frames: Stretch = None  # avatars: of the motion, B not included; default: all, of ply, spz and gltf the first
     methods: Names = ()  # avatars: only these of a run
     scene: str | None = None  # avatars: of a run with several; default: its first
     trust: Trust = False  # avatars: load methods that are not ours too: their code runs here, without isolation
@@ -104,6 +102,8 @@ class ExportCommand:
         from synth.export.formats import FORMATS as OF_CAPTURES
 
         capture = is_capture(self.source)
+        if not capture and not any((self.source / name).exists() for name in ("run.json", "config.json", "cells")):
+            raise InputError(f"{self.source}: expected the folder of a capture, a run or a cell")
         if not capture and self.form in OLD_FORMATS:
             return replace(self, form=OLD_FORMATS[self.form])()
         allowed, kind = (OF_CAPTURES, "a capture") if capture else (OF_AVATARS, "a trained avatar")
@@ -113,8 +113,7 @@ class ExportCommand:
         self._require_options_of_format()
         if capture:
             return self._export_capture(self.out or self.source.with_name(f"{self.source.name}-{self.form}"))
-        suffix = suffix_of(self.form, self.out or Path())
-        return self._export_avatar(self.out or Path(f"{self.source.resolve().name}{suffix}"), suffix)
+        return self._export_avatar(suffix_of(self.form, self.out or Path()))
 
     def _require_options_of_format(self) -> None:
         """An option that the format does not know is refused, and not ignored."""
@@ -143,34 +142,41 @@ class ExportCommand:
             print((folder / "ABOUT.txt").read_text(), end="", file=sys.stderr)
         return DONE
 
-    def _export_avatar(self, out: Path, suffix: str) -> int:
+    def _export_avatar(self, suffix: str) -> int:
         from benchmarks.export.formats import FRAMES
         from benchmarks.play.avatars import open_avatars
         from benchmarks.play.motions import frames_in, motion_clip
 
-        write = {"bvh": self._write_bvh, "mp4": self._write_video, "html": self._write_page}.get(self.form)
+        one_file = {"bvh": self._write_bvh, "mp4": self._write_video, "html": self._write_page}
         with open_avatars(self.source, scene=self.scene, methods=self.methods, trust=self.trust) as avatars:
             clip = motion_clip(avatars.capture, self.motion)
-            if self.form in FRAMES:
-                self._write_frames(avatars, clip, frames_in(clip, self.frames or "0"), out, suffix)
-                print(out)
-            elif write is not None:
-                frames = frames_in(clip, self.frames)
-                write(avatars, clip, frames, out)
-                print(f"{out}: {len(frames)} frames, {out.stat().st_size / 1e6:.1f} MB")
+            frames = frames_in(clip, self.frames or ("0" if self.form in FRAMES else None))
+            out = self.out or Path(self.source.resolve().name)
+            if self.form in FRAMES and len(frames) > 1:
+                out = out if self.out else Path(f"{out}-{self.form}")
+                self._write_frames(avatars, clip, frames, out, suffix)
+                print(f"{out}: {len(frames)} files")
+                return DONE
+            out = out if out.suffix else out.with_name(f"{out.name}{suffix}")
+            one_file.get(self.form, self._write_frame)(avatars, clip, frames, out)
+        print(f"{out}: {len(frames)} frame{'s' if len(frames) > 1 else ''}, {out.stat().st_size / 1e6:.1f} MB")
         return DONE
 
-    def _write_frames(
-        self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], out: Path, suffix: str
-    ) -> None:
-        """One frame into a file, or several into a folder, each named by its number in the capture or the file."""
+    def _write_frame(self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], out: Path) -> None:
         from benchmarks.export.formats import frame_bytes
 
         loaded = avatars.only()
+        pose = Pose(clip.motion, frames[0])
+        write_atomic(out, frame_bytes(loaded.avatar, pose, suffix=out.suffix, title=loaded.title))
+
+    def _write_frames(
+        self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], folder: Path, suffix: str
+    ) -> None:
+        """A file for each frame, named by the frame's number in the capture or in the motion's file."""
+        if folder.suffix:
+            raise InputError(f"{folder}: expected a folder for {len(frames)} frames, got a name with a suffix")
         for frame in frames:
-            path = out if len(frames) == 1 else out / f"{frame:06d}{suffix}"
-            pose = Pose(clip.motion, frame)
-            write_atomic(path, frame_bytes(loaded.avatar, pose, suffix=suffix, title=loaded.title))
+            self._write_frame(avatars, clip, (frame,), folder / f"{frame:06d}{suffix}")
 
     def _write_bvh(self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], out: Path) -> None:
         from benchmarks.export.bvh import bvh_bytes

@@ -2,7 +2,7 @@
 
 viser by itself listens on every address, asks for no token, checks neither Host nor Origin, opens a public tunnel for
 any client that asks, and accepts uploads. Here it listens on the loopback address; every request needs a random token
-and an exact Host, every WebSocket an exact Origin too; four kinds of messages are handled, all others are dropped;
+and an exact Host, every WebSocket an exact Origin too; three kinds of messages are handled, all others are dropped;
 messages are small, and clients few. The hooks are viser's private ones: its version is pinned, and each is tested.
 """
 
@@ -28,12 +28,11 @@ from websockets.http11 import Request, Response
 
 from ash.files import InputError
 
-# Camera, sliders and buttons, hot keys, and a click on a camera's frustum.
+# Camera, sliders and buttons, and hot keys.
 ALLOWED_MESSAGES = (
     messages.ViewerCameraMessage,
     messages.GuiUpdateMessage,
     messages.CommandTriggerMessage,
-    messages.SceneNodeClickMessage,
 )
 MAX_MESSAGE = 64 << 10  # bytes; a click is a few hundred
 ANY_ADDRESS = ("0.0.0.0", "::")
@@ -68,11 +67,6 @@ class Auth:
     cookie: str = field(default_factory=lambda: f"ash_bench_{secrets.token_hex(4)}")
     origins: frozenset[str] = frozenset()
     connected: int = 0
-
-    @property
-    def is_full(self) -> bool:
-        """No further client may connect."""
-        return self.connected >= self.options.clients
 
 
 def require_safe(options: AuthOptions) -> None:
@@ -144,12 +138,10 @@ def _bracketed(host: str) -> str:
 
 
 def _is_free(host: str, port: int) -> bool:
-    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM) as trial:
-        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            trial.bind((host, port))
-        except OSError:
-            return False
+    try:
+        socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
+    except OSError:
+        return False
     return True
 
 
@@ -167,7 +159,7 @@ def _protected(auth: Auth) -> Iterator[None]:
 
     def guarded(handler: Callable[[Any], Awaitable[None]], *args: Any, **options: Any) -> Any:
         async def limited(connection: Any) -> None:
-            if auth.is_full:
+            if auth.connected >= auth.options.clients:
                 await connection.close(1013, f"at most {auth.options.clients} viewers")
                 return
             auth.connected += 1
@@ -194,7 +186,8 @@ def respond(auth: Auth, connection: Any, request: Request, page: Callable[[Any, 
     if reason is not None:
         return _plain(http.HTTPStatus.FORBIDDEN, reason)
     if _is_websocket(request):
-        return _plain(http.HTTPStatus.SERVICE_UNAVAILABLE, "too many viewers") if auth.is_full else None
+        is_full = auth.connected >= auth.options.clients
+        return _plain(http.HTTPStatus.SERVICE_UNAVAILABLE, "too many viewers") if is_full else None
     url = urlsplit(request.path)
     if url.path != "/":
         return _plain(http.HTTPStatus.NOT_FOUND, "there is one page: /")
@@ -233,9 +226,8 @@ def _is_websocket(request: Request) -> bool:
 
 
 def _plain(status: http.HTTPStatus, text: str) -> Response:
-    body = text.encode()
-    headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)), **SAFE_HEADERS})
-    return Response(status.value, status.phrase, headers, body)
+    headers = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(text.encode())), **SAFE_HEADERS}
+    return Response(status.value, status.phrase, Headers(headers), text.encode())
 
 
 def _drop_other_messages(handler: viser.infra.WebsockMessageHandler) -> None:

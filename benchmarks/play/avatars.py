@@ -28,9 +28,9 @@ from ash.gaussians.splatting import Splatted, splat
 from ash.model import blend_renders, image_of, views_of
 from ash.protocol import Avatar, PosedGeometry, PosesGaussians, StageClock
 from benchmarks.analysis.style import style_of
-from benchmarks.cell.cells import CHECKPOINT, Cell, is_trained, read_cell
-from benchmarks.cell.methods import is_oracle
-from benchmarks.cell.process import load_avatar as open_avatar
+from benchmarks.cell.registry import is_oracle
+from benchmarks.cell.run import load_avatar as open_avatar
+from benchmarks.cell.schema import CHECKPOINT, Cell, is_trained, read_cell
 from benchmarks.play.motions import motion_clip
 from benchmarks.suites.runs import RUN_FILE, read_run
 
@@ -39,7 +39,6 @@ Components = list[tuple[float, Gaussians]]  # sets of Gaussians whose pictures a
 
 CACHED_POSES = 48  # A short motion that is repeated, or a camera that turns, decodes nothing twice.
 NOT_FINITE = "the rendered image holds NaN or infinity"
-ELLIPSOID_SCALE = 0.4  # of its standard deviations: the size of a Gaussian that is shown as an ellipsoid
 
 
 class LoadedAvatar:
@@ -91,24 +90,11 @@ class LoadedAvatar:
             return image_of(self._splat(components, camera, None))
 
     @torch.no_grad()
-    def on_colour(
-        self, pose: Pose, camera: Camera, clock: StageClock, background: Colour, *, ellipsoids: bool = False
-    ) -> np.ndarray:
-        """The picture over a colour, uint8 `[h, w, 3]`, at less cost; or each Gaussian as a small opaque ellipsoid.
-
-        Raises:
-            InputError: ellipsoids of an avatar that has no Gaussians.
-        """
+    def on_colour(self, pose: Pose, camera: Camera, clock: StageClock, background: Colour) -> np.ndarray:
+        """The picture over a colour, uint8 `[h, w, 3]`, at less cost than the one that is scored."""
         if not isinstance(self.avatar, PosesGaussians):
-            if ellipsoids:
-                raise InputError(f"{self.title} has no Gaussians to show as ellipsoids")
             return composite(self.premultiplied(pose, camera, clock), background)
         components = self._components(pose, clock)
-        if ellipsoids:
-            components = [
-                (weight, replace(all_, scales=ELLIPSOID_SCALE * all_.scales, opacities=(all_.opacities > 0.1).float()))
-                for weight, all_ in components
-            ]
         with clock.stage("stg4"):
             rgb = self._splat(components, camera, torch.tensor(background) / 255).rgb[0]
             if not math.isfinite(float(rgb.sum())):

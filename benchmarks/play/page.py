@@ -1,4 +1,4 @@
-"""The panel beside the picture: what a viewer can turn, in words for somebody who never read the paper."""
+"""The panel beside the picture, in words for somebody who never read the paper, and the camera of its browser."""
 
 import json
 import time
@@ -7,26 +7,31 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import viser
 import viser._messages as messages
+from scipy.spatial.transform import Rotation
 
-from benchmarks.play.camera_control import CameraControl
-from benchmarks.play.cameras import FREE, SPIRAL
-from benchmarks.play.joints import FREE_DEG, ORDER, Angles, angles_of, ranges_of
-from benchmarks.play.rendering import (
-    ABSOLUTE,
-    FLIP,
-    NO_ERROR,
-    NOTHING,
-    TRUTH,
-    RenderedView,
-    ViewRenderer,
-    ViewState,
+from ash.capture.dataset import Camera, Capture
+from benchmarks.play.cameras import (
+    FREE,
+    SPIRAL,
+    Viewpoint,
+    distance_between,
+    fov_of,
+    middle_of,
+    resized,
+    start_position,
 )
+from benchmarks.play.motions import EULER, EULER_DEG, Angles, angles_of
+from benchmarks.play.rendering import NOTHING, TRUTH, RenderedView, ViewRenderer, ViewState
 from benchmarks.play.viewer import Viewer, may_be_closed
 
 NUMBERS_SECONDS = 0.3  # between two changes of the line of numbers, so that it can be read
 SPEEDS = {"1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0}
+SETTLE_SECONDS = 0.6  # after a jump, in which the browser may still report its old camera
+SAME_M, SAME_RAD = 0.01, 0.01  # errors of a browser's numbers
+NARROW = 0.75  # width by height
 NO_JOINT = "(choose a joint)"
 BACK, TOGGLE, AHEAD = "◀", "Play / pause", "▶"
 
@@ -109,8 +114,6 @@ class Page:
         hint = "Yours, the paper's spiral around the person, or one of the capture's. Key: C"
         self._camera = self._gui.add_dropdown("Camera", self._camera_names(), initial_value=FREE, hint=hint)
         self._on(self._camera, lambda value: self.cameras.jump(str(value)))
-        frustums = self._gui.add_checkbox("Show cameras", False, hint="Click on one to look through it.")
-        self._on(frustums, lambda value: self.cameras.show_frustums(bool(value)))
 
     def _camera_names(self) -> list[str]:
         """Held-out cameras first: of them the truth of the held-out motion is known."""
@@ -125,10 +128,9 @@ class Page:
         choices, hint = [NOTHING, TRUTH, *titles], "Another method, or the path-traced truth. Key: T"
         self._right = self._gui.add_dropdown("Beside it", choices, initial_value=NOTHING, hint=hint)
         self._on(self._right, lambda value: self._choose_right(str(value)))
-        hint = "Bright is wrong. FLIP is how visible it is to people. Where the truth is known. Key: E"
-        errors = [NO_ERROR, ABSOLUTE, FLIP]
-        self._error = self._gui.add_dropdown("Show the error", errors, initial_value=NO_ERROR, hint=hint)
-        self._sets(self._error, "error", str)
+        hint = "FLIP, where the truth is known: bright is where people see that it is wrong. Key: E"
+        self._error = self._gui.add_checkbox("Show the error", False, hint=hint)
+        self._on(self._error, lambda value: self._show_error(bool(value)))
         hint = "Path-traces this pose from this side; takes some seconds."
         self._gui.add_button("Render truth here", hint=hint).on_click(lambda _: self._ask_truth())
         self._progress = self._gui.add_progress_bar(0, visible=False, animated=True)
@@ -142,8 +144,9 @@ class Page:
         self._joint = self._gui.add_dropdown("Joint", choices, initial_value=NO_JOINT, hint=hint)
         self._on(self._joint, lambda _: self._choose_joint())
         self._sliders = []
-        for number, axis in enumerate(ORDER.lower()):
-            slider = self._gui.add_slider(f"About {axis}", -FREE_DEG, FREE_DEG, 0.5, 0.0, visible=False)
+        hint = "Degrees about an axis of the resting person: x to the left, y up, z to the front."
+        for number, (axis, most) in enumerate(zip(EULER.lower(), EULER_DEG, strict=True)):
+            slider = self._gui.add_slider(f"About {axis}", -most, most, 0.5, 0.0, visible=False, hint=hint)
             self._on(slider, lambda value, number=number: self._turn(number, float(value)))
             self._sliders.append(slider)
         self._reset_joint = self._gui.add_button("Reset this joint", visible=False)
@@ -154,7 +157,6 @@ class Page:
         for name, label, hint in (
             ("mesh", "Template mesh", "The surface that carries the Gaussians."),
             ("skeleton", "Skeleton", "The joints that the pose turns."),
-            ("ellipsoids", "Gaussians as ellipsoids", "Each one small and opaque, so that single ones can be seen."),
         ):
             self._sets(self._gui.add_checkbox(label, False, hint=hint), name, bool)
         hint = "Page and background; at first as your system has it. Keys: D and L"
@@ -172,9 +174,8 @@ class Page:
             ("Truth beside it", "T", lambda: self._next(self._right, [NOTHING, TRUTH], self._choose_right)),
             ("Dark", "D", lambda: self._darken(True)),
             ("Light", "L", lambda: self._darken(False)),
-            ("Error", "E", lambda: self._next(
-                self._error, [NO_ERROR, ABSOLUTE, FLIP], lambda value: self._set(error=value))),
-        ):  # fmt: skip
+            ("Error", "E", lambda: self._show_error(not self.viewer.state.error)),
+        ):
             command = self._gui.add_command(label, hotkey=key)  # type: ignore[arg-type]
             command.on_trigger(lambda _, action=action: action())
 
@@ -228,28 +229,21 @@ class Page:
         return None if self._joint.value == NO_JOINT else self._joint_names.index(self._joint.value)
 
     def _choose_joint(self) -> None:
-        joint = self._joint_index()
-        self._reset_joint.visible = joint is not None
-        ranges = (None,) * len(ORDER) if joint is None else ranges_of(self._capture.skeleton.names[joint])
-        for slider, limits in zip(self._sliders, ranges, strict=True):
-            slider.visible = limits is not None
-            if limits is not None:
-                slider.min, slider.max, slider.label = limits.low, limits.high, limits.more.capitalize()
-                slider.hint = f"Degrees: {limits.high:g} {limits.more}, {limits.low:g} {limits.less}."
+        for control in (self._reset_joint, *self._sliders):
+            control.visible = self._joint_index() is not None
         self._show_angles(self.viewer.state)
 
     def _show_angles(self, state: ViewState) -> None:
-        """Set the sliders to the chosen joint's angles; to an end, where the motion goes beyond."""
+        """Set the sliders to the chosen joint's angles."""
         joint = self._joint_index()
         for slider, angle in zip(self._sliders, self._angles(state, joint) if joint is not None else (), strict=False):
-            slider.value = min(max(angle, slider.min), slider.max)
+            slider.value = angle
         self._angles_of = joint, state.clip, state.step
 
     def _angles(self, state: ViewState, joint: int) -> Angles:
         """The angles that the viewer gave a joint, or those of the motion."""
         clip = self._clips[state.clip]
-        rotvec = clip.motion.dofs[clip.frames[state.step], 3 + 3 * joint : 6 + 3 * joint]
-        return dict(state.turned).get(joint) or angles_of(self._capture.skeleton, joint, rotvec)
+        return dict(state.turned).get(joint) or angles_of(clip.motion, clip.frames[state.step], joint)
 
     def _turn(self, number: int, degrees: float) -> None:
         joint = self._joint_index()
@@ -259,6 +253,10 @@ class Page:
 
     def _reset(self, joint: int | None) -> None:
         self._show_angles(self.viewer.change(lambda state: state.without_joint(joint)))
+
+    def _show_error(self, wanted: bool) -> None:
+        self._error.value = wanted
+        self._set(error=wanted)
 
     def _darken(self, dark: bool) -> None:
         self._dark.value = dark
@@ -310,3 +308,71 @@ def _escaped(text: str) -> str:
     for mark in "\\`*_{}[]<>#|":
         text = text.replace(mark, f"\\{mark}" if mark != "<" else "&lt;")
     return text
+
+
+class CameraControl:
+    """Moves a browser's camera, and follows it."""
+
+    def __init__(self, viewer: Viewer, capture: Capture, on_choice: Callable[[str], None]) -> None:
+        """`on_choice` gets the name of the camera that the viewer looks through once the view was turned."""
+        self._viewer, self._capture, self._on_choice = viewer, capture, on_choice
+        self._client = viewer.client
+        self._jumped: tuple[float, np.ndarray] | None = None
+        self._client.camera.on_update(self._moved)
+        first = viewpoint_of(self._client.camera)  # Sent before anybody listened; it may never be sent again.
+        viewer.change(lambda state: replace(state, viewpoint=state.viewpoint or first))
+        if (
+            first is not None and first.width < NARROW * first.height
+        ):  # On a narrow screen the arms stay in the picture.
+            middle, start = middle_of(capture), start_position(capture)
+            with self._client.atomic():
+                self._client.camera.position = middle + (start - middle) * NARROW * first.height / first.width
+                self._client.camera.look_at = middle
+
+    def jump(self, name: str) -> None:
+        """Look through one of the capture's cameras, follow the spiral, or look around freely from here."""
+        own, window = self._capture.cameras.get(name), self._viewer.state.viewpoint
+        if own is not None and window is not None:
+            self._place_browser(resized(own, width=window.width, height=window.height))
+        self._viewer.change(lambda state: replace(state, camera=name))
+
+    def _place_browser(self, camera: Camera) -> None:
+        """Put the browser's own camera there, so that turning goes on from it."""
+        forward = camera.viewmat[2, :3]
+        depth = max(float(forward @ (middle_of(self._capture) - camera.position)), 0.1)
+        self._jumped = time.perf_counter(), camera.viewmat
+        with self._client.atomic():
+            self._client.camera.fov = fov_of(camera)
+            self._client.camera.up_direction = (0.0, 1.0, 0.0)
+            self._client.camera.position = camera.position
+            self._client.camera.look_at = camera.position + depth * forward
+
+    async def _moved(self, camera: viser.CameraHandle) -> None:
+        """The browser has sent its camera."""
+        now, before = viewpoint_of(camera), self._viewer.state.viewpoint
+        if now is None:
+            return
+        resized_only = before is None or np.array_equal(now.viewmat, before.viewmat)
+        stays = self._is_where_it_jumped(now) or resized_only
+        state = self._viewer.change(lambda s: replace(s, viewpoint=now, camera=s.camera if stays else FREE))
+        self._on_choice(state.camera)
+
+    def _is_where_it_jumped(self, now: Viewpoint) -> bool:
+        if self._jumped is None or self._viewer.state.camera not in self._capture.cameras:
+            return False
+        when, viewmat = self._jumped
+        moved, turned = distance_between(viewmat, now.viewmat)
+        return time.perf_counter() - when < SETTLE_SECONDS or (moved < SAME_M and turned < SAME_RAD)
+
+
+def viewpoint_of(camera: viser.CameraHandle) -> Viewpoint | None:
+    """The view of a browser's camera; None for numbers that no camera has."""
+    if camera.image_width < 16 or camera.image_height < 16 or not 0.01 < camera.fov < 3.0:
+        return None
+    if not (np.isfinite(camera.position).all() and np.isfinite(camera.wxyz).all() and np.linalg.norm(camera.wxyz) > 0):
+        return None
+    rotation = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix().T
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ camera.position
+    width, height = min(int(camera.image_width), 8192), min(int(camera.image_height), 8192)
+    return Viewpoint(viewmat=viewmat, fov=float(camera.fov), width=width, height=height)

@@ -57,13 +57,14 @@ class PlayServer:
         page = Page(viewer, self.renderer, self._render_truth)
         with self._lock:
             self.pages[client.client_id] = page
-        self.drawing.add(viewer)
+        self.drawing.viewers.append(viewer)
+        self.drawing.wake()
 
     def _disconnected(self, client: viser.ClientHandle) -> None:
         with self._lock:
             page = self.pages.pop(client.client_id, None)
-        if page is not None:
-            self.drawing.remove(page.viewer)
+        if page is not None and page.viewer in self.drawing.viewers:
+            self.drawing.viewers.remove(page.viewer)
 
     def _render_truth(self, viewer: Viewer) -> str:
         """Begin to path-trace what a viewer sees."""

@@ -14,19 +14,17 @@ from ash.protocol import StageClock
 from benchmarks.cell import metrics
 from benchmarks.play.avatars import AvatarSet, Colour, composite
 from benchmarks.play.cameras import FREE, SPIRAL, Viewpoint, resized, spiral_camera
-from benchmarks.play.joints import Angles, with_angles
-from benchmarks.play.motions import MotionClip
+from benchmarks.play.motions import Angles, MotionClip, with_angles
 from benchmarks.play.truth import PoseKey, TruthCache, TruthPicture
 from synth.posing import bone_frames
 
 NOTHING, TRUTH = "nothing", "the truth"
-NO_ERROR, ABSOLUTE, FLIP = "no", "absolute", "FLIP"
 LIGHT, DARK = (236, 236, 236), (24, 26, 30)  # behind the subject
 MESH, BONE, JOINT, TURNED_JOINT = (47, 111, 222), (221, 107, 32), (255, 255, 255), (255, 60, 60)
 LINE = 1 / 900  # of the picture's height: the width of a triangle's outline, at least a pixel
 FADE_WIDTHS = 6.0  # outlines fade where a triangle is narrower than so many of them: a dense mesh hides nothing
-ERROR_WHITE = {ABSOLUTE: 0.3, FLIP: 0.7}  # the error at which the map's colours end
-ERROR_SHOWN = 0.02  # from here on an error beside the person is shown
+FLIP_WHITE = 0.7  # the error at which the map's colours end
+FLIP_SHOWN = 0.02  # from here on an error beside the person is shown
 UNKNOWN_TRUTH = (
     "No truth of this view yet: press *Render truth here* under *Compare*, "
     "or look through one of the capture's cameras."
@@ -48,10 +46,9 @@ class ViewState:
     left: str  # an avatar
     right: str = NOTHING  # nothing, the truth, or another avatar
     divider: float = 0.5  # share of the width that is the left one's
-    error: str = NO_ERROR
+    error: bool = False  # the map of FLIP in place of the avatars
     mesh: bool = False
     skeleton: bool = False
-    ellipsoids: bool = False
     turned: tuple[tuple[int, Angles], ...] = ()  # joints that the viewer turned, and their angles
     dark: bool = False
     camera: str = FREE  # or spiral, or one of the capture's
@@ -110,11 +107,11 @@ class ViewRenderer:
         """
         camera, pose = self.camera(state, width=width, height=height), self.pose(state)
         truth = self.truths.find(self.pose_key(state), self.clips[state.clip], camera)
-        unknown = truth is None and (state.error != NO_ERROR or state.right == TRUTH)
+        unknown = truth is None and (state.error or state.right == TRUTH)
         note, clock = UNKNOWN_TRUTH if unknown else "", StageClock()
         pixels = left = self._side(state, state.left, pose, truth, camera, clock)
         if state.right == TRUTH:
-            empty = _blank(camera, state, "No truth of\nthis view yet")
+            empty = np.full_like(left, state.background)
             pixels = _divided(left, empty if truth is None else fitted(truth, camera, state.background), state)
         elif state.right != NOTHING:
             pixels = _divided(left, self._side(state, state.right, pose, truth, camera, StageClock()), state)
@@ -130,7 +127,7 @@ class ViewRenderer:
         score = ""
         if truth is not None and with_scores:
             titles = [state.left, *([state.right] if state.right in self.avatars.titles else [])]
-            rows = [(title, *self._compared(state, title, pose, truth)[:2]) for title in titles]
+            rows = [(title, *self._compared(title, pose, truth)[:2]) for title in titles]
             score = " · ".join(f"{title} {psnr:.1f} dB, FLIP {flip:.3f}" for title, psnr, flip in rows)
         return RenderedView(pixels=pixels, stage_ms=dict(clock.ms), score=score, note=note)
 
@@ -150,7 +147,7 @@ class ViewRenderer:
         motion, key = clip.motion, (clip.name, state.turned)
         if state.turned:
             if self._turned is None or self._turned[0] != key:
-                self._turned = key, with_angles(motion, self.avatars.capture.skeleton, dict(state.turned))
+                self._turned = key, with_angles(motion, dict(state.turned))
             motion = self._turned[1]
         return Pose(motion, clip.frames[state.step])
 
@@ -168,27 +165,23 @@ class ViewRenderer:
         self, state: ViewState, title: str, pose: Pose, truth: TruthPicture | None, camera: Camera, clock: StageClock
     ) -> np.ndarray:
         """An avatar, or its error where that is wanted and the truth is known."""
-        drawn = self.avatars[title].on_colour(pose, camera, clock, state.background, ellipsoids=state.ellipsoids)
-        if truth is None or state.error == NO_ERROR:
+        drawn = self.avatars[title].on_colour(pose, camera, clock, state.background)
+        if truth is None or not state.error:
             return drawn
-        error = self._compared(state, title, pose, truth)[2]
-        shown = (truth.on_black[..., 3] > 0) | (error > ERROR_SHOWN)
-        heat = np.dstack([_heat(error / ERROR_WHITE[state.error]), np.where(shown, 255, 0).astype(np.uint8)])
+        flip = self._compared(title, pose, truth)[2]
+        shown = (truth.on_black[..., 3] > 0) | (flip > FLIP_SHOWN)
+        heat = np.dstack([_heat(flip / FLIP_WHITE), np.where(shown, 255, 0).astype(np.uint8)])
         return fitted(TruthPicture(camera=truth.camera, on_black=metrics.on_black(heat)), camera, state.background)
 
-    def _compared(
-        self, state: ViewState, title: str, pose: Pose, truth: TruthPicture
-    ) -> tuple[float, float, np.ndarray]:
-        """PSNR and FLIP on the foreground in the truth's own pixels, as the protocol has them; the error's map."""
-        key = (title, truth.key, state.error)
+    def _compared(self, title: str, pose: Pose, truth: TruthPicture) -> tuple[float, float, np.ndarray]:
+        """PSNR and FLIP on the foreground in the truth's own pixels, as the protocol has them; the map of FLIP."""
+        key = (title, truth.key)
         if key not in self._scores:
             drawn = metrics.quantise(self.avatars[title].premultiplied(pose, truth.camera, StageClock()))
             ours, theirs = drawn[..., :3], truth.on_black[..., :3]
             mask, flip = metrics.foreground(truth.on_black), metrics.flip_map(ours, theirs)
-            absolute = np.abs(ours.astype(np.float32) - theirs).mean(axis=-1) / 255
             mean_flip = float(flip[mask].mean()) if mask.any() else 0.0
-            error = absolute if state.error == ABSOLUTE else flip
-            self._scores[key] = metrics.psnr(ours, theirs, mask), mean_flip, error
+            self._scores[key] = metrics.psnr(ours, theirs, mask), mean_flip, flip
             if len(self._scores) > CACHED_SCORES:
                 self._scores.popitem(last=False)
         return self._scores[key]
@@ -212,15 +205,6 @@ def fitted(picture: TruthPicture, camera: Camera, background: Colour) -> np.ndar
         page.paste(whole.resize(size, Image.Resampling.BICUBIC), (left, top))
         sheet[..., channel] = np.asarray(page)
     return composite(sheet, background)
-
-
-def _blank(camera: Camera, state: ViewState, text: str) -> np.ndarray:
-    sheet = Image.new("RGB", (camera.width, camera.height), state.background)
-    free, longest = (1 - state.divider) * camera.width, max(map(len, text.splitlines()))
-    size = max(10, min(camera.height / 32, 1.5 * free / longest))
-    position = (state.divider * camera.width + size, camera.height / 3)  # Above the divider's handle, off the panel.
-    ImageDraw.Draw(sheet).text(position, text, fill=state.ink, font=ImageFont.load_default(size), anchor="lm")
-    return np.asarray(sheet)
 
 
 def _divided(left: np.ndarray, right: np.ndarray, state: ViewState) -> np.ndarray:

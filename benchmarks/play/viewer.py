@@ -83,13 +83,11 @@ class Viewer:
         """When the next picture is wanted, on `time.perf_counter`'s clock."""
         if self._state.viewpoint is None:
             return NEVER
-        if self._dirty or self._is_animated:
-            return self.served + (MIN_INTERVAL if self._dirty or self._state.camera == SPIRAL else self._frame_seconds)
+        if self._dirty or self._state.camera == SPIRAL:
+            return self.served + MIN_INTERVAL
+        if self._state.playing:
+            return self.served + self._frame_seconds
         return NEVER if self._sharp else self._changed + STILL_SECONDS
-
-    @property
-    def _is_animated(self) -> bool:
-        return self._state.playing or self._state.camera == SPIRAL
 
     @property
     def _frame_seconds(self) -> float:
@@ -100,7 +98,7 @@ class Viewer:
         start = time.perf_counter()
         state = self._advance(start)
         assert state.viewpoint is not None
-        moving = self._dirty or self._is_animated
+        moving = self._dirty or state.playing or state.camera == SPIRAL
         with self._lock:
             self._dirty = False
         window = state.viewpoint
@@ -168,45 +166,28 @@ class DrawingThread:
     def __init__(self, renderer: ViewRenderer) -> None:
         self._renderer = renderer
         self.viewers: list[Viewer] = []
-        self._condition = threading.Condition()
-        self._ending = False
+        self._changed, self._ending = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="drawing", daemon=True)
         self._thread.start()
 
-    def stop(self) -> None:
-        """Finish the picture under way and end the thread."""
-        with self._condition:
-            self._ending = True
-            self._condition.notify()
-        self._thread.join()
-
-    def add(self, viewer: Viewer) -> None:
-        """Draw for one more."""
-        with self._condition:
-            self.viewers.append(viewer)
-            self._condition.notify()
-
-    def remove(self, viewer: Viewer) -> None:
-        """Draw for it no more."""
-        with self._condition:
-            if viewer in self.viewers:
-                self.viewers.remove(viewer)
-
     def wake(self) -> None:
         """Something changed."""
-        with self._condition:
-            self._condition.notify()
+        self._changed.set()
+
+    def stop(self) -> None:
+        """Finish the picture under way and end the thread."""
+        self._ending.set()
+        self.wake()
+        self._thread.join()
 
     def _run(self) -> None:
-        while True:
-            with self._condition:
-                if self._ending:
-                    return
-                now = time.perf_counter()
-                due = [viewer for viewer in self.viewers if viewer.due() <= now]
-                if not due:
-                    soonest = min((viewer.due() for viewer in self.viewers), default=NEVER)
-                    self._condition.wait(None if soonest == NEVER else max(soonest - now, 0.0005))
-                    continue
-                busy = sum(viewer.due() < now + 0.2 for viewer in self.viewers)
-            min(due, key=lambda viewer: viewer.served).draw(self._renderer, viewers=busy)
+        while not self._ending.is_set():
+            now, viewers = time.perf_counter(), list(self.viewers)
+            due = [viewer for viewer in viewers if viewer.due() <= now]
+            if due:
+                busy = sum(viewer.due() < now + 0.2 for viewer in viewers)
+                min(due, key=lambda viewer: viewer.served).draw(self._renderer, viewers=busy)
+                continue
+            soonest = min((viewer.due() for viewer in viewers), default=NEVER)
+            self._changed.wait(None if soonest == NEVER else max(soonest - now, 0.0005))
+            self._changed.clear()

@@ -36,7 +36,7 @@ def export_nerfstudio(capture: Capture, folder: Path, *, split: str = "train", f
         write_json(target / "transforms.json", {"camera_model": "OPENCV", "frames": rows})
     count = f"{len(frames)} frame{'s' if len(frames) > 1 else ''}"
     by = f"{len(chosen.seeing(frames[0]))} of its {len(chosen.cameras)} cameras"
-    _say(capture, folder, f"{count} of split {split}, a folder each, seen by {by}")
+    _write_about(capture, folder, f"{count} of split {split}, a folder each, seen by {by}")
     return folder
 
 
@@ -64,7 +64,7 @@ def export_colmap(capture: Capture, folder: Path, *, split: str = "train", frame
         text = "\n".join(lines) + "\n"
         write_atomic(folder / "sparse" / "0" / f"{name}.txt", text.encode())
     what = f"split {split}, frame {frame}, seen by {len(seeing)} of its {len(chosen.cameras)} cameras"
-    _say(capture, folder, f"{what}; the points are the template's vertices, skinned to that frame")
+    _write_about(capture, folder, f"{what}; the points are the template's vertices, skinned to that frame")
     return folder
 
 
@@ -81,7 +81,7 @@ def _frame(split: Split, name: str, frame: int) -> int:
     return frame
 
 
-def _say(capture: Capture, folder: Path, what: str) -> None:
+def _write_about(capture: Capture, folder: Path, what: str) -> None:
     """State in the export's folder what of the capture it holds."""
     write_atomic(folder / "ABOUT.txt", f"{capture.scene}, capture {capture.identity[:12]}: {what}.\n".encode())
 
@@ -97,7 +97,7 @@ def export_plain(capture: Capture, folder: Path) -> Path:
     _write_model(capture, folder, cameras=train.cameras, frames=train.frames)
     images = [{"camera": camera, "frame": frame, "image": _image(camera, frame)} for camera, frame in train.views]
     write_json(folder / "views.json", {"views": images})
-    _say(capture, folder, f"split train, {len(images)} images, straight alpha; poses.npz: {POSES}")
+    _write_about(capture, folder, f"split train, {len(images)} images, straight alpha; poses.npz: {POSES}")
     return folder
 
 
@@ -110,7 +110,9 @@ def export_test_views(capture: Capture, folder: Path, *, views: Sequence[View]) 
     cameras = tuple(dict.fromkeys(camera for _, camera, _ in views))
     _write_model(capture, folder, cameras=cameras, frames=range(len(capture.motion.dofs)))
     write_json(folder / "views.json", {"views": rows})
-    _say(capture, folder, f"{len(rows)} views to render as RGBA PNG, colour on black, at `image`; poses.npz: {POSES}")
+    _write_about(
+        capture, folder, f"{len(rows)} views to render as RGBA PNG, colour on black, at `image`; poses.npz: {POSES}"
+    )
     return folder
 
 

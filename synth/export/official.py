@@ -38,21 +38,21 @@ def skeleton_text(skeleton: Skeleton) -> str:
     offset = skeleton.heads[0] * MM
     for k, axis in enumerate("xyz"):
         parent = "none" if k == 0 else f"root_t{'xyz'[k - 1]}"
-        place = offset if k == 0 else np.zeros(3)
-        joints.append((f"root_t{axis}", "prismatic", parent, place, np.eye(3)[k]))
+        offset_mm = offset if k == 0 else np.zeros(3)
+        joints.append((f"root_t{axis}", "prismatic", parent, offset_mm, np.eye(3)[k]))
         dofs.append((f"root_t{axis}", MM))
     for j, name in enumerate(skeleton.names):
         order = ("ry", "rz", "rx") if j == 0 else ("rz", "ry", "rx")
         above = "root_tz" if j == 0 else f"{bone_name(skeleton.names[skeleton.parents[j]])}_rx"
-        place = np.zeros(3) if j == 0 else (skeleton.heads[j] - skeleton.heads[skeleton.parents[j]]) * MM
+        offset_mm = np.zeros(3) if j == 0 else (skeleton.heads[j] - skeleton.heads[skeleton.parents[j]]) * MM
         for axis in order:
             full = f"{bone_name(name)}_{axis}"
-            joints.append((full, "revolute", above, place, np.array(AXES[axis], dtype=np.float64)))
+            joints.append((full, "revolute", above, offset_mm, np.array(AXES[axis], dtype=np.float64)))
             dofs.append((full, YAW_WEIGHT if j == 0 else 1.0))
-            above, place = full, np.zeros(3)
+            above, offset_mm = full, np.zeros(3)
     lines = ["Skeletool Skeleton Definition V1.0", f"joints: {len(joints)}"]
-    for name, kind, parent, place, axis in joints:
-        numbers = " ".join(f"{value:.12g}" for value in (*place, *axis, 1.0))
+    for name, kind, parent, offset_mm, axis in joints:
+        numbers = " ".join(f"{value:.12g}" for value in (*offset_mm, *axis, 1.0))
         lines.append(f"{name} {kind} {parent} {numbers}")
     lines += ["markers: 0", "scaling joints: 0", f"dofs: {len(dofs)}"]
     for name, weight in dofs:
@@ -194,7 +194,7 @@ def cached_arrays(capture: Capture) -> dict[str, dict[int, np.ndarray]]:
 def joint_places(skeleton: Skeleton, dofs: np.ndarray, heads: np.ndarray) -> np.ndarray:
     """Where every joint of `skeleton_text` is, `[3 + 3 j, 3]` millimetres: the root slides along x, then y, then z.
 
-    `heads` `[j, 3]` are where ours are; the three joints of a ball joint are at one place.
+    `heads` `[j, 3]` are where ours are; the three joints of a ball joint are at one point.
     """
     sliding = skeleton.heads[0] + np.tril(np.ones((3, 3))) * dofs[:3]
     return np.concatenate([sliding * MM, np.repeat(heads, 3, axis=0)])
@@ -232,7 +232,7 @@ def _unpose(posed: np.ndarray, real: np.ndarray, dual: np.ndarray) -> np.ndarray
 def graph_nodes(template: TemplateMesh) -> np.ndarray:
     """Vertices that serve as nodes of the embedded graph, so that on every piece of the mesh all have one in reach.
 
-    The release looks a node up as the nearest vertex that is not taken yet, so of two vertices at one place it may take
+    The release looks a node up as the nearest vertex that is not taken yet, so of two vertices at one point it may take
     the other one; what that leaves out of reach becomes a node as well.
     """
     edges = _edges(template)
@@ -353,9 +353,9 @@ def export_official(capture: Capture, folder: Path, *, subject: str = "Synthetic
 
 def _require_faces_everywhere(capture: Capture) -> None:
     """The release's embedded graph knows no vertex that belongs to no face."""
-    lonely = len(capture.template.vertices) - len(np.unique(capture.template.faces))
-    if lonely:
-        raise InputError(f"{capture.folder}/template.npz: {lonely} vertices belong to no face, expected none")
+    unused = len(capture.template.vertices) - len(np.unique(capture.template.faces))
+    if unused:
+        raise InputError(f"{capture.folder}/template.npz: {unused} vertices belong to no face, expected none")
 
 
 def _hands(capture: Capture) -> list[str]:

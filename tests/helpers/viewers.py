@@ -52,7 +52,7 @@ def get(url: str, path: str, **headers: str) -> tuple[int, dict[str, str], bytes
 def cookie_of(url: str) -> str:
     """The cookie that the printed address gives."""
     parts = urlsplit(url)
-    status, headers, _ = get(url, f"/?{parts.query}", Host=parts.netloc)
+    status, headers, _ = get(url, f"/?{parts.query}", MethodClient=parts.netloc)
     assert status == 303, status
     return headers["Set-Cookie"].partition(";")[0]
 
@@ -141,9 +141,9 @@ class FakeBrowser:
 
     def look(self, angle: float) -> None:
         """Stand at an angle about the person, and say so."""
-        place = np.array([2.5 * np.sin(angle), 1.2, 2.5 * np.cos(angle)])
+        position = np.array([2.5 * np.sin(angle), 1.2, 2.5 * np.cos(angle)])
         target = np.array([0.0, 0.9, 0.0])
-        forward = (target - place) / np.linalg.norm(target - place)
+        forward = (target - position) / np.linalg.norm(target - position)
         right = np.cross(forward, [0, 1.0, 0])
         right /= np.linalg.norm(right)
         from scipy.spatial.transform import Rotation
@@ -153,7 +153,7 @@ class FakeBrowser:
         self.send(
             "ViewerCameraMessage",
             wxyz=[float(w), float(x), float(y), float(z)],
-            position=place.tolist(),
+            position=position.tolist(),
             fov=0.8,
             near=0.01,
             far=1000.0,
@@ -196,11 +196,11 @@ class FakeBrowser:
 @contextmanager
 def browsers(url: str, count: int, **options: int) -> Iterator[list[FakeBrowser]]:
     """Several viewers at once."""
-    found: list[FakeBrowser] = []
+    opened: list[FakeBrowser] = []
     try:
         for _ in range(count):
-            found.append(FakeBrowser(url, **options))
-        yield found
+            opened.append(FakeBrowser(url, **options))
+        yield opened
     finally:
-        for browser in found:
+        for browser in opened:
             browser.close()

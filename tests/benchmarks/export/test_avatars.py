@@ -51,6 +51,8 @@ def test_a_range_of_frames_becomes_a_folder_of_files_named_by_the_captures_frame
         files = sorted(out.iterdir())
         assert [file.name for file in files] == [f"{frame:06d}.spz" for frame in names]
         assert len({file.read_bytes() for file in files}) == len(names)
+    assert exported(tube_cells["ash"], "spz", tmp_path / "one") == cli.DONE
+    assert (tmp_path / "one.spz").is_file(), "a name without a suffix gets the format's"
 
 
 def test_the_exported_mesh_is_the_mesh_that_is_drawn(tube_cells, tmp_path: Path) -> None:
@@ -81,13 +83,21 @@ def test_the_exported_mesh_is_the_mesh_that_is_drawn(tube_cells, tmp_path: Path)
         ("ddc", "ply", "x", (), "has no Gaussians"),
         ("ash", "obj", "x", (), "expected one of ply, spz, gltf, bvh, mp4, html for a trained avatar"),
         ("ash", "colmap", "x", (), "expected one of ply, spz, gltf, bvh, mp4, html for a trained avatar"),
-        ("capture", "ply", "x", (), "expected one of ash, nerfstudio, colmap, plain, test-views for a capture"),
+        (
+            "capture",
+            "ply",
+            "x",
+            (),
+            "expected one of ash, nerfstudio, colmap, plain, test-views, undistorted for a capture",
+        ),
         ("ash", "ply", "x.spz", (), "x.spz: expected a name that ends with .ply for the format ply"),
         ("ash", "gltf", "x.ply", (), "x.ply: expected a name that ends with .glb or .gltf for the format gltf"),
         ("run", "ply", "x", (), "expected one avatar"),
+        ("nothing", "ply", "x", (), "expected the folder of a capture, a run or a cell"),
         ("ash", "ply", "x", ("--frames", "7"), "within 0:2"),
         ("ash", "ply", "x", ("--frames", "1:1"), "within 0:2"),
         ("ash", "ply", "x", ("--frames", "a"), "A:B or one number"),
+        ("ash", "ply", "x.ply", ("--frames", "0:2"), "x.ply: expected a folder for 2 frames"),
         ("ash", "ply", "x", ("--truth",), "--truth: goes with the format mp4, got ply"),
         ("capture", "ash", "x", ("--frame", "0"), "--frame: goes with the format nerfstudio, colmap, got ash"),
         ("capture", "plain", "x", ("--motion", "walk"), "--motion: goes with the format ply, spz, gltf"),
@@ -96,7 +106,7 @@ def test_the_exported_mesh_is_the_mesh_that_is_drawn(tube_cells, tmp_path: Path)
 def test_what_cannot_be_exported_is_refused_in_one_line(
     source, form, out, more, words, tube_run: Path, tube_cells, tmp_path: Path, capsys
 ) -> None:
-    folder = {"run": tube_run, "capture": tube_run.parent / "capture", **tube_cells}[source]
+    folder = {"run": tube_run, "capture": tube_run.parent / "capture", "nothing": tube_run.parent, **tube_cells}[source]
     assert exported(folder, form, tmp_path / out, *more) == cli.WRONG_INPUT
     message = capsys.readouterr().err
     assert words in message and message.count("\n") == 1
@@ -140,12 +150,12 @@ def test_bvh_says_where_every_joint_is(tmp_path: Path) -> None:
     for frame in range(6):
         world: list[np.ndarray] = []
         for joint, parent in enumerate(parents):
-            place = np.eye(4)
-            place[:3, 3] = rows[frame, :3] if parent < 0 else offsets[joint]
+            frame_of_joint = np.eye(4)
+            frame_of_joint[:3, 3] = rows[frame, :3] if parent < 0 else offsets[joint]
             for axis, angle in zip((2, 0, 1), angles[frame, joint], strict=True):
                 turn = np.eye(4)
                 turn[:3, :3] = rotvec_to_rotmat(angle * np.eye(3)[axis])
-                place = place @ turn
-            world.append(place if parent < 0 else world[parent] @ place)
+                frame_of_joint = frame_of_joint @ turn
+            world.append(frame_of_joint if parent < 0 else world[parent] @ frame_of_joint)
             ours = wanted[frame, skeleton.names.index(names[joint])]
             np.testing.assert_allclose(world[-1], ours, atol=1e-5)

@@ -54,19 +54,19 @@ def test_a_viewer_shows_the_frame_that_the_avatar_renders(
     )
     command = ["export", cell, "--format", form, "--motion", "train", "--frames", "2", "--out", str(out)]
     assert cli.main(command) == cli.DONE
-    seen = visit(page, size=(200, 200))
-    seen.page.wait_for_function("window.avatar", timeout=PATIENCE)
-    seen.page.keyboard.press(" ")  # The page's own clip stands still meanwhile.
+    visited = visit(page, size=(200, 200))
+    visited.page.wait_for_function("window.avatar", timeout=PATIENCE)
+    visited.page.keyboard.press(" ")  # The page's own clip stands still meanwhile.
     with open_avatars(tube_cells["ash"]) as avatars:
         loaded, camera = avatars[avatars.titles[0]], avatars.capture.cameras["cam2"]
         matrix = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1, -1, 1])
         fov = float(np.rad2deg(2 * np.arctan2(camera.height / 2, camera.K[1, 1])))
-        place = [matrix.T.ravel().tolist(), fov, camera.width, camera.height, loaded.avatar.dilation]
-        encoded = seen.page.evaluate(OPEN, [base64.b64encode(out.read_bytes()).decode(), form, turned, *place])
+        view = [matrix.T.ravel().tolist(), fov, camera.width, camera.height, loaded.avatar.dilation]
+        encoded = visited.page.evaluate(OPEN, [base64.b64encode(out.read_bytes()).decode(), form, turned, *view])
         pose = Pose(avatars.capture.motion, 2)
         ours = loaded.on_colour(pose, camera, StageClock(), PAPER) / 255
         alpha = loaded.premultiplied(pose, camera, StageClock())[..., 3]
     theirs = np.asarray(Image.open(io.BytesIO(base64.b64decode(encoded.partition(",")[2]))).convert("RGB")) / 255
     assert (alpha > 0.5).mean() > 0.05
     assert psnr(theirs, ours, alpha) > 30, psnr(theirs, ours, alpha)
-    assert seen.errors == []
+    assert visited.errors == []

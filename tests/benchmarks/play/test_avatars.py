@@ -11,8 +11,8 @@ from helpers import fakes
 
 from ash.files import InputError, read_image
 from benchmarks import cli
-from benchmarks.cell.cells import read_cell
 from benchmarks.cell.metrics import on_black
+from benchmarks.cell.schema import read_cell
 from benchmarks.play.avatars import load_avatar
 
 SCRIPT = Path(__file__).parents[3] / "docs" / "draw_a_frame.py"
@@ -45,9 +45,9 @@ def test_another_motion_and_another_camera(folder: Path) -> None:
     raised = avatar.motion.dofs.copy()
     raised[:, 8] += 1.0
     moved = avatar.draw(replace(avatar.motion, dofs=raised), frame=0, camera=camera)
-    seen = avatar.draw(avatar.motion, frame=0, camera=replace(camera, K=camera.K * [[0.5], [0.5], [1]]))
+    smaller = avatar.draw(avatar.motion, frame=0, camera=replace(camera, K=camera.K * [[0.5], [0.5], [1]]))
     assert own[..., 3].any() and not np.array_equal(own, moved)
-    assert (seen[..., 3] > 0).sum() < 0.9 * (own[..., 3] > 0).sum()
+    assert (smaller[..., 3] > 0).sum() < 0.9 * (own[..., 3] > 0).sum()
 
 
 def test_the_script_of_the_documentation(tube_cells: dict[str, Path], tmp_path: Path) -> None:

@@ -87,7 +87,8 @@ def test_methods_truth_errors_and_joints_are_chosen(player: PlayServer, viewer: 
     viewer.set("Camera", "cam0")
     viewer.press("Truth beside it")
     viewer.wait_for(lambda: "Against the truth" in viewer.words and "dB, FLIP" in viewer.words, PATIENCE)
-    viewer.set("Show the error", "FLIP")
+    viewer.set("Show the error", True)
+    viewer.wait_for(lambda: state_of(player).error)
     viewer.set("Joint", player.avatars.capture.skeleton.names[1])
     time.sleep(1.0)  # As a hand needs: the sliders take the joint's angles first.
     viewer.set("About x", 30)
@@ -176,8 +177,8 @@ def test_a_new_viewer_sees_the_motion_that_was_asked_for(tube_run: Path) -> None
 
 
 def test_all_threads_end_with_the_player(tube_run: Path) -> None:
-    before = {thread.ident for thread in threading.enumerate()}
+    before = thread_names()
     with playing(tube_run) as player, browsers(player.url, 2, width=64, height=64) as two:
         for each in two:
             each.wait_for(lambda each=each: each.arrivals, PATIENCE)
-    wait_for(lambda: not {thread.ident for thread in threading.enumerate()} - before)
+    wait_for(lambda: thread_names() == before)

@@ -35,8 +35,8 @@ def page(tube_cells: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) 
 
 
 def test_the_page_draws_in_a_browser_what_we_draw(page: Path, tube_cells: dict[str, Path], visit: Visitor) -> None:
-    seen = visit(page, size=(200, 200))
-    tab = seen.page
+    visited = visit(page, size=(200, 200))
+    tab = visited.page
     with open_avatars(tube_cells["ash"]) as avatars:
         tab.wait_for_function("window.avatar", timeout=PATIENCE)
         tab.keyboard.press(" ")
@@ -57,7 +57,7 @@ def test_the_page_draws_in_a_browser_what_we_draw(page: Path, tube_cells: dict[s
             assert psnr(theirs, ours, alpha) > 40 and psnr(theirs, ours, np.ones_like(alpha)) > 40
         tab.keyboard.press("ArrowRight")
         assert tab.evaluate("window.avatar.shown") == 0, "after the last frame comes the first"
-    assert seen.errors == [] and seen.requests == [], "it needs no network"
+    assert visited.errors == [] and visited.requests == [], "it needs no network"
 
 
 def test_the_page_holds_every_frame_to_its_bytes(page: Path, tube_cells: dict[str, Path]) -> None:
@@ -73,8 +73,8 @@ def test_the_page_holds_every_frame_to_its_bytes(page: Path, tube_cells: dict[st
         loaded, capture = avatars[avatars.titles[0]], avatars.capture
         for frame, columns in enumerate(bytes_of):
             wanted = loaded.avatar.gaussians(Pose(capture.motion, frame))
-            place = low + (high - low) * (256.0 * columns[:3] + columns[3:6]) / 65535
-            np.testing.assert_allclose(place.T, wanted.means, atol=1e-4)
+            position = low + (high - low) * (256.0 * columns[:3] + columns[3:6]) / 65535
+            np.testing.assert_allclose(position.T, wanted.means, atol=1e-4)
             turns = columns[9:13].astype(np.int8).T / 127
             unit = torch.nn.functional.normalize(wanted.quats, dim=-1).numpy()
             assert np.abs((turns * unit).sum(1)).min() > 0.985
