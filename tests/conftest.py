@@ -9,7 +9,7 @@ import pytest
 from helpers.browser import chromium, visit  # noqa: F401  (fixtures for all)
 from helpers.sharing import shared, small_capture  # noqa: F401
 
-from benchmarks.cell import methods
+from benchmarks.cell import registry
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -22,9 +22,9 @@ def can_be_interrupted() -> Iterator[None]:
 
 def pytest_sessionstart() -> None:
     """What is installed follows `sys.path` here; to read it anew takes a tenth of a second at each look."""
-    look = methods.methods
+    look = registry.methods
     seen = cache(lambda path: look())
-    methods.methods = lambda: seen(tuple(sys.path))
+    registry.methods = lambda: seen(tuple(sys.path))
 
 
 LONG = (

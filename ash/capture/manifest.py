@@ -78,7 +78,7 @@ class Manifest:
     parameters: dict[str, Any] = field(default_factory=dict)  # every parameter of the scene
     made_with: dict[str, str] = field(default_factory=dict)
     pose_novelty_deg: float | None = None  # mean over the split novel_pose, see `ash.capture.novelty`
-    perturbed: dict[str, Any] = field(default_factory=dict)  # how it was spoilt, and of which capture
+    perturbed: dict[str, Any] = field(default_factory=dict)  # how it was perturbed, and of which capture
     undistorted: dict[str, str] = field(default_factory=dict)  # of which capture
 
     def write(self, folder: Path) -> None:

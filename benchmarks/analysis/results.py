@@ -16,9 +16,9 @@ import pandas as pd
 from ash.files import InputError
 from benchmarks.analysis.statistics import LEVEL, Comparison, Samples, compare_samples, independent, mean_interval
 from benchmarks.analysis.style import is_ours
-from benchmarks.cell.cells import CellConfig, CellResult
-from benchmarks.cell.methods import is_oracle
 from benchmarks.cell.metrics import METRICS
+from benchmarks.cell.registry import is_oracle
+from benchmarks.cell.schema import CellConfig, CellResult
 from benchmarks.suites.suites import capture_name
 from synth.person.cast import VALIDATION
 

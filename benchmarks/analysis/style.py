@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import cache
 
 from ash.files import hash_of
-from benchmarks.cell.cells import CellConfig
-from benchmarks.cell.methods import DECIDING_PACKAGES, methods
+from benchmarks.cell.registry import DECIDING_PACKAGES, methods
+from benchmarks.cell.schema import CellConfig
 from benchmarks.suites.files import our_rows
 
 

@@ -12,7 +12,7 @@ import pandas as pd
 from benchmarks.analysis.results import Quantity, RunTables, compare, foreground, samples_of
 from benchmarks.analysis.statistics import independent, mean_interval
 from benchmarks.analysis.style import SPLIT_NAMES, style_of
-from benchmarks.cell.methods import ON_EXACT, WRONG_BY_MM
+from benchmarks.cell.registry import ON_EXACT, WRONG_BY_MM
 
 # ASH (CVPR 2024), Table 1: PSNR of ASH minus DDC, tight and loose clothes.
 PAPER_DB = {"novel_view": {"tight": 4.6, "loose": 7.4}, "novel_pose": {"tight": 1.1, "loose": 0.7}}

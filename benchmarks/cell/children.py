@@ -14,7 +14,7 @@ METHOD_PATH = "ASH_BENCH_METHOD_PATH"  # folders of users' methods, as in PATH
 LOUDEST, LAST_WORDS = 1 << 20, 1 << 14  # bytes of printing that are kept: the first of them, and the last
 
 
-def pass_on(output: IO[bytes]) -> None:
+def relay_output(output: IO[bytes]) -> None:
     """Print what the method prints: the first megabyte of it, and its last words."""
     kept, left_out, last = 0, 0, b""
     while part := os.read(output.fileno(), 1 << 16):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ash.files import open_regular
-from benchmarks.cell.cells import CurvePoint
+from benchmarks.cell.schema import CurvePoint
 
 MAX_POINTS = 200
 SETTLED_DB = 0.3

@@ -13,7 +13,11 @@ from ash.capture.novelty import novelty_deg
 from ash.files import read_arrays, write_image
 from ash.protocol import TrainingOutcome
 from benchmarks.cell import metrics
-from benchmarks.cell.cells import (
+from benchmarks.cell.client import TEST_VIEWS, WORK, MethodClient, MethodInfo, Timed, frame_times_ms
+from benchmarks.cell.curves import read_curve, seconds_to_settle
+from benchmarks.cell.errors import MethodFailed
+from benchmarks.cell.metrics import IMAGE_SPLITS, NOVELTY, VIEW_SCORES
+from benchmarks.cell.schema import (
     Cell,
     CellResult,
     CurvePoint,
@@ -24,11 +28,7 @@ from benchmarks.cell.cells import (
     prediction_path,
     stored_prediction,
 )
-from benchmarks.cell.curves import read_curve, seconds_to_settle
-from benchmarks.cell.failing import MethodFailed
-from benchmarks.cell.host import EXAM, WORK, Described, Host, Timed, frame_times_ms
-from benchmarks.cell.metrics import IMAGE_SPLITS, NOVELTY, VIEW_SCORES
-from benchmarks.cell.timing import TIMED_FRAMES, WARM_UP_FRAMES, Spent, reference_workload_ms
+from benchmarks.cell.timing import TIMED_FRAMES, WARM_UP_FRAMES, TrainingTime, reference_workload_ms
 from benchmarks.cell.views import View, evaluated_views, playback
 from benchmarks.cell.weights import weights_file
 
@@ -49,48 +49,50 @@ class PosedFrames:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Submission:
+class MethodOutputs:
     """What a trained method left besides its stored pictures, when its process ended."""
 
     views: tuple[View, ...]
     timing: Timing
     geometry: PosedFrames | None
-    described: Described
+    described: MethodInfo
     peak_mb: float
     snapshots: tuple[Snapshot, ...]
     isolated: bool
-    prepared: Spent  # since the avatar was made, before the first picture
+    prepared: TrainingTime  # since the avatar was made, before the first picture
 
 
-def draw_all(cell: Cell, capture: Capture, host: Host) -> Submission:
+def draw_all(cell: Cell, capture: Capture, client: MethodClient) -> MethodOutputs:
     """Let the method draw every view that is scored, and measure it; nothing is compared with truth yet.
 
     Frames are timed first, when none of them was ever drawn: a method that keeps its pictures gains nothing.
     """
     views = evaluated_views(capture)
-    host.meet(cell.folder.resolve() / EXAM, capture)
-    described, prepared = host.describe(), host.spent()
-    timing, shown = _timing(capture, host, playback(views))
+    client.load_test_views(cell.folder.resolve() / TEST_VIEWS, capture)
+    described, prepared = client.describe(), client.spent()
+    timing, shown = _timing(capture, client, playback(views))
     for view in views:
-        write_image(prediction_path(cell.folder, view), metrics.quantise(host.draw(view, capture.cameras[view.camera])))
+        write_image(
+            prediction_path(cell.folder, view), metrics.quantise(client.draw(view, capture.cameras[view.camera]))
+        )
     agreement_db = min(_agreement(image, stored_prediction(cell, capture, view)) for view, image in shown)
     if agreement_db < LEAST_AGREEMENT_DB:
         told = f"{agreement_db:.1f} dB, expected {LEAST_AGREEMENT_DB:.0f} or more"
         raise MethodFailed("crashed", f"a timed picture differs from the one that was scored by {told}")
-    return Submission(
+    return MethodOutputs(
         views=views,
         timing=replace(timing, agreement_db=agreement_db),
-        geometry=_pose_geometry(host, described, views),
+        geometry=_pose_geometry(client, described, views),
         described=described,
-        peak_mb=host.peak_memory_mb(),
-        snapshots=_snapshots(cell, capture, host, views),
-        isolated=host.isolated,
+        peak_mb=client.peak_memory_mb(),
+        snapshots=_snapshots(cell, capture, client, views),
+        isolated=client.isolated,
         prepared=prepared,
     )
 
 
 def judge(
-    cell: Cell, capture: Capture, drawn: Submission, spent: Spent, training: TrainingOutcome | None = None
+    cell: Cell, capture: Capture, drawn: MethodOutputs, spent: TrainingTime, training: TrainingOutcome | None = None
 ) -> CellResult:
     """Score the stored pictures, when the method's process is gone.
 
@@ -121,14 +123,14 @@ def judge(
     )
 
 
-def _snapshots(cell: Cell, capture: Capture, host: Host, views: tuple[View, ...]) -> tuple[Snapshot, ...]:
+def _snapshots(cell: Cell, capture: Capture, client: MethodClient, views: tuple[View, ...]) -> tuple[Snapshot, ...]:
     """What the avatar would have scored had training ended earlier, of a method that left its weights of then."""
     found = []
     for path in sorted((cell.folder / WORK / "snapshots").glob("*.safetensors"))[:MOST_SNAPSHOTS]:
         if not path.stem.isdecimal() or len(path.stem) > 9:
             continue
-        host.load(f"snapshots/{path.name}")
-        drawn = [metrics.quantise(host.draw(view, capture.cameras[view.camera])) for view in views]
+        client.load(f"snapshots/{path.name}")
+        drawn = [metrics.quantise(client.draw(view, capture.cameras[view.camera])) for view in views]
         for split in IMAGE_SPLITS:
             scores = [_psnr(capture, v, image) for v, image in zip(views, drawn, strict=True) if v.split == split]
             if scores:
@@ -142,12 +144,12 @@ def _psnr(capture: Capture, view: View, prediction: np.ndarray) -> float:
     return metrics.psnr(prediction[..., :3], truth[..., :3], mask if mask.any() else None)
 
 
-def _timing(capture: Capture, host: Host, views: list[View]) -> tuple[Timing, list[tuple[View, np.ndarray]]]:
+def _timing(capture: Capture, client: MethodClient, views: list[View]) -> tuple[Timing, list[tuple[View, np.ndarray]]]:
     """The method's own milliseconds, which ours outside must bear out, and the pictures that were timed.
 
     No picture is timed that was asked for before; where a capture has fewer views than are wanted, fewer are timed.
     """
-    drawn_by = host.open_display()
+    drawn_by = client.open_display()
     frames: list[Timed] = []
     references, pictures = [], []
     asked: set[tuple[str, int]] = set()
@@ -157,9 +159,9 @@ def _timing(capture: Capture, host: Host, views: list[View]) -> tuple[Timing, li
             continue
         asked |= {(view.camera, view.frame), (view.camera, before.frame)}
         if before != view:
-            host.time(before)
-        frames.append(host.time(view))
-        pictures.append((view, metrics.quantise(host.draw(view, capture.cameras[view.camera], "shown"))))
+            client.time(before)
+        frames.append(client.time(view))
+        pictures.append((view, metrics.quantise(client.draw(view, capture.cameras[view.camera], "shown"))))
         references.append(reference_workload_ms())
         if len(frames) == WARM_UP_FRAMES + TIMED_FRAMES:
             break
@@ -269,15 +271,15 @@ def _flicker_summary(cell: Cell, capture: Capture, scored: list[ViewScore]) -> t
     return (Summary(split="novel_pose", region="foreground", metric="flicker", value=float(np.mean(values))),)
 
 
-def _pose_geometry(host: Host, described: Described, views: tuple[View, ...]) -> PosedFrames | None:
+def _pose_geometry(client: MethodClient, described: MethodInfo, views: tuple[View, ...]) -> PosedFrames | None:
     """Template and Gaussians in the evaluated frames, of methods that show their geometry."""
     if not described.geometry:
         return None
     frames = sorted({view.frame for view in views})
     few = {frame for split in IMAGE_SPLITS for frame in _few(_frames_of(views, split))}
     return PosedFrames(
-        vertices={frame: host.geometry("vertices", frame) for frame in frames},
-        means={frame: host.geometry("means", frame) for frame in few} if described.gaussians else {},
+        vertices={frame: client.geometry("vertices", frame) for frame in frames},
+        means={frame: client.geometry("means", frame) for frame in few} if described.gaussians else {},
     )
 
 
@@ -317,7 +319,7 @@ def _surface_distance(capture: Capture, means: np.ndarray, frame: int) -> float 
     return metrics.surface_distance_mm(some, vertices, faces)
 
 
-def _cost_summary(drawn: Submission, spent: Spent, *, before_s: float) -> tuple[Summary, ...]:
+def _cost_summary(drawn: MethodOutputs, spent: TrainingTime, *, before_s: float) -> tuple[Summary, ...]:
     """What training and drawing cost.
 
     `before_s`: seconds by the method's log, which goes on where an interrupted attempt stopped. Wall and CPU seconds

@@ -15,7 +15,7 @@ def runs_kernels(device: str) -> bool:
     return device != "cpu"
 
 
-def give_kernels(device: str, place: Path) -> Path:
+def copy_kernel_cache(device: str, place: Path) -> Path:
     """A fresh folder `KERNELS` in `place`; in it what the device runs, compiled now where it never was.
 
     It stays empty on the CPU, where nothing is run from it, and where the device cannot be used: the method says that.
@@ -33,6 +33,6 @@ def give_kernels(device: str, place: Path) -> Path:
     return folder
 
 
-def looking_in(folder: Path) -> dict[str, str]:
+def kernel_env(folder: Path) -> dict[str, str]:
     """The environment of a process whose Warp has its cache there."""
     return clean_environment() | {"WARP_CACHE_PATH": str(folder)}

@@ -10,7 +10,7 @@ import numpy as np
 
 from ash.capture.dataset import Capture, Pose
 from ash.protocol import Drawn, StageClock
-from benchmarks.cell.cells import Timing
+from benchmarks.cell.schema import Timing
 from benchmarks.cell.views import View
 
 WARM_UP_FRAMES = 3
@@ -18,7 +18,7 @@ TIMED_FRAMES = 15
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Spent:
+class TrainingTime:
     """Seconds of a training, seen from outside: by the clock, and of CPU time of all the method's processes.
 
     A process that was stopped, or shared its core, has less of the latter; one that used several cores has more.

@@ -138,7 +138,7 @@ def _test_without_namespaces(root: Path, run: Callable[..., "subprocess.Complete
 
     Returns what failed.
     """
-    from benchmarks.cell.isolation import problem
+    from benchmarks.cell.sandbox import problem
 
     name = "isolation tests without namespaces"
     place = ["sh", str(root / "tests" / "helpers" / "without_namespaces.sh")]

@@ -51,7 +51,7 @@ def on_device(suite: "Suite", device: str) -> "Suite":
 
 
 def _moved(row: "MethodSpec", preset: str, device: str) -> "MethodSpec":
-    from benchmarks.cell.methods import offered
+    from benchmarks.cell.registry import offered
 
     if not hasattr(offered(row.of or row.name, preset), "device"):
         return row

@@ -105,9 +105,9 @@ def _lpips() -> Finding:
 
 
 def _isolation() -> Finding:
-    from benchmarks.cell import isolation
+    from benchmarks.cell import sandbox
 
-    if problem := isolation.problem():
+    if problem := sandbox.problem():
         consequence = "a method is only watched: its process could reach truth, and its row says so"
         return Finding(what="isolation", found=problem, consequence=consequence)
     return Finding(what="isolation", found="namespaces", consequence="a method's process sees training data alone")

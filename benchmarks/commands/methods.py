@@ -25,7 +25,7 @@ class CheckMethodCommand:
 
     def __call__(self) -> int:
         """Whether a method keeps the rules of docs/plugin.md."""
-        from benchmarks.cell.methods import find_method
+        from benchmarks.cell.registry import find_method
         from benchmarks.provenance import cores
         from benchmarks.studies.conformance import check_method as check
         from benchmarks.studies.conformance import table

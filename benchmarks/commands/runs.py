@@ -240,16 +240,16 @@ class TrainCommand:
 
     def settings(self) -> Any:
         """The configuration that the preset means, if the method offers one."""
-        from benchmarks.cell.methods import offered
+        from benchmarks.cell.registry import offered
 
         return offered(self.method, self.preset)
 
     def __call__(self) -> int:
         """One cell by hand."""
         from ash.capture.formats import load_capture
-        from benchmarks.cell.cells import read_result, write_config
-        from benchmarks.cell.methods import configured
-        from benchmarks.cell.process import run_cell
+        from benchmarks.cell.registry import configured
+        from benchmarks.cell.run import run_cell
+        from benchmarks.cell.schema import read_result, write_config
         from benchmarks.suites.captures import require_intact
         from benchmarks.suites.engine import plan_cells
         from benchmarks.suites.runs import cell_for
@@ -302,7 +302,7 @@ class EvalCommand:
 
     def __call__(self) -> int:
         """Render where that is asked for, and score."""
-        from benchmarks.cell.process import evaluate_cell, rescore_cell
+        from benchmarks.cell.run import evaluate_cell, rescore_cell
 
         if self.motion is not None:
             return self._on_motion(self.motion)

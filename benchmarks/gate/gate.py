@@ -18,8 +18,8 @@ from typing import Literal
 from ash.capture.typed import from_json
 from ash.files import InputError, read_json, write_json
 from benchmarks.analysis.statistics import Comparison, compare_samples, corrected
-from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS, PROTOCOL
+from benchmarks.cell.schema import CellResult
 from benchmarks.report import escaping
 
 Verdict = Literal["pass", "fail", "unexplained improvement", "not judged"]

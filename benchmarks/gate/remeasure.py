@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from dataclasses import replace
 
-from benchmarks.cell.cells import CellResult, result_of
+from benchmarks.cell.schema import CellResult, result_of
 from benchmarks.gate.gate import Row
 from benchmarks.suites.captures import make_capture
 from benchmarks.suites.runs import RunOptions, cell_for, run_missing

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from ash.files import InputError
-from benchmarks.cell.methods import DECIDING_PACKAGES, find_method, named_method
+from benchmarks.cell.registry import DECIDING_PACKAGES, find_method, named_method
 from benchmarks.gate.gate import FINE, Baseline, Check
 from benchmarks.report import escaping
 

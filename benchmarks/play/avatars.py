@@ -28,9 +28,9 @@ from ash.gaussians.splatting import Splatted, splat
 from ash.model import blend_renders, image_of, views_of
 from ash.protocol import Avatar, PosedGeometry, PosesGaussians, StageClock
 from benchmarks.analysis.style import style_of
-from benchmarks.cell.cells import CHECKPOINT, Cell, is_trained, read_cell
-from benchmarks.cell.methods import is_oracle
-from benchmarks.cell.process import load_avatar as open_avatar
+from benchmarks.cell.registry import is_oracle
+from benchmarks.cell.run import load_avatar as open_avatar
+from benchmarks.cell.schema import CHECKPOINT, Cell, is_trained, read_cell
 from benchmarks.play.motions import motion_clip
 from benchmarks.suites.runs import RUN_FILE, read_run
 

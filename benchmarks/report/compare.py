@@ -13,8 +13,8 @@ from benchmarks.analysis.error_attribution import psnr_of
 from benchmarks.analysis.results import RANKED_SPLITS, Quantity, foreground, load, samples_of
 from benchmarks.analysis.statistics import compare_samples, corrected
 from benchmarks.analysis.style import SPLIT_NAMES
-from benchmarks.cell.cells import Cell, CellResult, read_result
 from benchmarks.cell.metrics import METRICS
+from benchmarks.cell.schema import Cell, CellResult, read_result
 from benchmarks.report import pictures
 from benchmarks.report.content import Block, Mark, Report, Section, Strip, Strips, Table, Text
 from benchmarks.report.page import render

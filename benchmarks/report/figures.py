@@ -6,7 +6,7 @@ from benchmarks.analysis import pareto
 from benchmarks.analysis.results import FRAME_MS, RANKED_SPLITS, RunTables, foreground, samples_of
 from benchmarks.analysis.statistics import intervals
 from benchmarks.analysis.style import EXACT, SPLIT_NAMES
-from benchmarks.cell.methods import WRONG_BY_MM
+from benchmarks.cell.registry import WRONG_BY_MM
 from benchmarks.report import charts, vega
 from benchmarks.report.vega import Figure
 

@@ -14,7 +14,7 @@ from markupsafe import Markup, escape
 from ash.files import InputError, write_atomic
 from benchmarks.analysis.results import RunTables, csv_of
 from benchmarks.analysis.style import titles_of
-from benchmarks.cell.cells import printable
+from benchmarks.cell.schema import printable
 from benchmarks.report import content, escaping, glossary, sections, sentences, tables, vega
 from benchmarks.report.content import Report, Section
 from benchmarks.report.pictures import Album

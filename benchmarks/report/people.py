@@ -11,7 +11,7 @@ from ash.capture.formats import load_capture
 from benchmarks.analysis.results import RANKED_SPLITS, RunTables, foreground, samples_of
 from benchmarks.analysis.statistics import spreads
 from benchmarks.analysis.style import SPLIT_NAMES, is_ours, style_of
-from benchmarks.cell.cells import CellResult
+from benchmarks.cell.schema import CellResult
 from benchmarks.report import pictures
 from benchmarks.report.content import Block, Bullets, Strips, Table, Text
 from benchmarks.report.pictures import Album, Frames, Shown

@@ -19,7 +19,7 @@ from benchmarks.analysis.error_attribution import REGION_COLOURS, psnr_of, worst
 from benchmarks.analysis.results import RANKED_SPLITS
 from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell import metrics
-from benchmarks.cell.cells import Cell, CellResult, ViewScore, stored_prediction
+from benchmarks.cell.schema import Cell, CellResult, ViewScore, stored_prediction
 from benchmarks.cell.views import View, spread
 from benchmarks.report.content import Strip
 

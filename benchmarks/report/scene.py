@@ -12,8 +12,8 @@ from benchmarks.analysis import differences, paper
 from benchmarks.analysis.error_attribution import REGIONS
 from benchmarks.analysis.results import HELD_OUT_SPLITS, MOTION_SPLITS, RANKED_SPLITS, Quantity, RunTables, foreground
 from benchmarks.analysis.style import SPLIT_NAMES, is_ours, style_of
-from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS
+from benchmarks.cell.schema import CellResult
 from benchmarks.report import charts, figures, people, pictures, sentences, tables, vega
 from benchmarks.report.content import Block, Bullets, Flipbook, Mark, Section, Strips, Table, Text
 from benchmarks.report.pictures import Album, Shown

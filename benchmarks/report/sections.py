@@ -9,8 +9,8 @@ from benchmarks.analysis import ablation_matrix, curves, paper, pareto, stabilit
 from benchmarks.analysis.differences import differences
 from benchmarks.analysis.results import FRAME_MS, RANKED_SPLITS, Quantity, RunTables, foreground
 from benchmarks.analysis.style import SPLIT_NAMES, style_of
-from benchmarks.cell.cells import CellResult
 from benchmarks.cell.metrics import METRICS, PROTOCOL
+from benchmarks.cell.schema import CellResult
 from benchmarks.report import charts, vega
 from benchmarks.report.content import Block, Bullets, Section, Table, Text
 from benchmarks.report.figures import line_figure

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from benchmarks.analysis import paper, pareto
 from benchmarks.analysis.results import FRAME_MS, RANKED_SPLITS, Quantity, RunTables, foreground
 from benchmarks.analysis.style import EXACT, SPLIT_NAMES, style_of
-from benchmarks.cell.cells import CellResult
-from benchmarks.cell.methods import is_oracle
+from benchmarks.cell.registry import is_oracle
+from benchmarks.cell.schema import CellResult
 from synth.person.cast import VALIDATION
 
 TOO_CLOSE_DB = 0.1

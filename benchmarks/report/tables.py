@@ -7,8 +7,8 @@ import pandas as pd
 
 from benchmarks.analysis.results import HELD_OUT_SPLITS, RANKED_SPLITS, Quantity, RunTables, foreground
 from benchmarks.analysis.style import SPLIT_NAMES, style_of
-from benchmarks.cell.methods import is_oracle
 from benchmarks.cell.metrics import METRICS, Metric
+from benchmarks.cell.registry import is_oracle
 from benchmarks.report.content import Mark, Table
 from benchmarks.report.escaping import latex as tex
 

@@ -14,7 +14,7 @@ import altair as alt
 import vl_convert
 
 from benchmarks.analysis.style import style_of
-from benchmarks.cell.methods import is_oracle
+from benchmarks.cell.registry import is_oracle
 
 VERSION = "6.4"  # of Vega-Lite, among those that vl-convert brings
 PAPER, INK, DIM, GRID, LINE = "#fffffe", "#1f2733", "#5d6878", "#dfe4eb", "#8a94a3"

@@ -14,11 +14,11 @@ from typing import Any
 from ash.capture.dataset import Capture
 from ash.capture.formats import load_capture, write_cameras, write_motion
 from ash.files import InputError, write_json
-from benchmarks.cell.host import BASE, EXAM, WORK, room_for
-from benchmarks.cell.isolation import ISOLATION, REFUSED
-from benchmarks.cell.methods import ORACLES, find_method
-from benchmarks.cell.sealing import copy, seen_by_method
-from benchmarks.studies.trial import Outcome, Trial, few_views, read_outcome
+from benchmarks.cell.access_guard import copy, seen_by_method
+from benchmarks.cell.client import BASE, TEST_VIEWS, WORK, sandbox_for
+from benchmarks.cell.registry import ORACLES, find_method
+from benchmarks.cell.sandbox import ISOLATION, SANDBOX_UNAVAILABLE
+from benchmarks.studies.conformance_worker import Outcome, Trial, few_views, read_outcome
 from benchmarks.suites.engine import Limits, last_line, watched_process
 
 
@@ -108,13 +108,13 @@ class _Bench:
     limits: Limits
 
     def run(self, place: Path, *, seed: int, thorough: bool = False, weights: Path | None = None) -> TrialRun:
-        """A trial in `place / WORK`: in a room of its own, or where there is none, watched."""
+        """A trial in `place / WORK`: in a sandbox, or where there is none, watched."""
         place = place.resolve()
         oracle, whole = self.name in ORACLES, self.capture
-        for name in (WORK, EXAM, BASE):
+        for name in (WORK, TEST_VIEWS, BASE):
             (place / name).mkdir(parents=True, exist_ok=True)
-        write_cameras(place / EXAM / "cameras.json", list(whole.cameras.values()))
-        write_motion(place / EXAM / "motion.npz", whole.motion)
+        write_cameras(place / TEST_VIEWS / "cameras.json", list(whole.cameras.values()))
+        write_motion(place / TEST_VIEWS / "motion.npz", whole.motion)
         if weights is not None:
             copy(weights, place / WORK / "given.safetensors")
         with seen_by_method(whole, place / "input", oracle=oracle) as seen:
@@ -123,7 +123,7 @@ class _Bench:
                 oracle=oracle,
                 capture=str(whole.folder.resolve()),
                 input=str(seen.folder.resolve()),
-                exam=str(place / EXAM),
+                test_views=str(place / TEST_VIEWS),
                 views=tuple(few_views(whole)),
                 preset=self.preset,
                 seed=seed,
@@ -131,19 +131,21 @@ class _Bench:
                 thorough=thorough,
             )
             write_json(place / WORK / "trial.json", asdict(trial))
-            room = None
+            spec = None
             if not oracle and os.environ.get(ISOLATION) != "off":
-                room = asdict(room_for(place, whole, seen, find_method(self.name), None))
-            ran, refused = self._attempt(place, trial, room)
+                spec = asdict(sandbox_for(place, whole, seen, find_method(self.name), None))
+            ran, refused = self._attempt(place, trial, spec)
             return self._attempt(place, trial, None)[0] if refused else ran
 
-    def _attempt(self, place: Path, trial: Trial, room: dict[str, Any] | None) -> tuple[TrialRun, bool]:
-        """How a trial ended, and whether that was for want of a room."""
+    def _attempt(self, place: Path, trial: Trial, spec: dict[str, Any] | None) -> tuple[TrialRun, bool]:
+        """How a trial ended, and whether that was for want of a sandbox."""
         work, log = place / WORK, place / "output.log"
-        write_json(work / "room.json", room)
-        ending = watched_process([sys.executable, "-P", "-m", "benchmarks.studies.locked", str(work)], log, self.limits)
-        isolated = room is not None
-        if isolated and ending.exit_code == REFUSED:
+        write_json(work / "sandbox.json", spec)
+        ending = watched_process(
+            [sys.executable, "-P", "-m", "benchmarks.studies.conformance_entry", str(work)], log, self.limits
+        )
+        isolated = spec is not None
+        if isolated and ending.exit_code == SANDBOX_UNAVAILABLE:
             return TrialRun(outcome=None), True
         if ending.failure is not None:
             over = "time" if ending.failure.status == "timeout" else "memory"

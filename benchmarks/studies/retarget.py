@@ -14,11 +14,11 @@ from ash.capture.dataset import Capture, Motion
 from ash.capture.formats import load_capture, read_template_truth
 from ash.files import InputError, sha256_of, write_image, write_json
 from benchmarks.cell import metrics
-from benchmarks.cell.cells import Cell, is_trained, result_of
-from benchmarks.cell.failing import Killed, MethodFailed
-from benchmarks.cell.host import EXAM
-from benchmarks.cell.methods import ORACLES
-from benchmarks.cell.process import trained_host
+from benchmarks.cell.client import TEST_VIEWS
+from benchmarks.cell.errors import Killed, MethodFailed
+from benchmarks.cell.registry import ORACLES
+from benchmarks.cell.run import trained_client
+from benchmarks.cell.schema import Cell, is_trained, result_of
 from benchmarks.cell.views import View, spread
 from benchmarks.report.pictures import on_paper
 from benchmarks.suites.progress import Progress
@@ -130,11 +130,11 @@ def drawn_in_isolation(
     split, vertices = truth.splits["novel_pose"], {}
     views = [View(split="novel_pose", camera=camera, frame=frame) for camera, frame in split.views]
     try:
-        with trained_host(cell, own, secret=(truth.folder, truth.folder.parent)) as host:
-            host.meet(cell.folder.resolve() / EXAM, truth)
-            images = {(v.camera, v.frame): metrics.quantise(host.draw(v, truth.cameras[v.camera])) for v in views}
-            if host.describe().geometry:
-                vertices = {frame: host.geometry("vertices", frame) for frame in split.frames}
+        with trained_client(cell, own, secret=(truth.folder, truth.folder.parent)) as client:
+            client.load_test_views(cell.folder.resolve() / TEST_VIEWS, truth)
+            images = {(v.camera, v.frame): metrics.quantise(client.draw(v, truth.cameras[v.camera])) for v in views}
+            if client.describe().geometry:
+                vertices = {frame: client.geometry("vertices", frame) for frame in split.frames}
     except (MethodFailed, Killed) as error:
         raise InputError(f"{cell.folder}: {error or 'its process was killed'}") from error
     return images, vertices

@@ -58,7 +58,7 @@ def described(spec: CaptureSpec) -> Scene:
 
 
 def _spoilt_capture(spec: CaptureSpec, stress: Stress, clean: Path, data: Path) -> Path:
-    """The clean capture, spoilt; made anew where an earlier attempt did not come to its manifest, the last file."""
+    """The clean capture, perturbed; made anew where an earlier attempt did not come to its manifest, the last file."""
     capture = load_capture(clean)
     folder = data / f"{spec.name}-{capture.identity[:8]}"
     if not is_capture(folder):
@@ -118,5 +118,5 @@ def require_kept_apart(suite: Suite) -> None:
 
 def truth_of(manifest: Manifest) -> str:
     """A name for what a capture shows that does not depend on the machine that rendered it."""
-    spoilt = {name: value for name, value in manifest.perturbed.items() if name != "of"}
-    return hash_of([manifest.identity or None, manifest.source or None, spoilt])
+    perturbation = {name: value for name, value in manifest.perturbed.items() if name != "of"}
+    return hash_of([manifest.identity or None, manifest.source or None, perturbation])

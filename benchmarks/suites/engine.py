@@ -20,7 +20,9 @@ import psutil
 
 from ash.capture.manifest import read_manifest
 from ash.files import InputError, one_line, read_json, sha256_of
-from benchmarks.cell.cells import (
+from benchmarks.cell.children import clean_environment, kill_process_tree
+from benchmarks.cell.run import DISK_FULL, KILLED
+from benchmarks.cell.schema import (
     Cell,
     CellResult,
     Status,
@@ -30,8 +32,6 @@ from benchmarks.cell.cells import (
     write_config,
     write_result,
 )
-from benchmarks.cell.children import clean_environment, kill_process_tree
-from benchmarks.cell.process import DISK_FULL, KILLED
 from benchmarks.suites.gpus import lent_gpu
 from benchmarks.suites.progress import Progress
 
@@ -190,11 +190,11 @@ def run_in_process(folder: str, limits: Limits, gpus: tuple[str, ...] = ()) -> s
     cell = read_cell(Path(folder))
     for path in cell.folder.rglob(".*.*"):  # What a killed process left half-written.
         path.unlink(missing_ok=True)
-    command = [sys.executable, "-P", "-m", "benchmarks.cell.process", str(cell.folder), "--follow-parent"]
+    command = [sys.executable, "-P", "-m", "benchmarks.cell.run", str(cell.folder), "--follow-parent"]
     for _ in range(ATTEMPTS):
         with lent_gpu(gpus, cell.config) as environment:
             ending = watched_process(command, cell.folder / "output.log", limits, environment, disk=cell.folder)
-        for left in ("input", "exam", "room"):  # By a method that was ended.
+        for left in ("input", "test_views", "sandbox"):  # By a method that was ended.
             shutil.rmtree(cell.folder / left, ignore_errors=True)
         if ending.interrupted:
             return "interrupted"

@@ -29,7 +29,7 @@ from ash.capture.manifest import read_manifest
 from ash.fields import WRITTEN, Changes, for_json, suggest
 from ash.files import InputError, hash_of, open_regular
 from benchmarks.aliases import OLD_SIZES, OLD_SUITES
-from benchmarks.cell.methods import configured, find_method
+from benchmarks.cell.registry import configured, find_method
 from benchmarks.suites.stress import Stress
 from benchmarks.suites.suites import MethodSpec, SceneSpec, Suite, varied_name
 

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from benchmarks.cell.cells import CellConfig
+from benchmarks.cell.schema import CellConfig
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 ANY = "cuda"  # The device of a cell that takes whichever GPU it is given; cuda:1 names its own.

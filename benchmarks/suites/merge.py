@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ash.files import InputError, read_json, write_json
-from benchmarks.cell.cells import read_result, result_of
+from benchmarks.cell.schema import read_result, result_of
 from benchmarks.suites.runs import RUN_FILE, read_run
 
 

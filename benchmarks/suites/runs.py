@@ -13,11 +13,11 @@ from ash.capture.formats import load_capture
 from ash.capture.typed import from_json
 from ash.fields import for_json
 from ash.files import InputError, read_json, require_plain, run_lock, write_json
-from benchmarks.cell import isolation
-from benchmarks.cell.cells import Cell, CellConfig, CellResult, printable, read_cell, result_of
+from benchmarks.cell import sandbox
 from benchmarks.cell.children import clean_environment
-from benchmarks.cell.methods import code_version, configured, find_method, offered
 from benchmarks.cell.metrics import PROTOCOL
+from benchmarks.cell.registry import code_version, configured, find_method, offered
+from benchmarks.cell.schema import Cell, CellConfig, CellResult, printable, read_cell, result_of
 from benchmarks.suites.captures import (
     make_capture,
     missing_captures,
@@ -135,7 +135,7 @@ def _require_importable(method: str, preset: str) -> None:
     """Import a method in a process of its own; only what that process refuses counts, not how it ends otherwise."""
     code = (
         "import sys; from ash.files import InputError; from benchmarks.cell.children import add_method_paths\n"
-        "from benchmarks.cell.methods import offered; add_method_paths()\n"
+        "from benchmarks.cell.registry import offered; add_method_paths()\n"
         "try: offered(*sys.argv[1:])\nexcept InputError as error: sys.exit(f'refused: {error}')"
     )
     with contextlib.suppress(subprocess.TimeoutExpired):
@@ -174,7 +174,7 @@ def run_missing(cells: Sequence[Cell], suite: Suite, options: RunOptions) -> Non
         progress.say(reason)
     if plan.done:
         progress.say(f"{len(plan.done)} of {len(plan.done) + len(plan.todo)} cells are there already")
-    if plan.todo and options.executor == "local" and (problem := isolation.problem()):
+    if plan.todo and options.executor == "local" and (problem := sandbox.problem()):
         progress.say(f"methods are not isolated here: {problem}; rows say so")
     gpu = any(cell.config.device != "cpu" for cell in plan.todo)
     with make_executor(options.executor, workers=options.side_by_side, gpu=gpu) as executor:

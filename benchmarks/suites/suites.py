@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ash.fields import Changes, suggest
 from ash.files import InputError, hash_of
-from benchmarks.cell.methods import ORACLES, find_method, is_oracle, named_method
+from benchmarks.cell.registry import ORACLES, find_method, is_oracle, named_method
 from benchmarks.suites.stress import Stress
 from synth.person.cast import VALIDATION
 
@@ -48,7 +48,7 @@ class MethodSpec:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class CaptureSpec:
-    """Which capture a cell needs: a scene, its root seed, its subject, and how it is spoilt, if it is."""
+    """Which capture a cell needs: a scene, its root seed, its subject, and its perturbation, if any."""
 
     scene: str
     size: str

@@ -7,14 +7,14 @@ import pytest
 
 import ash.files
 import baselines.ddc
-import benchmarks.cell.methods
+import benchmarks.cell.registry
 from ash.files import hash_sources, source_files
 from synth.source_hash import MAKERS, READERS
 
 DECIDE_A_CELL = (
     Path(ash.files.__file__).parent,
     Path(baselines.ddc.__file__).parent,
-    Path(benchmarks.cell.methods.__file__).parent,
+    Path(benchmarks.cell.registry.__file__).parent,
 )
 
 

@@ -14,7 +14,7 @@ from ash.capture.dataset import Capture, Pose
 from ash.config import TemplateConfig
 from ash.protocol import StageClock
 from baselines.mlp import mlp
-from benchmarks.cell.methods import configured, find_method, is_oracle
+from benchmarks.cell.registry import configured, find_method, is_oracle
 from benchmarks.suites.files import find_suite
 from benchmarks.suites.suites import MethodSpec
 

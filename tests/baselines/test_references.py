@@ -20,7 +20,7 @@ from baselines.ablations import smpl
 from baselines.nearest import central_frame, move_image, nearest, pose_distances, see_root
 from baselines.oracle_texture import oracle_texture
 from baselines.static import of_one_frame, static
-from benchmarks.cell.methods import WRONG_BY_MM, find_method
+from benchmarks.cell.registry import WRONG_BY_MM, find_method
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from ash.fields import apply_overrides, changed
 from ash.files import write_arrays
 from ash.template.template import skinned_template
 from baselines.ddc import DdcConfig, ddc
-from benchmarks.cell.methods import configured, find_method, offered
+from benchmarks.cell.registry import configured, find_method, offered
 from benchmarks.suites.files import find_suite
 
 Parts = dict[str, str]

@@ -10,7 +10,7 @@ from helpers.captures import write_tube_capture
 from helpers.sharing import Shared
 
 from benchmarks import cli
-from benchmarks.cell.cells import read_cell
+from benchmarks.cell.schema import read_cell
 
 
 @pytest.fixture(scope="session")

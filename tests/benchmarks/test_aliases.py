@@ -5,7 +5,7 @@ import pytest
 from ash.presets import named
 from benchmarks import cli
 from benchmarks.aliases import OLD_COMMANDS, OLD_FIELDS
-from benchmarks.cell.methods import configured
+from benchmarks.cell.registry import configured
 from benchmarks.commands.arguments import changes_of, read_command
 from benchmarks.commands.runs import TrainCommand
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.analysis.results import Quantity, RunTables, foreground
-from benchmarks.cell.cells import CellResult
+from benchmarks.cell.schema import CellResult
 from benchmarks.suites.files import find_suite
 from benchmarks.suites.runs import read_run, results_of
 

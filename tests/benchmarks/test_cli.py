@@ -15,7 +15,7 @@ from helpers.waiting import wait_for
 
 from ash.capture.manifest import read_manifest
 from benchmarks import cli
-from benchmarks.cell import methods
+from benchmarks.cell import registry
 from benchmarks.cell.children import METHOD_PATH
 from benchmarks.commands import arguments
 from benchmarks.commands.captures import SynthCommand
@@ -259,21 +259,21 @@ def test_ctrl_c_exits_with_130_and_the_same_command_goes_on(capture: Path, tmp_p
 
 def test_the_code_version_follows_every_deciding_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = Path(shutil.copytree(Path(cli.__file__).parents[1] / "ash", tmp_path / "ash"))
-    monkeypatch.setattr(methods, "_package_folder", lambda package: root)
+    monkeypatch.setattr(registry, "_package_folder", lambda package: root)
     seen = set()
     for path in (None, root / "model.py", root / "native" / "splat.cpp", root / "native" / "project.inc"):
         if path is not None:
             path.write_text(path.read_text() + "\n")
-        methods.code_version.cache_clear()
-        seen.add(methods.code_version("fake_good"))
-    methods.code_version.cache_clear()
+        registry.code_version.cache_clear()
+        seen.add(registry.code_version("fake_good"))
+    registry.code_version.cache_clear()
     assert len(seen) == 4
-    assert methods._package_folder("ash") == root
+    assert registry._package_folder("ash") == root
 
 
 def test_the_code_version_reads_the_sources_that_run() -> None:
     import ash.files
-    from benchmarks.cell.methods import _package_folder
+    from benchmarks.cell.registry import _package_folder
 
     assert _package_folder("ash") == Path(ash.files.__file__).parent
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from benchmarks.cell.cells import CellConfig, CellResult, Summary
+from benchmarks.cell.schema import CellConfig, CellResult, Summary
 
 SPLITS = ("novel_view", "novel_pose")
 

@@ -69,7 +69,7 @@ def _try_all() -> dict[str, str]:
     return loot
 
 
-AT_IMPORT = _try_all() if Path("/nowhere") != TRUTH and "benchmarks.cell.guest" in " ".join(sys.orig_argv) else {}
+AT_IMPORT = _try_all() if Path("/nowhere") != TRUTH and "benchmarks.cell.worker" in " ".join(sys.orig_argv) else {}
 
 
 class Thief(FakeAvatar):

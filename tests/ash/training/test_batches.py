@@ -14,7 +14,7 @@ from ash.files import InputError
 from ash.training.batches import draw_batch, over
 from ash.training.images import load_training_images
 from ash.training.loop import view_loss
-from benchmarks.cell.methods import find_method
+from benchmarks.cell.registry import find_method
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ from helpers.cells import people
 from benchmarks.analysis.ablation_matrix import COMPONENTS, CONTROL_SCENES, EXPECTED, matrix, strength_curves, surprises
 from benchmarks.analysis.differences import differences
 from benchmarks.analysis.results import RunTables
-from benchmarks.cell.cells import CellResult, failed_result
-from benchmarks.cell.methods import offered
+from benchmarks.cell.registry import offered
+from benchmarks.cell.schema import CellResult, failed_result
 from benchmarks.report import sections
 from benchmarks.report.content import Bullets, Section, Table, Text
 from benchmarks.report.vega import Figure

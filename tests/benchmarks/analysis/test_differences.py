@@ -12,7 +12,7 @@ from benchmarks.analysis.differences import detectable_effects, differences
 from benchmarks.analysis.pareto import candidates
 from benchmarks.analysis.results import COLUMNS, RunTables, compare, foreground
 from benchmarks.analysis.statistics import detectable
-from benchmarks.cell.cells import failed_result
+from benchmarks.cell.schema import failed_result
 from benchmarks.report.content import Table
 from benchmarks.report.scene import detectable as detectable_sentence
 from benchmarks.report.scene import difference_blocks

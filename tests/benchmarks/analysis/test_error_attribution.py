@@ -9,7 +9,7 @@ from ash.capture.formats import load_capture
 from benchmarks.analysis import error_attribution
 from benchmarks.analysis.error_attribution import REGIONS, ErrorAttribution, Share, region_map, shares
 from benchmarks.cell import metrics
-from benchmarks.cell.cells import ViewScore
+from benchmarks.cell.schema import ViewScore
 
 VIEW = ViewScore(split="novel_pose", camera="a", frame=0, prediction="d" * 64, scores={})
 

@@ -5,8 +5,8 @@ from helpers.cells import cell, config
 
 from benchmarks.analysis import paper
 from benchmarks.analysis.results import RunTables
-from benchmarks.cell.cells import CellResult, Summary
-from benchmarks.cell.methods import offered
+from benchmarks.cell.registry import offered
+from benchmarks.cell.schema import CellResult, Summary
 from benchmarks.report.content import Bullets, Table
 from benchmarks.report.sections import beside_the_paper
 from benchmarks.suites.files import find_suite

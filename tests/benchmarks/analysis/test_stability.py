@@ -15,8 +15,8 @@ from ash.capture.manifest import verify_capture
 from ash.files import InputError
 from benchmarks.analysis import stability, template_error
 from benchmarks.analysis.results import RunTables, load
-from benchmarks.cell.cells import CellResult, failed_result
-from benchmarks.cell.methods import configured, offered
+from benchmarks.cell.registry import configured, offered
+from benchmarks.cell.schema import CellResult, failed_result
 from benchmarks.report import sections, vega
 from benchmarks.report.charts import _number_axis
 from benchmarks.report.content import Table

@@ -14,11 +14,11 @@ from helpers import fakes, thieves
 from ash.capture.formats import load_capture
 from ash.capture.manifest import verify_capture
 from ash.files import InputError, sha256_of
-from benchmarks.cell import host, isolation, kernels
-from benchmarks.cell.cells import Cell, failed_result, read_result, result_of, write_result
-from benchmarks.cell.failing import MethodFailed
-from benchmarks.cell.methods import find_method
-from benchmarks.cell.sealing import seen_by_method
+from benchmarks.cell import client, kernels, sandbox
+from benchmarks.cell.access_guard import seen_by_method
+from benchmarks.cell.errors import MethodFailed
+from benchmarks.cell.registry import find_method
+from benchmarks.cell.schema import Cell, failed_result, read_result, result_of, write_result
 from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells
 from benchmarks.suites.progress import Progress
 from benchmarks.suites.runs import cell_for
@@ -78,7 +78,7 @@ def test_a_thief_finds_nothing_and_scores_what_it_draws(
     monkeypatch.setenv("ASH_BENCH_TEST_TRUTH", str(truth))
     monkeypatch.setenv("ASH_BENCH_TEST_OTHER", str(other))
     cheat = cell("thief", capture, tmp_path)
-    if isolation.problem():  # Nothing stops it: what it damaged is named, and its own row fails.
+    if sandbox.problem():  # Nothing stops it: what it damaged is named, and its own row fails.
         with pytest.raises(InputError, match=r"own: frames/cam4/000000\.png: "):
             run([honest, cheat])
         result = read_result(cheat.folder)
@@ -87,7 +87,7 @@ def test_a_thief_finds_nothing_and_scores_what_it_draws(
     run([honest, cheat])
     result, expected = read_result(cheat.folder), read_result(honest.folder)
     assert result is not None and expected is not None and result.status == "done", result.reason
-    loot = json.loads((cheat.folder / host.WORK / "loot.json").read_text())
+    loot = json.loads((cheat.folder / client.WORK / "loot.json").read_text())
     assert len(loot["fit"]) == len(loot["import"]) == 10
     assert not [name for attempts in loot.values() for name, found in attempts.items() if found not in ("", "''")]
     assert {path: sha256_of(path) for path in before} == before
@@ -110,8 +110,8 @@ def test_the_processor_s_time_stands_beside_the_clock_s(capture: Path, tmp_path:
 
 def test_what_an_earlier_attempt_left_damaged_is_not_the_method_s_fault(capture: Path, tmp_path: Path) -> None:
     target = cell("resumes", capture, tmp_path)
-    (target.folder / host.WORK).mkdir(parents=True)
-    (target.folder / host.WORK / "checkpoint.safetensors").write_bytes(b"half of it")
+    (target.folder / client.WORK).mkdir(parents=True)
+    (target.folder / client.WORK / "checkpoint.safetensors").write_bytes(b"half of it")
     run([target])
     result = read_result(target.folder)
     assert result is not None and result.status == "done", result and result.reason
@@ -126,14 +126,14 @@ def test_a_clock_that_contradicts_ours_is_told(capture: Path, tmp_path: Path) ->
 
 
 def test_a_slow_clock_gains_nothing_and_a_busy_machine_ends_no_cell() -> None:
-    def frames(way: float) -> list[host.Timed]:
-        return [host.Timed(inside_ms=ms, stage_ms={}, outside_ms=ms + way + ms / 50) for ms in (5.0, 6.0, 9.0)]
+    def frames(way: float) -> list[client.Timed]:
+        return [client.Timed(inside_ms=ms, stage_ms={}, outside_ms=ms + way + ms / 50) for ms in (5.0, 6.0, 9.0)]
 
-    assert host.frame_times_ms(frames(0.5)) == (5.0, 6.0, 9.0)
-    assert host.frame_times_ms(frames(6.0)) == pytest.approx((11.1, 12.12, 15.18))
+    assert client.frame_times_ms(frames(0.5)) == (5.0, 6.0, 9.0)
+    assert client.frame_times_ms(frames(6.0)) == pytest.approx((11.1, 12.12, 15.18))
     for way in (30.0, -1.0):
         with pytest.raises(MethodFailed, match="its clock says"):
-            host.frame_times_ms(frames(way))
+            client.frame_times_ms(frames(way))
 
 
 def test_a_picture_that_was_drawn_before_is_not_timed(capture: Path, tmp_path: Path) -> None:
@@ -155,7 +155,7 @@ def test_all_work_before_the_first_picture_is_training(capture: Path, tmp_path: 
 def test_a_result_that_another_cell_changed_is_made_again(
     way: str, own_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(isolation.ISOLATION, way)
+    monkeypatch.setenv(sandbox.ISOLATION, way)
     honest, cheat = cell("fake_good", own_capture, tmp_path), cell("overwrites", own_capture, tmp_path)
     run([honest])
     before = result_of(honest)
@@ -164,13 +164,13 @@ def test_a_result_that_another_cell_changed_is_made_again(
     assert result_of(cheat).status == "done" and [v.prediction for v in again.views] == [
         v.prediction for v in before.views
     ]
-    assert ("its result was changed while another cell ran" in lines) == (isolation.problem() is not None)
+    assert ("its result was changed while another cell ran" in lines) == (sandbox.problem() is not None)
 
 
 def test_methods_that_change_each_other_s_results_end_the_run(
     own_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(isolation.ISOLATION, "off")
+    monkeypatch.setenv(sandbox.ISOLATION, "off")
     one, other = cell("overwrites", own_capture, tmp_path), cell("overwrites", own_capture, tmp_path, seed=1)
     with pytest.raises(InputError, match="its result was changed by other cells 2 times"):
         run([one, other], workers=1)
@@ -190,7 +190,7 @@ def test_a_damaged_result_is_made_again_and_kept_beside(capture: Path, tmp_path:
 def test_a_method_s_folder_has_a_limit(
     way: str, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(isolation.ISOLATION, way)
+    monkeypatch.setenv(sandbox.ISOLATION, way)
     cheat = cell("fills", capture, tmp_path)
     run([cheat], replace(LIMITS, disk_mb=100))
     result = result_of(cheat)
@@ -201,7 +201,7 @@ def test_a_method_s_folder_has_a_limit(
 def test_what_a_method_started_ends_with_it_when_it_is_ended_for_memory(
     way: str, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(isolation.ISOLATION, way)
+    monkeypatch.setenv(sandbox.ISOLATION, way)
     cheat = cell("forks", capture, tmp_path)
     run([cheat], replace(LIMITS, memory_mb=900))
     assert result_of(cheat).status == "out of memory"
@@ -260,7 +260,7 @@ def test_printing_is_bounded_and_processes_end_with_their_cell(capture: Path, tm
 
 
 def test_without_namespaces_the_row_says_so(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(isolation.ISOLATION, "off")
+    monkeypatch.setenv(sandbox.ISOLATION, "off")
     plain = cell("fake_good", capture, tmp_path)
     run([plain])
     result = read_result(plain.folder)
@@ -275,11 +275,11 @@ def test_isolation_costs_a_cell_at_most_half_a_second(
     method = find_method("fake_good")
 
     def seconds(way: str) -> float:
-        monkeypatch.setenv(isolation.ISOLATION, way)
+        monkeypatch.setenv(sandbox.ISOLATION, way)
         start = time.perf_counter()
         with seen_by_method(whole, tmp_path / "input", oracle=way == "off") as seen:
-            with host.hosted(target, whole, seen, method, oracle=False) as guest:
-                if guest.isolated != (way == "on"):
+            with client.open_client(target, whole, seen, method, oracle=False) as client_of:
+                if client_of.isolated != (way == "on"):
                     pytest.skip("this kernel gives no namespaces")
             return time.perf_counter() - start
 
@@ -295,28 +295,28 @@ def test_kernels_are_compiled_once_and_every_cell_has_its_own_copy(
 ) -> None:
     """On Warp's CPU device, as if it were a GPU."""
     monkeypatch.setattr(kernels, "runs_kernels", lambda device: seeded)
-    monkeypatch.setenv(isolation.ISOLATION, way)
+    monkeypatch.setenv(sandbox.ISOLATION, way)
     target, whole = cell("warps", capture, tmp_path), load_capture(capture)
     method = find_method("warps")
     with (
         seen_by_method(whole, tmp_path / "input", oracle=False) as seen,
-        host.hosted(target, whole, seen, method, oracle=False) as guest,
+        client.open_client(target, whole, seen, method, oracle=False) as client_of,
     ):
-        guest.make()
-        guest.fit()
-    told = json.loads((target.folder / host.WORK / "compiled.json").read_text())
+        client_of.make()
+        client_of.fit()
+    told = json.loads((target.folder / client.WORK / "compiled.json").read_text())
     assert told["seen"] == 16, "the triangle covers the whole picture"
     assert bool(told["before"]) == seeded and bool(told["after"])
     assert (told["after"] == told["before"]) == seeded, "what lies there is not compiled again"
     assert not (target.folder / kernels.KERNELS).exists()
     if seeded:
-        again = kernels.give_kernels("cpu", tmp_path / "again")
+        again = kernels.copy_kernel_cache("cpu", tmp_path / "again")
         assert not [path for path in again.rglob("*") if path.is_file() and path.read_bytes() == b"spoilt"]
 
 
 def test_without_a_gpu_there_is_nothing_to_compile(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert not any(kernels.give_kernels("cpu", tmp_path).iterdir()) and capfd.readouterr().err == ""
-    assert not any(kernels.give_kernels("cuda:99", tmp_path).iterdir())
+    assert not any(kernels.copy_kernel_cache("cpu", tmp_path).iterdir()) and capfd.readouterr().err == ""
+    assert not any(kernels.copy_kernel_cache("cuda:99", tmp_path).iterdir())
     assert "device cuda:99: no kernels are compiled, Warp" in capfd.readouterr().err
 
 
@@ -328,7 +328,7 @@ def test_a_capture_that_a_method_changed_is_seen_and_used_no_more(
     truth = mine / "frames" / "cam4" / "000000.png"
     whole = truth.read_bytes()
     monkeypatch.setenv("ASH_BENCH_TEST_TRUTH", str(truth))
-    monkeypatch.setenv(isolation.ISOLATION, "off")
+    monkeypatch.setenv(sandbox.ISOLATION, "off")
     cheat = cell("spoils", mine, tmp_path)
     run([cheat])
     result = read_result(cheat.folder)

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from helpers import fakes
 
-from benchmarks.cell.cells import read_result
 from benchmarks.cell.children import METHOD_PATH
+from benchmarks.cell.schema import read_result
 
 PACKAGE = Path(__file__).parents[2] / "helpers" / "plugin"
 

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import pytest
 
 from ash.files import InputError
-from benchmarks.cell import isolation, process
-from benchmarks.cell.cells import Cell, read_result, write_config
+from benchmarks.cell import run, sandbox
+from benchmarks.cell.schema import Cell, read_result, write_config
 from benchmarks.suites import engine
 from benchmarks.suites.engine import Ending, Limits
 from benchmarks.suites.runs import cell_for, require_utf8
@@ -36,10 +36,10 @@ def test_a_method_that_fails_on_a_full_disk_has_no_result(
     capture: Path, tmp_path: Path, full_disk: Callable[[], None]
 ) -> None:
     with_space, without = cell("fake_raising", capture, tmp_path / "a"), cell("fake_raising", capture, tmp_path / "b")
-    assert process.run_cell(with_space).status == "crashed"
+    assert run.run_cell(with_space).status == "crashed"
     full_disk()
     with pytest.raises(OSError, match=r"disk is full .*the method's own mistake") as failure:
-        process.run_cell(without)
+        run.run_cell(without)
     assert failure.value.errno == errno.ENOSPC and read_result(without.folder) is None
 
 
@@ -47,9 +47,9 @@ def test_a_full_disk_stops_the_run_with_one_line(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = cell("fake_good", capture, tmp_path)
-    monkeypatch.setattr(process, "read_cell", lambda folder: write_nothing())
-    assert process.main([str(made.folder)]) == process.DISK_FULL
-    monkeypatch.setattr(engine, "watched_process", lambda *_, **__: Ending(exit_code=process.DISK_FULL))
+    monkeypatch.setattr(run, "read_cell", lambda folder: write_nothing())
+    assert run.main([str(made.folder)]) == run.DISK_FULL
+    monkeypatch.setattr(engine, "watched_process", lambda *_, **__: Ending(exit_code=run.DISK_FULL))
     with pytest.raises(InputError, match="the disk is full; with more space the same command goes on"):
         engine.run_in_process(str(made.folder), Limits(seconds=60.0, memory_mb=4096))
     assert read_result(made.folder) is None
@@ -61,10 +61,10 @@ def write_nothing() -> Cell:
 
 def test_eval_names_the_code_that_scored(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = cell("fake_good", capture, tmp_path)
-    process.run_cell(made)
-    assert process.evaluate_cell(made).evaluated_code == ""
-    monkeypatch.setattr(process, "code_version", lambda method: "0123456789abcdef")
-    process.evaluate_cell(made)
+    run.run_cell(made)
+    assert run.evaluate_cell(made).evaluated_code == ""
+    monkeypatch.setattr(run, "code_version", lambda method: "0123456789abcdef")
+    run.evaluate_cell(made)
     result = read_result(made.folder)
     assert (result.evaluated_code, result.config.code) == ("0123456789abcdef", made.config.code)
 
@@ -79,8 +79,8 @@ def test_a_result_says_whether_the_machine_isolates(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = cell("fake_good", capture, tmp_path)
-    assert process.run_cell(made).isolated is (isolation.problem() is None)
-    monkeypatch.setenv(isolation.ISOLATION, "off")
-    assert isolation.problem() == "ASH_BENCH_ISOLATION=off"
+    assert run.run_cell(made).isolated is (sandbox.problem() is None)
+    monkeypatch.setenv(sandbox.ISOLATION, "off")
+    assert sandbox.problem() == "ASH_BENCH_ISOLATION=off"
     (made.folder / "result.json").unlink()
-    assert process.run_cell(made).isolated is False
+    assert run.run_cell(made).isolated is False

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.cell.methods import code_version
+from benchmarks.cell.registry import code_version
 from benchmarks.cell.sources import imported_from, sources_below
 
 PROJECT = """
@@ -41,7 +41,7 @@ def write_project(folder: Path) -> Path:
 def version_of(method: str, *places: Path) -> str:
     """As another process sees it, with these places on its path."""
     program = f"import sys; sys.path[:0] = {[str(place) for place in places]!r}\n"
-    program += f"from benchmarks.cell.methods import code_version; print(code_version({method!r}))"
+    program += f"from benchmarks.cell.registry import code_version; print(code_version({method!r}))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout

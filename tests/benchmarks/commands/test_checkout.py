@@ -6,7 +6,7 @@ import pytest
 from helpers.commands import refused
 
 from benchmarks import cli
-from benchmarks.cell import isolation
+from benchmarks.cell import sandbox
 from benchmarks.commands import arguments
 
 
@@ -41,7 +41,7 @@ def test_isolation_is_tested_without_namespaces_as_well(
 
     monkeypatch.setattr(subprocess, "run", run)
     monkeypatch.setattr(os, "geteuid", lambda: 0)
-    monkeypatch.setattr(isolation, "problem", lambda: "refused" if refused_by_the_kernel else None)
+    monkeypatch.setattr(sandbox, "problem", lambda: "refused" if refused_by_the_kernel else None)
     assert cli.main(["test"]) == (arguments.DONE if refused_by_the_kernel else arguments.FAILED)
     assert any("without_namespaces.sh" in command[1] for command in asked) != refused_by_the_kernel
     last = capsys.readouterr().out.splitlines()[-2:]

@@ -15,8 +15,8 @@ import ash.devices
 from ash.devices import cuda_error
 from ash.files import InputError
 from benchmarks import cli
-from benchmarks.cell.cells import CellConfig, read_cell, read_result, write_config, write_result
-from benchmarks.cell.process import placed_on
+from benchmarks.cell.run import placed_on
+from benchmarks.cell.schema import CellConfig, read_cell, read_result, write_config, write_result
 from benchmarks.commands import doctor
 from benchmarks.commands.devices import chosen_device, on_device
 from benchmarks.play.avatars import open_avatars

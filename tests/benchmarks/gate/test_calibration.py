@@ -13,7 +13,7 @@ from helpers.captures import tiny_preset, write_tube_capture
 from ash.capture.dataset import Capture, Pose
 from ash.files import InputError, read_json
 from ash.protocol import Avatar, StageClock
-from benchmarks.cell.methods import code_version, find_method
+from benchmarks.cell.registry import code_version, find_method
 from benchmarks.gate import calibration, gate, remeasure
 from benchmarks.suites.files import read_suite
 from benchmarks.suites.runs import RunOptions

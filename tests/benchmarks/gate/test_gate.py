@@ -11,9 +11,9 @@ from markdown_it import MarkdownIt
 
 from ash.files import InputError
 from benchmarks import provenance
-from benchmarks.cell.cells import CellConfig, CellResult, Summary, Timing, ViewScore, failed_result
-from benchmarks.cell.methods import methods
 from benchmarks.cell.metrics import PROTOCOL
+from benchmarks.cell.registry import methods
+from benchmarks.cell.schema import CellConfig, CellResult, Summary, Timing, ViewScore, failed_result
 from benchmarks.gate import summary
 from benchmarks.gate.gate import (
     TIMED_AGAIN,

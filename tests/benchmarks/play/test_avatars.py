@@ -11,8 +11,8 @@ from helpers import fakes
 
 from ash.files import InputError, read_image
 from benchmarks import cli
-from benchmarks.cell.cells import read_cell
 from benchmarks.cell.metrics import on_black
+from benchmarks.cell.schema import read_cell
 from benchmarks.play.avatars import load_avatar
 
 SCRIPT = Path(__file__).parents[3] / "docs" / "draw_a_frame.py"

@@ -15,7 +15,7 @@ from helpers.waiting import wait_for
 
 from ash.files import InputError
 from benchmarks import cli
-from benchmarks.cell.cells import Cell, CellResult
+from benchmarks.cell.schema import Cell, CellResult
 from benchmarks.report.compare import changes, printed, verdict_of
 from benchmarks.suites import runs as runs_module
 from benchmarks.suites.files import read_suite

@@ -17,8 +17,8 @@ from ash.files import InputError
 from ash.protocol import TrainingOutcome
 from benchmarks import cli
 from benchmarks.analysis.results import Quantity, RunTables
-from benchmarks.cell.cells import CellResult, Summary, failed_result, result_of
 from benchmarks.cell.metrics import PROTOCOL
+from benchmarks.cell.schema import CellResult, Summary, failed_result, result_of
 from benchmarks.commands import arguments
 from benchmarks.report import charts, sentences, tables, vega
 from benchmarks.report.content import Text

@@ -11,7 +11,7 @@ from PIL import Image
 
 from ash.files import InputError
 from benchmarks.analysis.results import RunTables
-from benchmarks.cell.cells import Cell, CellResult, Summary, failed_result
+from benchmarks.cell.schema import Cell, CellResult, Summary, failed_result
 from benchmarks.report import people
 from benchmarks.report.content import Bullets, Table
 from benchmarks.report.pictures import Album

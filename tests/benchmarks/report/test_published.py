@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.cell.methods import code_version
+from benchmarks.cell.registry import code_version
 
 REPORTS = Path(__file__).parents[3] / "reports"
 ROW = re.compile(r"^\| \[.+?\]\((?P<file>[^)]+)\).*? \| (?P<state>[^|]+) \|", re.MULTILINE)

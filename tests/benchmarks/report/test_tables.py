@@ -8,7 +8,9 @@ import pytest
 from ash.files import InputError
 from benchmarks.analysis.results import COLUMNS, RunTables, csv_of, foreground, load, read_csv, samples_of
 from benchmarks.analysis.statistics import independent
-from benchmarks.cell.cells import (
+from benchmarks.cell.curves import read_curve
+from benchmarks.cell.metrics import METRICS
+from benchmarks.cell.schema import (
     Cell,
     CellConfig,
     CellResult,
@@ -23,8 +25,6 @@ from benchmarks.cell.cells import (
     write_config,
     write_result,
 )
-from benchmarks.cell.curves import read_curve
-from benchmarks.cell.metrics import METRICS
 from benchmarks.report.sentences import doubts
 from benchmarks.report.tables import build, quality_columns
 

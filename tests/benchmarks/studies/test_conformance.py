@@ -10,8 +10,8 @@ from ash.capture.formats import load_capture
 from ash.capture.manifest import verify_capture
 from ash.files import sha256_of
 from benchmarks import cli
-from benchmarks.cell.cells import Cell, CellConfig, read_result
-from benchmarks.cell.sealing import Tampering, Trespass, seen_by_method, training_copy, watched
+from benchmarks.cell.access_guard import InputModifiedError, TruthAccessError, seen_by_method, training_copy, watched
+from benchmarks.cell.schema import Cell, CellConfig, read_result
 from benchmarks.commands import arguments
 from benchmarks.studies.conformance import check_method
 from benchmarks.suites.engine import Limits, run_in_process, write_config
@@ -96,13 +96,13 @@ def test_what_is_closed_cannot_be_opened_listed_or_changed(capture: Path, tmp_pa
             lambda: list((capture / "truth").iterdir()),
             lambda: (capture / "frames" / "cam0" / ".." / "cam4" / image.name).read_bytes(),
         ):
-            with pytest.raises(Trespass, match="held-out"), watched(whole, seen):
+            with pytest.raises(TruthAccessError, match="held-out"), watched(whole, seen):
                 forbidden()
         own = seen.folder / "frames" / "cam0" / "000000.png"
         with watched(whole, seen):
             assert own.read_bytes() and (tmp_path / "elsewhere").write_bytes(b"fine")
         for change in (lambda: own.write_bytes(b""), own.unlink, lambda: own.rename(tmp_path / "x")):
-            with pytest.raises(Tampering), watched(whole, seen):
+            with pytest.raises(InputModifiedError), watched(whole, seen):
                 change()
         assert image.read_bytes(), "the harness itself may read"
     assert not (tmp_path / "copy").exists()

@@ -15,7 +15,7 @@ from helpers import fakes
 from helpers.waiting import wait_for
 
 from ash.files import InputError
-from benchmarks.cell.cells import read_result
+from benchmarks.cell.schema import read_result
 from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells
 from benchmarks.suites.gpus import VISIBLE
 from benchmarks.suites.progress import Progress
@@ -102,7 +102,7 @@ def test_cells_that_learn_on_cuda_go_where_a_gpu_is(cluster, tmp_path: Path) -> 
 KILL_WHEN_BUSY = """
 import os, signal, sys, time, psutil
 worker = psutil.Process(int(sys.argv[1]))
-while not any("benchmarks.cell.process" in " ".join(child.cmdline()) for child in worker.children()):
+while not any("benchmarks.cell.run" in " ".join(child.cmdline()) for child in worker.children()):
     time.sleep(0.02)
 worker.kill()
 """

@@ -15,8 +15,8 @@ from helpers import fakes
 from helpers.waiting import wait_for
 
 from ash.files import InputError
-from benchmarks.cell.cells import Cell, read_result
 from benchmarks.cell.metrics import PROTOCOL
+from benchmarks.cell.schema import Cell, read_result
 from benchmarks.suites import engine
 from benchmarks.suites.engine import CellPlan, Limits, make_executor, plan_cells, run_cells, run_in_process, shard_of
 from benchmarks.suites.progress import Progress
@@ -136,7 +136,7 @@ def test_shards_cover_all_cells_once() -> None:
 def test_interrupting_ends_the_children_and_the_cell_can_be_resumed(capture: Path, tmp_path: Path) -> None:
     target = cell("sleeping", capture, tmp_path)
     code = (
-        "import io; from pathlib import Path; from benchmarks.cell.cells import read_cell\n"
+        "import io; from pathlib import Path; from benchmarks.cell.schema import read_cell\n"
         "from benchmarks.suites.engine import *\n"
         "from benchmarks.suites.progress import Progress\n"
         f"cell = read_cell(Path({str(target.folder)!r}))\n"

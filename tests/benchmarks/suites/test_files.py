@@ -9,8 +9,8 @@ from helpers import fakes
 
 from ash.files import InputError
 from benchmarks.analysis.style import is_ours, style_of, titles_of, user_rows
-from benchmarks.cell.cells import write_config
-from benchmarks.cell.methods import WRONG_BY_MM, is_oracle
+from benchmarks.cell.registry import WRONG_BY_MM, is_oracle
+from benchmarks.cell.schema import write_config
 from benchmarks.suites.captures import described
 from benchmarks.suites.files import find_suite, given_captures, line_of, read_suite, suite_files
 from benchmarks.suites.runs import Run, cell_for, read_run, write_run

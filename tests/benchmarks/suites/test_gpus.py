@@ -11,7 +11,7 @@ from helpers.cells import config
 import ash.devices
 import benchmarks.commands.runs
 from benchmarks import cli
-from benchmarks.cell.cells import Cell, read_result
+from benchmarks.cell.schema import Cell, read_result
 from benchmarks.suites import gpus
 from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells
 from benchmarks.suites.gpus import VISIBLE, lent_gpu, visible_gpus

@@ -1,8 +1,8 @@
-"""A method's own process: `python -m benchmarks.cell.guest REQUESTS REPLIES ORDER`, started by `benchmarks.cell.host`.
+"""A method's process: `python -m benchmarks.cell.worker REQUESTS REPLIES ORDER`, started by `benchmarks.cell.client`.
 
 It does what it is asked, one request after another: import the factory, learn, save or load, draw. It knows no truth,
 no score and no result; whatever it answers is checked by the host. Only the standard library is imported before the
-room is entered, and of the method nothing.
+sandbox is entered, and of the method nothing.
 """
 
 import json
@@ -13,25 +13,27 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from benchmarks.cell import isolation
+from benchmarks.cell import sandbox
 
 LARGEST_HEADER = 1 << 16
 
 
 def main(argv: list[str]) -> int:
-    """Enter the room, then answer until the requests end."""
+    """Enter the sandbox, then answer until the requests end."""
     requests, replies, order = int(argv[0]), int(argv[1]), json.loads(argv[2])
-    if order["room"] is not None:
+    if order["sandbox"] is not None:
         try:
-            isolation.enter(isolation.Room(**{name: _paths(value) for name, value in order["room"].items()}))
-        except isolation.Refused as error:
+            sandbox.enter_sandbox(
+                sandbox.SandboxSpec(**{name: _paths(value) for name, value in order["sandbox"].items()})
+            )
+        except sandbox.SandboxUnavailable as error:
             print(error, file=sys.stderr, flush=True)
-            return isolation.REFUSED
+            return sandbox.SANDBOX_UNAVAILABLE
     else:
-        isolation.end_with_parent()
+        sandbox.end_with_parent()
     os.chdir(order["work"])
     _reply(replies, {"hello": True})
-    answers = Answers(order)
+    answers = Handlers(order)
     with os.fdopen(requests, "rb") as lines:
         for line in lines:
             _reply(replies, *_answer(answers, json.loads(line)))
@@ -43,7 +45,7 @@ def _paths(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _answer(answers: "Answers", request: dict[str, Any]) -> tuple[dict[str, Any], bytes]:
+def _answer(answers: "Handlers", request: dict[str, Any]) -> tuple[dict[str, Any], bytes]:
     """The reply to a request: what was asked for, or what went wrong."""
     try:
         with answers.watched():
@@ -56,7 +58,7 @@ def _answer(answers: "Answers", request: dict[str, Any]) -> tuple[dict[str, Any]
             return {"error": "harness", "message": f"{type(error).__name__}: {error}"[:2000]}, b""
         kind = "memory" if isinstance(error, MemoryError) else "crashed"
         kind = "diverged" if isinstance(error, FloatingPointError) else kind
-        from benchmarks.cell.methods import located
+        from benchmarks.cell.registry import located
 
         said = located(error, answers.order["target"]) if isinstance(error, Exception) else type(error).__name__
         return {"error": kind, "message": said[:2000]}, b""
@@ -70,7 +72,7 @@ def _reply(descriptor: int, header: dict[str, Any], payload: bytes = b"") -> Non
             view = view[os.write(descriptor, view) :]
 
 
-class Answers:
+class Handlers:
     """The method, and what it can be asked."""
 
     def __init__(self, order: dict[str, Any]) -> None:
@@ -84,10 +86,10 @@ class Answers:
         self.cameras: Any = None
 
     def watched(self) -> AbstractContextManager[None]:
-        """Without a room, Python's audit hook stands in for one."""
+        """Without a sandbox, Python's audit hook watches instead."""
         if not self.order["closed"]:
             return nullcontext()
-        from benchmarks.cell.sealing import watched_folders
+        from benchmarks.cell.access_guard import watched_folders
 
         return watched_folders(self.order["closed"], Path(self.order["input"]))
 
@@ -97,7 +99,7 @@ class Answers:
 
         from ash.capture.formats import load_capture
         from benchmarks.cell.children import add_method_paths
-        from benchmarks.cell.methods import Method, configured
+        from benchmarks.cell.registry import Method, configured
 
         add_method_paths()
         store = Path(self.order["store"]) if self.order["store"] else None
@@ -126,7 +128,7 @@ class Answers:
         self.avatar.load(Path(self.order["work"]) / name)
         return {}, b""
 
-    def do_meet(self, folder: str) -> tuple[dict[str, Any], bytes]:
+    def do_load_test_views(self, folder: str) -> tuple[dict[str, Any], bytes]:
         """Get to know the cameras and the motion that are to be drawn."""
         from ash.capture.formats import read_cameras, read_motion
 

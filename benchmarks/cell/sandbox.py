@@ -1,4 +1,4 @@
-"""A room of its own for a method: a process that sees libraries, its own folder and training data, and nothing else.
+"""A sandbox for a method: a process that can read libraries, its own folder and training data, and nothing else.
 
 On Linux, where the kernel lets a user make namespaces: a user namespace without capabilities, a file system of its own
 that holds what is listed below, no network, and a process tree that ends with its first process. Only the standard
@@ -29,11 +29,11 @@ CAPSET_VERSION = 0x20080522
 SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32", "/etc", "/opt", "/sys", "/nix")
 EMPTY = ("/tmp", "/var/tmp", "/dev/shm", "/run", "/root", "/home")
 ISOLATION = "ASH_BENCH_ISOLATION"  # "off": do without namespaces, as where the kernel has none
-REFUSED = 77  # exit code of a process that could not have its room; why is on standard error
+SANDBOX_UNAVAILABLE = 77  # exit code of a process that could not enter its sandbox; standard error says why
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Room:
+class SandboxSpec:
     """What a method's process sees besides the system: absolute paths."""
 
     readable: tuple[str, ...]  # its input, libraries, its own sources
@@ -42,18 +42,18 @@ class Room:
     base: str  # an empty folder on which the new file system is put together
 
 
-class Refused(OSError):
+class SandboxUnavailable(OSError):
     """This kernel, or its settings, do not let us have a namespace."""
 
 
-def enter(room: Room) -> None:
-    """Return in a process inside the room; the calling process stays outside, waits, and ends as that one does.
+def enter_sandbox(spec: SandboxSpec) -> None:
+    """Return in a process inside the sandbox; the calling process stays outside, waits, and ends as that one does.
 
     Raises:
-        Refused: this system has no such rooms; nothing has changed for the caller then.
+        SandboxUnavailable: this system allows none; nothing has changed for the caller then.
     """
     if not sys.platform.startswith("linux") or os.uname().machine not in PIVOT_ROOT:
-        raise Refused("namespaces are Linux's")
+        raise SandboxUnavailable("namespaces are Linux's")
     uid, gid = os.getuid(), os.getgid()
     _call("unshare", CLONE_NEWUSER | CLONE_NEWPID | CLONE_NEWNET | CLONE_NEWIPC)
     _write("/proc/self/setgroups", "deny")
@@ -65,11 +65,11 @@ def enter(room: Room) -> None:
         _end_as(first)
     _die_with_parent()
     try:
-        _furnish(room)
+        _mount_filesystem(spec)
         _drop_capabilities()
     except OSError as error:
         print(f"{error}", file=sys.stderr, flush=True)
-        os._exit(REFUSED)
+        os._exit(SANDBOX_UNAVAILABLE)
     # The first process of a process namespace is deaf to signals from inside: it only waits for the one that works.
     worker = os.fork()
     if worker:
@@ -86,14 +86,14 @@ def problem() -> str | None:
 def _kernel_problem() -> str | None:
     """What the kernel says when an empty file system of its own is asked for: tried in a process without threads."""
     with tempfile.TemporaryDirectory() as base:
-        command = [sys.executable, "-P", "-m", "benchmarks.cell.isolation", base]
+        command = [sys.executable, "-P", "-m", "benchmarks.cell.sandbox", base]
         tried = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
     lines = tried.stderr.strip().splitlines()
     return None if tried.returncode == 0 else lines[-1] if lines else f"the trial ended with {tried.returncode}"
 
 
 def end_with_parent() -> None:
-    """Without a room: end when the parent ends, whatever ends it."""
+    """Without a sandbox: end when the parent ends, whatever ends it."""
     if sys.platform.startswith("linux"):
         _die_with_parent()
 
@@ -129,40 +129,40 @@ def _die_with_parent() -> None:
         os._exit(1)
 
 
-def _furnish(room: Room) -> None:
+def _mount_filesystem(spec: SandboxSpec) -> None:
     """Put the new file system together and make it the root."""
     _call("unshare", CLONE_NEWNS)
     _mount("none", "/", None, MS_REC | MS_PRIVATE)
-    _mount("tmpfs", room.base, "tmpfs", 0, "mode=755")
+    _mount("tmpfs", spec.base, "tmpfs", 0, "mode=755")
     for place in SYSTEM:
         if os.path.islink(place):
-            os.symlink(os.readlink(place), room.base + place)
+            os.symlink(os.readlink(place), spec.base + place)
         elif os.path.isdir(place):
-            _bind(room.base, place, read_only=True)
-    _bind(room.base, "/dev", read_only=False)
-    os.makedirs(room.base + "/proc", exist_ok=True)
+            _bind(spec.base, place, read_only=True)
+    _bind(spec.base, "/dev", read_only=False)
+    os.makedirs(spec.base + "/proc", exist_ok=True)
     try:
-        _mount("proc", room.base + "/proc", "proc", 0)
-    except Refused:  # In a container whose /proc is masked in part.
-        _mount("/proc", room.base + "/proc", None, MS_BIND | MS_REC)
+        _mount("proc", spec.base + "/proc", "proc", 0)
+    except SandboxUnavailable:  # In a container whose /proc is masked in part.
+        _mount("/proc", spec.base + "/proc", None, MS_BIND | MS_REC)
     for settings in ("/proc/sys", "/proc/sysrq-trigger"):  # Of the machine; root outside may write them.
-        if os.path.exists(room.base + settings):
-            _mount(room.base + settings, room.base + settings, None, MS_BIND | MS_REC)
-            _make_read_only(room.base + settings)
+        if os.path.exists(spec.base + settings):
+            _mount(spec.base + settings, spec.base + settings, None, MS_BIND | MS_REC)
+            _make_read_only(spec.base + settings)
     for place in EMPTY:
         if os.path.isdir(place) or place == "/tmp":
-            _empty(room.base + place)
-    for place in _outermost(room.readable):
-        _bind(room.base, place, read_only=True)
-    for place in room.hidden:
-        if os.path.isdir(room.base + place):
-            _empty(room.base + place)
-    for place in sorted(set(room.readable)):  # What lies inside a hidden folder is put back.
-        if not os.path.exists(room.base + place):
-            _bind(room.base, place, read_only=True)
-    for place in room.writable:
-        _bind(room.base, place, read_only=False)
-    os.chdir(room.base)
+            _empty(spec.base + place)
+    for place in _outermost(spec.readable):
+        _bind(spec.base, place, read_only=True)
+    for place in spec.hidden:
+        if os.path.isdir(spec.base + place):
+            _empty(spec.base + place)
+    for place in sorted(set(spec.readable)):  # What lies inside a hidden folder is put back.
+        if not os.path.exists(spec.base + place):
+            _bind(spec.base, place, read_only=True)
+    for place in spec.writable:
+        _bind(spec.base, place, read_only=False)
+    os.chdir(spec.base)
     _syscall("pivot_root", PIVOT_ROOT[os.uname().machine], b".", b".")
     _call("umount2", b".", MNT_DETACH)
     os.chdir("/")
@@ -193,7 +193,7 @@ def _make_read_only(target: str) -> None:
     attributes = (ctypes.c_uint64 * 4)(ATTR_RDONLY, 0, 0, 0)
     try:
         _syscall("mount_setattr", MOUNT_SETATTR, AT_FDCWD, target.encode(), AT_RECURSIVE, attributes, 32)
-    except Refused:  # A kernel before 5.12: the folder itself, not what is mounted below.
+    except SandboxUnavailable:  # A kernel before 5.12: the folder itself, not what is mounted below.
         kept = os.statvfs(target).f_flag & KEPT_FLAGS
         _mount("none", target, None, MS_REMOUNT | MS_BIND | MS_RDONLY | kept)
 
@@ -222,7 +222,7 @@ def _write(path: str, text: str) -> None:
         with open(path, "w") as file:
             file.write(text)
     except OSError as error:
-        raise Refused(error.errno, f"{path}: {error.strerror}") from error
+        raise SandboxUnavailable(error.errno, f"{path}: {error.strerror}") from error
 
 
 def _libc() -> ctypes.CDLL:
@@ -232,18 +232,18 @@ def _libc() -> ctypes.CDLL:
 def _call(name: str, *arguments: object, about: str = "") -> None:
     if getattr(_libc(), name)(*arguments) != 0:
         number = ctypes.get_errno()
-        raise Refused(number, f"{name}{about and ' ' + about}: {os.strerror(number)}")
+        raise SandboxUnavailable(number, f"{name}{about and ' ' + about}: {os.strerror(number)}")
 
 
 def _syscall(name: str, number: int, *arguments: object) -> None:
     if _libc().syscall(ctypes.c_long(number), *arguments) != 0:
         error = ctypes.get_errno()
-        raise Refused(error, f"{name}: {os.strerror(error)}")
+        raise SandboxUnavailable(error, f"{name}: {os.strerror(error)}")
 
 
 if __name__ == "__main__":
     try:
-        enter(Room(readable=libraries(), writable=(), hidden=(), base=sys.argv[1]))
-    except Refused as error:
+        enter_sandbox(SandboxSpec(readable=libraries(), writable=(), hidden=(), base=sys.argv[1]))
+    except SandboxUnavailable as error:
         print(error, file=sys.stderr, flush=True)
-        sys.exit(REFUSED)
+        sys.exit(SANDBOX_UNAVAILABLE)

@@ -29,11 +29,11 @@ STARTING = ("subprocess.Popen", "os.exec", "os.posix_spawn", "os.system", "ctype
 WRITE_FLAGS = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 
 
-class Trespass(RuntimeError):
+class TruthAccessError(RuntimeError):
     """A method opened what it must not see."""
 
 
-class Tampering(Trespass):
+class InputModifiedError(TruthAccessError):
     """A method changed what it must not touch."""
 
 
@@ -94,7 +94,7 @@ def watched(capture: Capture, seen: Capture) -> Iterator[None]:
     An oracle, which sees the capture itself, is not watched.
 
     Raises:
-        Trespass: at the forbidden call, and again at the end in case that the method swallowed it.
+        TruthAccessError: at the forbidden call, and again at the end in case that the method swallowed it.
     """
     with watched_folders([] if seen.folder == capture.folder else [str(capture.folder)], seen.folder):
         yield
@@ -127,7 +127,7 @@ class _Watch:
     installed = False
     closed = ""
     untouchable = ""
-    caught: Trespass | None = None
+    caught: TruthAccessError | None = None
 
 
 _watch = _Watch()
@@ -143,23 +143,23 @@ def _audit(event: str, arguments: tuple[Any, ...]) -> None:
     if not _watch.closed or not arguments:
         return
     if event in STARTING and _watch.closed in repr(arguments):
-        _refuse(Trespass(f"the method started {arguments[0]!r} on held-out views or truth"))
+        _refuse(TruthAccessError(f"the method started {arguments[0]!r} on held-out views or truth"))
     if event not in (*READING, *CHANGING, *NAMING):
         return
     if not isinstance(arguments[0], (str, bytes, os.PathLike)):
         return  # A descriptor: whatever it belongs to was opened before.
     path = os.path.realpath(os.fsdecode(arguments[0]))
     if _inside(path, _watch.closed):
-        _refuse(Trespass(f"the method opened {path}: held-out views or truth"))
+        _refuse(TruthAccessError(f"the method opened {path}: held-out views or truth"))
     changes = event in CHANGING or (event == "open" and bool((arguments[2] or 0) & WRITE_FLAGS))
     if changes and _inside(path, _watch.untouchable):
-        _refuse(Tampering(f"the method changed its input: {path}"))
+        _refuse(InputModifiedError(f"the method changed its input: {path}"))
 
 
 def _inside(path: str, folder: str) -> bool:
     return path == folder or path.startswith(folder + os.sep)
 
 
-def _refuse(error: Trespass) -> None:
+def _refuse(error: TruthAccessError) -> None:
     _watch.caught = _watch.caught or error
     raise error

@@ -50,7 +50,7 @@ class CellConfig:
     seed: int
     code: str  # SHA-256 over the sources that decide the outcome
     truth: str = ""  # what the capture shows, on any machine: hash of scene, generator and perturbation
-    axis: str = ""  # the stress axis along which the capture is spoilt; none: the clean capture
+    axis: str = ""  # the axis of the perturbation; empty: the clean capture
     severity: float = 0.0
     factory: str = ""  # an entry point or `package.module:factory`, where the row `method` has another name than that
     changes: dict[str, Any] = field(default_factory=dict)  # in the method's configuration: dotted key to new value
@@ -74,7 +74,7 @@ class CellConfig:
 
     @property
     def place(self) -> str:
-        """The scene, and how its capture is spoilt."""
+        """The scene, and the perturbation of its capture."""
         return f"{self.scene} {self.axis}={self.severity:g}" if self.axis else self.scene
 
     @property
@@ -163,7 +163,7 @@ class CellResult:
     provenance: Provenance | None = None
     drawn_on: str = ""  # device of its pictures: `eval` may take another than the one that learned; empty: unknown
     evaluated_code: str = ""  # of `eval`, where it is not the code of the config, which trained; empty: the same code
-    isolated: bool | None = None  # whether the method had a room of its own; None: an oracle, a failure, an old result
+    isolated: bool | None = None  # whether the method ran in a sandbox; None: an oracle, a failure, an old result
 
     def value(self, split: str, region: str, metric: str) -> float | None:
         """One number of the summary."""

@@ -1,4 +1,4 @@
-"""One trial of a method for `ash-bench check-method`, in a process of its own (`benchmarks.studies.locked`).
+"""One trial of a method for `ash-bench check-method`, in a process of its own (`benchmarks.studies.conformance_entry`).
 
 Its folder holds `trial.json` (what to do); `outcome.json` is left there. Nothing is scored: pictures are hashed and
 compared by `benchmarks.studies.conformance`. What an outcome says of arrays and bad poses is told by the process in
@@ -24,9 +24,9 @@ from ash.capture.manifest import verify_capture
 from ash.capture.typed import from_json
 from ash.files import InputError, read_json, write_json
 from ash.protocol import Avatar, StageClock
+from benchmarks.cell.access_guard import InputModifiedError, TruthAccessError, watched_folders
 from benchmarks.cell.children import add_method_paths
-from benchmarks.cell.methods import find_method, located
-from benchmarks.cell.sealing import Tampering, Trespass, watched_folders
+from benchmarks.cell.registry import find_method, located
 from benchmarks.cell.timing import peak_memory_mb
 
 SLACK = 1e-3  # By how much values may leave 0..1, and the alpha that counts as none: rounding, not light.
@@ -40,7 +40,7 @@ class Trial:
     oracle: bool
     capture: str  # the folder of the capture, which only oracles see
     input: str  # the folder of what the method sees
-    exam: str  # the folder with the cameras and the motion that are drawn
+    test_views: str  # the folder with the cameras and the motion that are drawn
     views: tuple[tuple[str, int], ...]  # camera and frame of each picture
     preset: str
     seed: int
@@ -101,8 +101,8 @@ def read_outcome(folder: Path) -> Outcome | None:
 def perform(trial: Trial, folder: Path) -> Outcome:
     """Build, train or load, draw, and look at what changed."""
     seen = load_capture(Path(trial.input))
-    cameras = read_cameras(Path(trial.exam) / "cameras.json")
-    motion = read_motion(Path(trial.exam) / "motion.npz", joints=len(seen.skeleton.names))
+    cameras = read_cameras(Path(trial.test_views) / "cameras.json")
+    motion = read_motion(Path(trial.test_views) / "motion.npz", joints=len(seen.skeleton.names))
     drawn = replace(seen, cameras=cameras, motion=motion)
     factory = find_method(trial.target).load()
     start = time.perf_counter()
@@ -111,9 +111,9 @@ def perform(trial: Trial, folder: Path) -> Outcome:
         closed = [] if trial.oracle else [trial.capture]
         with watched_folders(closed, seen.folder), _untouched(seen, "capture"):
             found = _performed(trial, folder, drawn, seen, factory)
-    except (Changed, Tampering) as error:
+    except (Changed, InputModifiedError) as error:
         found = replace(found, input=str(error))
-    except Trespass as error:
+    except TruthAccessError as error:
         found = replace(found, held_out=str(error))
     if not found.input and (problems := verify_capture(seen.folder)):
         found = replace(found, input=f"a file of the capture: {problems[0]}")
@@ -187,7 +187,7 @@ def bad_pose_problem(avatar: Avatar, capture: Capture, view: tuple[str, int]) ->
     for name, bad in cases.items():
         try:
             avatar.render(bad, camera, clock=StageClock())
-        except Trespass:
+        except TruthAccessError:
             raise
         except ValueError as error:
             if not str(error):

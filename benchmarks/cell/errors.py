@@ -1,7 +1,7 @@
 """How a method may fail: what it did, what was done to it, and what it did to others."""
 
 from ash.files import one_line
-from benchmarks.cell.cells import Status
+from benchmarks.cell.schema import Status
 
 
 class MethodFailed(Exception):

@@ -1,6 +1,6 @@
-"""One cell, in a process of its own: train, render, score, time; `python -m benchmarks.cell.process FOLDER`.
+"""One cell, in a process of its own: train, render, score, time; `python -m benchmarks.cell.run FOLDER`.
 
-No code of the method runs in this process: it learns and draws in another (`benchmarks.cell.host`), and ends before
+No code of the method runs in this process: it learns and draws in another (`benchmarks.cell.client`), and ends before
 anything is scored. So these exit codes are the harness's own word: 0 a result was written (also that of a method that
 failed), 2 wrong input (on stderr), 75 the disk is full, 130 interrupted, 76 the method's process was killed by somebody
 else; the last three without a result.
@@ -25,7 +25,21 @@ from ash.capture.manifest import verify_capture
 from ash.files import InputError, disk_problem
 from ash.protocol import Avatar
 from benchmarks import provenance
-from benchmarks.cell.cells import (
+from benchmarks.cell.access_guard import seen_by_method, watched
+from benchmarks.cell.children import add_method_paths, adopt_orphans
+from benchmarks.cell.client import WORK, MethodClient, open_client, stage_in, stage_out
+from benchmarks.cell.errors import CaptureModifiedError, HarnessFailed, Killed, MethodFailed
+from benchmarks.cell.evaluation import (
+    MethodOutputs,
+    _flicker_summary,
+    _gap_summary,
+    _image_summary,
+    draw_all,
+    judge,
+    scored_views,
+)
+from benchmarks.cell.registry import ORACLES, code_version, configured, find_method, offered
+from benchmarks.cell.schema import (
     CHECKPOINT,
     Cell,
     CellConfig,
@@ -37,21 +51,7 @@ from benchmarks.cell.cells import (
     result_of,
     write_result,
 )
-from benchmarks.cell.children import add_method_paths, adopt_orphans
-from benchmarks.cell.evaluation import (
-    Submission,
-    _flicker_summary,
-    _gap_summary,
-    _image_summary,
-    draw_all,
-    judge,
-    scored_views,
-)
-from benchmarks.cell.failing import CaptureModifiedError, HarnessFailed, Killed, MethodFailed
-from benchmarks.cell.host import WORK, Host, give_files, hosted, take_files
-from benchmarks.cell.methods import ORACLES, code_version, configured, find_method, offered
-from benchmarks.cell.sealing import seen_by_method, watched
-from benchmarks.cell.timing import Spent
+from benchmarks.cell.timing import TrainingTime
 from benchmarks.cell.views import View
 
 DISK_FULL, KILLED = 75, 76  # exit codes
@@ -61,7 +61,7 @@ TEMPLATES = "templates"  # Beside the captures: learned once, shared by methods 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the cell whose folder is given, unless it is finished."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.cell.process")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.cell.run")
     parser.add_argument("folder", type=Path)
     parser.add_argument("--follow-parent", action="store_true", help="end when standard input ends")
     arguments = parser.parse_args(argv)
@@ -140,8 +140,8 @@ def evaluate_cell(cell: Cell, *, device: str | None = None) -> CellResult:
     spent = _spent_before(before)
     try:
         there = cell if device is None else replace(cell, config=placed_on(cell.config, device))
-        with trained_host(there, capture) as host:
-            drawn = draw_all(cell, capture, host)
+        with trained_client(there, capture) as client:
+            drawn = draw_all(cell, capture, client)
         judged = judge(cell, capture, drawn, spent, before.training)
         code = code_version(cell.config.source)
         result = replace(
@@ -201,16 +201,16 @@ def rescore_cell(cell: Cell) -> CellResult:
 
 def _train_and_evaluate(cell: Cell, capture: Capture) -> CellResult:
     """The method learns and draws in a process of its own, then ends; what it drew is scored in this one."""
-    with _hosted(cell, capture) as host:
-        made = host.make()
-        host.fit()
-        host.save()
-        drawn = draw_all(cell, capture, host)
-    take_files(cell)
+    with _with_client(cell, capture) as client:
+        made = client.make()
+        client.fit()
+        client.save()
+        drawn = draw_all(cell, capture, client)
+    stage_out(cell)
     return judge(cell, capture, drawn, _training_time(cell, made, drawn))
 
 
-def _training_time(cell: Cell, made: Spent, drawn: Submission) -> Spent:
+def _training_time(cell: Cell, made: TrainingTime, drawn: MethodOutputs) -> TrainingTime:
     """What training took: everything before the first picture, but for a template that ours learned for all methods.
 
     A method of others that learns a template has that in its training; what it says about it is not believed.
@@ -218,37 +218,40 @@ def _training_time(cell: Cell, made: Spent, drawn: Submission) -> Spent:
     template_s = drawn.described.template_s if find_method(cell.config.source).is_ours else None
     whole = drawn.prepared
     assert whole.cpu_s is not None and made.cpu_s is not None
-    return Spent(
+    return TrainingTime(
         wall_s=whole.wall_s - min(template_s or 0.0, made.wall_s),
         cpu_s=whole.cpu_s - min(template_s or 0.0, made.cpu_s),
     )
 
 
 @contextmanager
-def trained_host(cell: Cell, capture: Capture, *, secret: tuple[Path, ...] = ()) -> Iterator[Host]:
+def trained_client(cell: Cell, capture: Capture, *, secret: tuple[Path, ...] = ()) -> Iterator[MethodClient]:
     """A process that holds a cell's trained avatar, to be drawn by; it sees nothing of `secret` either.
 
     Raises:
         MethodFailed: the method does not load any more, or what the body asks of it goes wrong.
     """
-    give_files(cell)
-    with _hosted(cell, capture, secret=secret) as host:
-        host.make()
-        host.load()
-        yield host
+    stage_in(cell)
+    with _with_client(cell, capture, secret=secret) as client:
+        client.make()
+        client.load()
+        yield client
 
 
 @contextmanager
-def _hosted(cell: Cell, capture: Capture, *, secret: tuple[Path, ...] = ()) -> Iterator[Host]:
+def _with_client(cell: Cell, capture: Capture, *, secret: tuple[Path, ...] = ()) -> Iterator[MethodClient]:
     method, oracle = find_method(cell.config.source), cell.config.source in ORACLES
     exposed = False
     try:
-        with _seen(cell, capture) as seen, hosted(cell, capture, seen, method, oracle=oracle, secret=secret) as host:
-            if not host.isolated and (damage := _damage(cell, capture)):
+        with (
+            _seen(cell, capture) as seen,
+            open_client(cell, capture, seen, method, oracle=oracle, secret=secret) as client,
+        ):
+            if not client.isolated and (damage := _damage(cell, capture)):
                 raise InputError(f"{cell.capture_folder}: {damage}")
-            exposed = not host.isolated
+            exposed = not client.isolated
             try:
-                yield host
+                yield client
             except MethodFailed as error:
                 require_disk(cell.folder, error)
                 raise
@@ -333,10 +336,10 @@ def _finished(cell: Cell) -> CellResult:
     return result
 
 
-def _spent_before(result: CellResult) -> Spent:
+def _spent_before(result: CellResult) -> TrainingTime:
     """What a finished cell's training took."""
     clock, cpu_s, whole = (result.value("speed", "", name) for name in ("train_wall_s", "train_cpu_s", "train_s"))
-    return Spent(wall_s=clock or whole or 0.0, cpu_s=cpu_s)
+    return TrainingTime(wall_s=clock or whole or 0.0, cpu_s=cpu_s)
 
 
 def _provenance(wall_s: float) -> Provenance:

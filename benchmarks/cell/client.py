@@ -30,18 +30,19 @@ from ash.capture.formats import write_cameras, write_motion
 from ash.capture.typed import from_json
 from ash.files import require_plain
 from ash.protocol import TrainingOutcome
-from benchmarks.cell import isolation
-from benchmarks.cell.cells import CHECKPOINT, Cell, DrawnBy, Status
-from benchmarks.cell.children import kill_process_tree, pass_on, peak_memory_mb
-from benchmarks.cell.failing import HarnessFailed, Killed, MethodFailed
-from benchmarks.cell.guest import LARGEST_HEADER
-from benchmarks.cell.kernels import KERNELS, give_kernels, looking_in
-from benchmarks.cell.methods import OUR_PACKAGES, Method
+from benchmarks.cell import sandbox
+from benchmarks.cell.children import kill_process_tree, peak_memory_mb, relay_output
+from benchmarks.cell.errors import HarnessFailed, Killed, MethodFailed
+from benchmarks.cell.kernels import KERNELS, copy_kernel_cache, kernel_env
+from benchmarks.cell.registry import OUR_PACKAGES, Method
+from benchmarks.cell.schema import CHECKPOINT, Cell, DrawnBy, Status
 from benchmarks.cell.sources import editable_folder, package_files
-from benchmarks.cell.timing import Spent
+from benchmarks.cell.timing import TrainingTime
 from benchmarks.cell.views import View
+from benchmarks.cell.worker import LARGEST_HEADER
 
-WORK, EXAM, BASE = "work", "exam", "room"  # In a cell's folder: the method's own, what it is to draw, its file system.
+# Folders in a cell's folder: the method's own, the cameras and poses to render, the root of its file system.
+WORK, TEST_VIEWS, BASE = "work", "test_views", "sandbox"
 KEPT = (CHECKPOINT, "log.jsonl")
 MOST_POINTS, MOST_COUNT = 10_000_000, 10**13
 LOWEST, HIGHEST = -0.5, 2.0  # of a picture; rounding and overbright colours leave 0..1 a little, other units far
@@ -59,7 +60,7 @@ class Timed:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Described:
+class MethodInfo:
     """What a trained method says of itself."""
 
     params: int
@@ -69,17 +70,17 @@ class Described:
     training: TrainingOutcome | None
 
 
-class Host:
+class MethodClient:
     """A method's process, and what it may be asked."""
 
     def __init__(self, process: subprocess.Popen[bytes], requests: int, replies: int, *, isolated: bool) -> None:
         self.isolated = isolated
         self._process, self._requests, self._replies = process, requests, replies
-        self._start = Spent(wall_s=0.0, cpu_s=0.0)
+        self._start = TrainingTime(wall_s=0.0, cpu_s=0.0)
 
-    def make(self) -> Spent:
+    def make(self) -> TrainingTime:
         """Import the factory and build the avatar. Returns what that took; the time of training begins here."""
-        self._start = Spent(wall_s=time.perf_counter(), cpu_s=self._cpu_seconds())
+        self._start = TrainingTime(wall_s=time.perf_counter(), cpu_s=self._cpu_seconds())
         self._ask("make")
         return self.spent()
 
@@ -92,13 +93,15 @@ class Host:
         if abs(seconds - inside) > TRAINING_SLACK_S + CLOCK_SLACK * seconds:
             raise MethodFailed("crashed", f"its clock says {inside:.1f} s of training, ours {seconds:.1f} s")
 
-    def spent(self) -> Spent:
+    def spent(self) -> TrainingTime:
         """Time since `make` began, of every request and of what the process does between them.
 
         Read before the first picture, this is the training: no work that prepares pictures is left out.
         """
         assert self._start.cpu_s is not None
-        return Spent(wall_s=time.perf_counter() - self._start.wall_s, cpu_s=self._cpu_seconds() - self._start.cpu_s)
+        return TrainingTime(
+            wall_s=time.perf_counter() - self._start.wall_s, cpu_s=self._cpu_seconds() - self._start.cpu_s
+        )
 
     def save(self) -> None:
         """Write the weights."""
@@ -108,11 +111,11 @@ class Host:
         """Read the weights, or others that it left in its folder."""
         self._ask("load", name=name)
 
-    def meet(self, folder: Path, capture: Capture) -> None:
+    def load_test_views(self, folder: Path, capture: Capture) -> None:
         """Show the cameras and motion that are to be drawn; only after training."""
         write_cameras(folder / "cameras.json", list(capture.cameras.values()))
         write_motion(folder / "motion.npz", capture.motion)
-        self._ask("meet", folder=str(folder))
+        self._ask("load_test_views", folder=str(folder))
 
     def open_display(self) -> DrawnBy:
         """Have what is timed from now on drawn by the method's display, where it has one that opens here."""
@@ -159,7 +162,7 @@ class Host:
             raise MethodFailed("crashed", f"{what}: expected {shape[0]} finite points")
         return points.reshape(-1, 3).astype(np.float64)
 
-    def describe(self) -> Described:
+    def describe(self) -> MethodInfo:
         """Counts, and what it offers."""
         header, _ = self._ask("describe")
         for name in ("params", "gaussians"):
@@ -167,7 +170,7 @@ class Host:
             if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count <= MOST_COUNT:
                 raise MethodFailed("crashed", f"{name}: {count!r}, expected a whole number, 0 or more")
         seconds = header.get("template_s")
-        return Described(
+        return MethodInfo(
             params=header["params"],
             gaussians=header["gaussians"],
             geometry=header.get("geometry") is True,
@@ -233,8 +236,8 @@ class Host:
             code = self._process.wait(5)
         except subprocess.TimeoutExpired:
             return MethodFailed("crashed", "its process closed the connection")
-        if code == isolation.REFUSED:
-            return isolation.Refused("no room")
+        if code == sandbox.SANDBOX_UNAVAILABLE:
+            return sandbox.SandboxUnavailable("no sandbox")
         if code == -signal.SIGKILL:
             return Killed()
         name = signal.Signals(-code).name if code < 0 and -code in list(signal.Signals) else f"exit code {code}"
@@ -242,15 +245,15 @@ class Host:
 
 
 @contextlib.contextmanager
-def hosted(
+def open_client(
     cell: Cell, capture: Capture, seen: Capture, method: Method, *, oracle: bool, secret: tuple[Path, ...] = ()
-) -> Iterator[Host]:
-    """A process for the method, in a room of its own where this system has one; whatever it started ends with it.
+) -> Iterator[MethodClient]:
+    """A process for the method, in a sandbox where this system allows one; whatever it started ends with it.
 
     `secret`: folders besides the capture's that it must not see.
     """
     place, work = cell.folder.resolve(), cell.folder.resolve() / WORK
-    for name in (WORK, EXAM, BASE):
+    for name in (WORK, TEST_VIEWS, BASE):
         (place / name).mkdir(parents=True, exist_ok=True)
     store = seen.store if oracle or method.target.split(".")[0] in OUR_PACKAGES else work / "templates"
     order: dict[str, Any] = {
@@ -262,36 +265,36 @@ def hosted(
         "seed": cell.config.seed,
         "preset": cell.config.preset,
         "changes": cell.config.changes,
-        "room": None,
+        "sandbox": None,
     }
-    kernels = give_kernels(cell.config.device, place)
-    wanted = not oracle and os.environ.get(isolation.ISOLATION) != "off"
+    kernels = copy_kernel_cache(cell.config.device, place)
+    wanted = not oracle and os.environ.get(sandbox.ISOLATION) != "off"
     if wanted:
         if store is not None:
             store.mkdir(parents=True, exist_ok=True)
-        room = room_for(place, capture, seen, method, store, secret=secret)
-        order["room"] = asdict(replace(room, writable=(*room.writable, str(kernels))))
-    host, pump = _start(order, kernels, isolated=wanted)
+        spec = sandbox_for(place, capture, seen, method, store, secret=secret)
+        order["sandbox"] = asdict(replace(spec, writable=(*spec.writable, str(kernels))))
+    client, pump = _start(order, kernels, isolated=wanted)
     try:
         try:
-            host._receive(0)
-        except isolation.Refused:
-            kill_process_tree(host._process)
-            host, pump = _start(order | {"room": None}, kernels, isolated=False)
-            host._receive(0)
+            client._receive(0)
+        except sandbox.SandboxUnavailable:
+            kill_process_tree(client._process)
+            client, pump = _start(order | {"sandbox": None}, kernels, isolated=False)
+            client._receive(0)
         except MethodFailed as error:
             raise HarnessFailed(f"before the method began: {error}") from error
-        yield host
+        yield client
     finally:
-        kill_process_tree(host._process)
-        for descriptor in (host._requests, host._replies):
+        kill_process_tree(client._process)
+        for descriptor in (client._requests, client._replies):
             os.close(descriptor)
         pump.join(5)
-        for name in (EXAM, BASE, KERNELS):
+        for name in (TEST_VIEWS, BASE, KERNELS):
             shutil.rmtree(place / name, ignore_errors=True)
 
 
-def take_files(cell: Cell) -> None:
+def stage_out(cell: Cell) -> None:
     """Move what a method leaves to be kept into the cell's folder: regular files only."""
     for name in KEPT:
         source = cell.folder / WORK / name
@@ -302,7 +305,7 @@ def take_files(cell: Cell) -> None:
         raise MethodFailed("crashed", f"save wrote no file {CHECKPOINT}")
 
 
-def give_files(cell: Cell) -> None:
+def stage_in(cell: Cell) -> None:
     """Put a trained cell's weights where its method finds them again."""
     (cell.folder / WORK).mkdir(parents=True, exist_ok=True)
     target = cell.folder / WORK / CHECKPOINT
@@ -329,21 +332,21 @@ def frame_times_ms(frames: list[Timed]) -> tuple[float, ...]:
     return tuple(frame.inside_ms for frame in frames)
 
 
-def room_for(
+def sandbox_for(
     place: Path, capture: Capture, seen: Capture, method: Method, store: Path | None, *, secret: tuple[Path, ...] = ()
-) -> isolation.Room:
+) -> sandbox.SandboxSpec:
     """What a method sees: libraries, its own sources, its input; it writes to `place / WORK` alone."""
     packages = {folder for name in ("ash", "baselines", "benchmarks") for folder in _package_folders(name)}
     own = _package_folders(method.target) or {str(path.resolve()) for path in package_files(method.target)}
     with contextlib.suppress(PackageNotFoundError):
         if method.distribution and (project := editable_folder(distribution(method.distribution.rpartition(" ")[0]))):
             own.add(str(project.resolve()))
-    readable = {*isolation.libraries(), *packages, *own, str(seen.folder.resolve()), str(place / EXAM)}
+    readable = {*sandbox.libraries(), *packages, *own, str(seen.folder.resolve()), str(place / TEST_VIEWS)}
     data = capture.folder.resolve()
     # The generator of truth is none of a method's business either.
     closed = {data, data.parent, place, place.parent, *(folder.resolve() for folder in secret)}
     hidden = {*map(str, closed), *_package_folders("synth")}
-    return isolation.Room(
+    return sandbox.SandboxSpec(
         readable=tuple(sorted(readable)),
         writable=(str(place / WORK), *((str(store.resolve()),) if store is not None else ())),
         hidden=tuple(sorted(hidden - readable)),
@@ -361,24 +364,24 @@ def _package_folders(target: str) -> set[str]:
     return {str(place.resolve()) for place in places}
 
 
-def _start(order: dict[str, Any], kernels: Path, *, isolated: bool) -> tuple[Host, threading.Thread]:
+def _start(order: dict[str, Any], kernels: Path, *, isolated: bool) -> tuple[MethodClient, threading.Thread]:
     theirs, requests = os.pipe()
     replies, answers = os.pipe()
-    command = [sys.executable, "-P", "-m", "benchmarks.cell.guest", str(theirs), str(answers), json.dumps(order)]
+    command = [sys.executable, "-P", "-m", "benchmarks.cell.worker", str(theirs), str(answers), json.dumps(order)]
     process = subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         pass_fds=(theirs, answers),
-        env=looking_in(kernels),
+        env=kernel_env(kernels),
     )
     os.close(theirs)
     os.close(answers)
     assert process.stdout is not None
-    pump = threading.Thread(target=pass_on, args=(process.stdout,), daemon=True)
+    pump = threading.Thread(target=relay_output, args=(process.stdout,), daemon=True)
     pump.start()
-    return Host(process, requests, replies, isolated=isolated), pump
+    return MethodClient(process, requests, replies, isolated=isolated), pump
 
 
 def _number(value: Any, what: str) -> float:
