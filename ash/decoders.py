@@ -107,13 +107,13 @@ class UNet(nn.Module):
         return as_batch([run(shape, *one, layers, threads, picks) for one in zip(texture, each, strict=True)])
 
     def _can_use_native(self, texture: Tensor) -> bool:
+        """Whether the kernels have this architecture, size and precision; the texture gets no gradient from them."""
         levels = len(self.down)
-        whole = levels > 0 and not any(size % 2**levels for size in texture.shape[2:])
-        small = self.head.in_channels * 2**levels <= NATIVE_CHANNELS
-        of_its_kind = texture.dtype == self.head.weight.dtype == torch.float32 and texture.device.type == "cpu"
-        as_it_is = not (texture.requires_grad or torch.jit.is_tracing())
-        known = not torch.is_autocast_enabled("cpu") or self._can_use_tiles()
-        return self.plain and whole and small and of_its_kind and as_it_is and known
+        divisible = levels > 0 and not any(size % 2**levels for size in texture.shape[2:])
+        narrow = self.head.in_channels * 2**levels <= NATIVE_CHANNELS
+        float32_on_cpu = texture.dtype == self.head.weight.dtype == torch.float32 and texture.device.type == "cpu"
+        precise = not torch.is_autocast_enabled("cpu") or self._can_use_tiles()
+        return self.plain and divisible and narrow and float32_on_cpu and not texture.requires_grad and precise
 
     def _can_use_tiles(self) -> bool:
         return self.head.in_channels % TILED_CHANNELS == 0 and ash.native.library.has_tiles()

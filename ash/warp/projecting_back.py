@@ -92,7 +92,7 @@ def project_backward(
     g_opacities: wp.array(dtype=float),
     g_sh: wp.array(dtype=wp.vec3),
 ):
-    """One Gaussian, over all cameras in their order: the same sum whatever runs beside it."""
+    """One Gaussian, over all cameras in their order, so that the sum is reproducible."""
     number = wp.tid()
     coefficients = sh.shape[0] // means.shape[0]
     mean, quat, scale = means[number], quats[number], scales[number]

@@ -81,5 +81,7 @@ def chosen_on_others(here: Sequence[Candidate], others: Sequence[Candidate]) -> 
     choice = smallest_sufficient([each for each in others if each.name in by_name])
     if choice is None:
         return None
-    change = compare_samples(by_name[choice.name].samples, by_name[choice.best].samples, margin=SUFFICIENT_DB)
+    change = compare_samples(
+        by_name[choice.name].samples, by_name[choice.best].samples, margin=SUFFICIENT_DB, level=ONE_SIDED
+    )
     return None if change is None else (choice, change)

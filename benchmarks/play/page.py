@@ -321,9 +321,7 @@ class CameraControl:
         self._client.camera.on_update(self._moved)
         first = viewpoint_of(self._client.camera)  # Sent before anybody listened; it may never be sent again.
         viewer.change(lambda state: replace(state, viewpoint=state.viewpoint or first))
-        if (
-            first is not None and first.width < NARROW * first.height
-        ):  # On a narrow screen the arms stay in the picture.
+        if first is not None and first.width < NARROW * first.height:  # The arms stay in a narrow picture.
             middle, start = middle_of(capture), start_position(capture)
             with self._client.atomic():
                 self._client.camera.position = middle + (start - middle) * NARROW * first.height / first.width

@@ -233,12 +233,12 @@ def _fixed(domain: tuple[float, float]) -> alt.Scale:
 def _domain(table: pd.DataFrame, columns: Sequence[str], pad: float = 0.1) -> tuple[float, float]:
     values = pd.to_numeric(table[[name for name in columns if name in table]].stack())
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
-    room = pad * (high - low) or 1.0
-    return low - room, high + room
+    padding = pad * (high - low) or 1.0
+    return low - padding, high + padding
 
 
-def _log_domain(values: pd.Series, room: float) -> tuple[float, float]:
-    return float(values.min()) / room, float(values.max()) * room
+def _log_domain(values: pd.Series, padding: float) -> tuple[float, float]:
+    return float(values.min()) / padding, float(values.max()) * padding
 
 
 def _log_ticks(domain: tuple[float, float]) -> list[float]:

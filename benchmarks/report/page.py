@@ -55,7 +55,7 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
                 results=tuple(r for r in results if r.config.scene == scene and not r.config.axis),
                 scene=scene,
                 album=album,
-                room=PICTURE_BYTES // len(run_tables.scenes),
+                max_bytes=PICTURE_BYTES // len(run_tables.scenes),
                 worst_frames=FEW_WORST if many else WORST,
             )
         )

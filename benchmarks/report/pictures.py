@@ -83,8 +83,8 @@ class Frames:
         return Strip(title=self.title, tiles=tiles, width=self.images[0].pixels.shape[1])
 
 
-def tracks(capture: Capture, shown: Sequence[Shown], album: Album, *, room: int) -> list[dict[str, Any]]:
-    """Pictures of all methods on the first camera of each split, of as many frames as `room` bytes allow.
+def tracks(capture: Capture, shown: Sequence[Shown], album: Album, *, max_bytes: int) -> list[dict[str, Any]]:
+    """Pictures of all methods on the first camera of each split, of as many frames as `max_bytes` bytes allow.
 
     A track is {"title", "frames", "width", "height", "truth": places in the album by frame, "pictures": the same by
     method, "psnr": dB by method}.
@@ -92,7 +92,7 @@ def tracks(capture: Capture, shown: Sequence[Shown], album: Album, *, room: int)
     views = {split: [v for v in shown[0].result.views if v.split == split] for split in TRACKS}
     views = {split: views_of_split for split, views_of_split in views.items() if views_of_split}
     return [
-        _track(capture, shown, album, split, views_of_split[0].camera, room=room // len(views))
+        _track(capture, shown, album, split, views_of_split[0].camera, max_bytes=max_bytes // len(views))
         for split, views_of_split in views.items()
     ]
 
@@ -165,7 +165,7 @@ def on_paper(on_black: np.ndarray) -> np.ndarray:
 
 
 def _track(
-    capture: Capture, shown: Sequence[Shown], album: Album, split: str, camera: str, *, room: int
+    capture: Capture, shown: Sequence[Shown], album: Album, split: str, camera: str, *, max_bytes: int
 ) -> dict[str, Any]:
     scores = [{v.frame: psnr_of(v) for v in s.result.views if (v.split, v.camera) == (split, camera)} for s in shown]
     frames = sorted(scores[0])
@@ -180,7 +180,7 @@ def _track(
 
     before = album.size
     add(frames[0])
-    fit = max(1, room // max(1, album.size - before))
+    fit = max(1, max_bytes // max(1, album.size - before))
     for index in spread(len(frames), min(len(frames), fit)):
         if frames[index] not in keys:
             add(frames[index])

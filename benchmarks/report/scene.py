@@ -68,7 +68,7 @@ class SceneData:
     results: tuple[CellResult, ...]  # of the unperturbed captures of the scene
     scene: str
     album: Album
-    room: int  # bytes
+    max_bytes: int
     worst_frames: int
 
 
@@ -301,7 +301,7 @@ def _picture_sections(
 
 
 def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Flipbook, dict[str, bytes]]:
-    tracks = pictures.tracks(capture, shown, data.album, room=data.room)
+    tracks = pictures.tracks(capture, shown, data.album, max_bytes=data.max_bytes)
     series = vega.series_of([each.cell.config.method for each in shown])
     points = [
         {"track": index, "series": each.title, "frame": frame, "psnr": psnr}

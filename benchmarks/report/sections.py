@@ -34,7 +34,7 @@ SUFFICIENT_NOTE = (
 )
 CHOSEN_NOTE = (
     "The same choice, made on subjects for validation and judged on the subjects here: the chosen row minus the one "
-    f"that was best there, with the 95 % interval. Equivalent: the interval lies within {pareto.SUFFICIENT_DB} dB."
+    f"that was best there, with the 90 % interval. Equivalent: the interval lies within {pareto.SUFFICIENT_DB} dB."
 )
 NOT_CHOSEN = "On subjects for validation nothing was chosen: no scene or row in common with this run, or too few."
 PAPER_NOTE = (

@@ -55,7 +55,7 @@ DEFINITION_RUNS = 3  # frames that an untrained avatar draws by the definitions
 
 @dataclass(frozen=True, kw_only=True)
 class Subject:
-    """A configuration to be timed, untrained: a network takes its time whatever its weights are."""
+    """A configuration to be timed, untrained: the time of a network does not depend on its weights."""
 
     name: str
     config: AshConfig
@@ -121,7 +121,7 @@ def speed_frame(
     rounds: int = 15,
     device: torch.device = CPU,
 ) -> Iterator[list[SpeedRow] | Agreement]:
-    """Time frames and steps of untrained avatars on a capture; yields results as they come. Large ones: fewer rounds.
+    """Time frames and steps of untrained avatars on a capture, large ones in fewer rounds; yields results one by one.
 
     `timed`: all `subjects()` where none are given.
     """
@@ -361,7 +361,7 @@ def main_of_avatar(avatar: Avatar, capture: Capture, title: str, json_path: Path
 
 
 def print_table(results: Iterable[list[SpeedRow] | Agreement], json_path: Path | None, device: torch.device) -> int:
-    """Print rows and agreements as they come, and write them to `json_path`; returns the exit code."""
+    """Print rows and agreements one by one, and write them to `json_path`; returns the exit code."""
     print(f"device {device}")
     print_head()
     rows: list[SpeedRow] = []

@@ -152,9 +152,9 @@ class SplatDetail:
 def speed_kernels(
     *, rounds: int = 3, threads: tuple[int, ...] = (1, 2), device: torch.device = CPU
 ) -> Iterator[list[SpeedRow] | SplatDetail]:
-    """Time splatting, loss and rasteriser, naive and native by turns; yields results as they come.
+    """Time splatting, loss and rasteriser, naive and native interleaved; yields results one by one.
 
-    On a GPU threads are of no account, and the loss is the definition.
+    On a GPU one number of threads is timed, and the loss is the definition.
     """
     threads = threads if device == CPU else (1,)
     for scene in (splat_scene("S"), splat_scene("P")):
@@ -183,7 +183,7 @@ def _without_result(call: Callable[..., object], **options: int) -> Callable[[in
 
 
 def time_splat(scene: SplatScene, *, rounds: int, threads: tuple[int, ...]) -> Iterator[list[SpeedRow] | SplatDetail]:
-    """Rows of forward and of forward with backward, naive and native by turns; of the CPU a detail per thread count."""
+    """Rows of forward and of forward with backward, interleaved; on the CPU a detail per number of threads."""
     device = scene.gaussians.means.device
     leaves = {name: getattr(scene.gaussians, name).clone().requires_grad_() for name in Gaussians.__slots__}
     gradient = torch.randn(1, scene.height, scene.width, 3, generator=torch.Generator().manual_seed(1)).to(device)

@@ -6,6 +6,7 @@ CPU time of the thread, in which waiting for a core does not count; "train_step"
 static views or learns vertices is timed as a whole, and its parts are not.
 """
 
+import math
 import tempfile
 import time
 from collections import defaultdict
@@ -178,7 +179,8 @@ def profile_rows(capture: Capture, device: torch.device = CPU) -> list[SpeedRow]
             candidates.append(profiled(learner, images, name, Path(folder) / name))
         samples = time_interleaved(candidates, rounds=STEPS, warm_up=False, device=device)
     camera = next(iter(images.cameras.values()))
-    return rows_of("train_step", f"{camera.width}x{camera.height}", "forward+backward", samples, device)
+    rows = rows_of("train_step", f"{camera.width}x{camera.height}", "forward+backward", samples, device)
+    return [replace(row, ratio=math.nan) for row in rows]  # No definition is timed beside them.
 
 
 def main(json_path: Path | None, folder: Path | None, device: torch.device = CPU) -> int:

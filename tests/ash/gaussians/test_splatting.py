@@ -18,6 +18,7 @@ from helpers.numerics import (
     draw,
     random_scene,
     relative_error,
+    splat_warp,
     tensors_of,
     values_and_gradients,
 )
@@ -26,8 +27,13 @@ from torch import Tensor
 from ash.files import InputError
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted, splat, splat_naive
-from ash.native import splatting
+from ash.native import splatting as native
 from ash.native.library import instruction_set, use_team
+from ash.warp import splatting as warp
+
+Drawer = Callable[..., Splatted]
+FAST = pytest.mark.parametrize("drawer", [splat, splat_warp], ids=["native", "warp"])
+PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 
 
 def one_gaussian(**tensors: Tensor) -> Scene:
@@ -47,7 +53,7 @@ def one_gaussian(**tensors: Tensor) -> Scene:
 
 
 @pytest.mark.parametrize("drawer", [splat_naive, splat])
-def test_one_gaussian_has_its_closed_form(drawer: Callable[..., Splatted]) -> None:
+def test_one_gaussian_has_its_closed_form(drawer: Drawer) -> None:
     drawn = draw(drawer, one_gaussian())
     offsets = torch.arange(21) - 10.0
     squared = offsets[:, None] ** 2 + offsets**2
@@ -61,7 +67,7 @@ def test_one_gaussian_has_its_closed_form(drawer: Callable[..., Splatted]) -> No
 
 
 @pytest.mark.parametrize("drawer", [splat_naive, splat])
-def test_nearer_gaussians_cover_farther_ones_and_the_background_shines_through(drawer: Callable[..., Splatted]) -> None:
+def test_nearer_gaussians_cover_farther_ones_and_the_background_shines_through(drawer: Drawer) -> None:
     two = one_gaussian(
         means=torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 2.0]]),
         quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),
@@ -77,7 +83,7 @@ def test_nearer_gaussians_cover_farther_ones_and_the_background_shines_through(d
 
 
 @pytest.mark.parametrize("drawer", [splat_naive, splat])
-def test_opacity_is_capped_and_a_finished_pixel_takes_no_more(drawer: Callable[..., Splatted]) -> None:
+def test_opacity_is_capped_and_a_finished_pixel_takes_no_more(drawer: Drawer) -> None:
     count = 5
     wall = one_gaussian(
         means=torch.tensor([[0.0, 0.0, 2.0 + i] for i in range(count)]),
@@ -116,13 +122,14 @@ def test_definition_has_the_gradient_of_its_value(compensate: bool) -> None:
     assert torch.autograd.gradcheck(images, tensors, eps=1e-7, atol=1e-5, rtol=1e-4, fast_mode=True)
 
 
-# --- the fast path ----------------------------------------------------------------------------------------------------
+# --- the fast paths: native kernels, and Warp's on its CPU device -----------------------------------------------------
 
 
+@FAST
 @pytest.mark.parametrize("compensate", [False, True])
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
-def test_splat_is_its_definition(coefficients: int, compensate: bool) -> None:
-    compare(replace(random_scene(coefficients=coefficients, cameras=2), compensate=compensate))
+def test_splat_is_its_definition(coefficients: int, compensate: bool, drawer: Drawer) -> None:
+    compare(replace(random_scene(coefficients=coefficients, cameras=2), compensate=compensate), drawer=drawer)
 
 
 def test_every_instruction_set_is_the_definition(instructions: str) -> None:
@@ -131,28 +138,44 @@ def test_every_instruction_set_is_the_definition(instructions: str) -> None:
     compare(replace(random_scene(count=400, coefficients=4, seed=2), compensate=True, dilation=0.05, background=None))
 
 
-@pytest.mark.parametrize("output", ["rgb", "alpha", "depth"])
-def test_each_image_alone_has_its_gradient(output: str) -> None:
-    """The others' gradients are then absent altogether."""
+OUTPUTS = ("rgb", "alpha", "depth", "means2d")
+
+
+@FAST
+@pytest.mark.parametrize("constant", [False, True])
+@pytest.mark.parametrize("outputs", [*((name,) for name in OUTPUTS[:3]), OUTPUTS], ids="-".join)
+def test_some_images_have_their_gradient(outputs: tuple[str, ...], constant: bool, drawer: Drawer) -> None:
+    """The others' gradients are then absent altogether; a sum's is one number for all pixels."""
     gradients = []
-    for drawer, dtype in ((splat, torch.float32), (splat_naive, torch.float64)):
-        scene = cast(random_scene(), dtype)
-        image = getattr(draw(drawer, scene), output)
-        (image * torch.linspace(0.1, 1, image.numel(), dtype=dtype).reshape(image.shape)).sum().backward()
-        tensors = tensors_of(scene.gaussians) | {"viewmats": scene.viewmats}
-        gradients.append({name: torch.zeros_like(t) if t.grad is None else t.grad for name, t in tensors.items()})
+    for each, dtype in ((drawer, torch.float32), (splat_naive, torch.float64)):
+        scene = cast(random_scene(count=60), dtype)
+        drawn, total = draw(each, scene), torch.zeros((), dtype=dtype)
+        for name in outputs:
+            image = getattr(drawn, name)
+            factor = 1.0 if constant else torch.linspace(0.1, 1, image.numel(), dtype=dtype).reshape(image.shape)
+            total = total + (image * factor).sum()
+        total.backward()
+        leaves = tensors_of(scene.gaussians) | ({"viewmats": scene.viewmats} if drawer is splat else {})
+        gradients.append({name: torch.zeros_like(t) if t.grad is None else t.grad for name, t in leaves.items()})
     assert_same(*gradients, TOLERANCE)
 
 
-MUTATIONS = ("means", "quats", "scales", "opacities", "sh", "viewmats")
+NODES = {
+    splat: (native._Project, native._Blend, (*PARAMETERS, "viewmats")),
+    splat_warp: (warp._ProjectByWarp, warp._BlendByWarp, PARAMETERS),
+}
 
 
 @pytest.mark.parametrize("factor", [0.0, 0.5])
-@pytest.mark.parametrize("parameter", [*MUTATIONS, "means2d"])
-def test_a_halved_or_zeroed_gradient_is_noticed(parameter: str, factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    node, position = (
-        (splatting._Blend, 2) if parameter == "means2d" else (splatting._Project, 1 + MUTATIONS.index(parameter))
-    )
+@pytest.mark.parametrize(
+    ("drawer", "parameter"),
+    [(drawer, name) for drawer, (*_, names) in NODES.items() for name in (*names, "means2d")],
+)
+def test_a_halved_or_zeroed_gradient_is_noticed(
+    drawer: Drawer, parameter: str, factor: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project, blend, names = NODES[drawer]
+    node, position = (blend, 2) if parameter == "means2d" else (project, 1 + names.index(parameter))
     honest = node.backward
 
     def mutant(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
@@ -160,10 +183,10 @@ def test_a_halved_or_zeroed_gradient_is_noticed(parameter: str, factor: float, m
         results[position] = factor * results[position]
         return tuple(results)
 
-    compare(random_scene())
+    compare(random_scene(), drawer=drawer)
     monkeypatch.setattr(node, "backward", staticmethod(mutant))
     with pytest.raises(AssertionError, match=f"grad_{parameter}"):
-        compare(random_scene())
+        compare(random_scene(), drawer=drawer)
 
 
 @pytest.mark.parametrize("of_torch", [True, False])
@@ -179,11 +202,12 @@ def test_threads_and_repetition_change_no_bit(of_torch: bool) -> None:
         use_team(of_torch=True)
 
 
-def test_several_cameras_are_one_camera_several_times() -> None:
+@FAST
+def test_several_cameras_are_one_camera_several_times(drawer: Drawer) -> None:
     scene = random_scene(cameras=3)
-    together = draw(splat, scene)
+    together = draw(drawer, scene)
     for i in range(3):
-        alone = draw(splat, replace(scene, viewmats=scene.viewmats[i : i + 1], Ks=scene.Ks[i : i + 1]))
+        alone = draw(drawer, replace(scene, viewmats=scene.viewmats[i : i + 1], Ks=scene.Ks[i : i + 1]))
         assert torch.equal(alone.rgb[0], together.rgb[i])
 
 
@@ -196,11 +220,12 @@ def test_threads_work_after_a_fork() -> None:
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
-def test_backward_may_come_twice_and_late() -> None:
+@FAST
+def test_backward_may_come_twice_and_late(drawer: Drawer) -> None:
     scene = cast(random_scene(), torch.float32)
-    drawn = draw(splat, scene)
+    drawn = draw(drawer, scene)
     for _ in range(6):  # other drawings come and go in between
-        draw(splat, random_scene(count=40, seed=9))
+        draw(drawer, random_scene(count=40, seed=9))
     drawn.rgb.sum().backward(retain_graph=True)
     once = scene.gaussians.means.grad.clone()
     drawn.rgb.sum().backward()
@@ -229,8 +254,8 @@ def test_a_camera_finds_its_way_back() -> None:
 
 @pytest.mark.parametrize("drawer", [splat_naive, splat])
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh", "viewmats", "Ks"])
-def test_nan_and_infinity_are_named(name: str, bad: float, drawer: Callable[..., Splatted]) -> None:
+@pytest.mark.parametrize("name", [*PARAMETERS, "viewmats", "Ks"])
+def test_nan_and_infinity_are_named(name: str, bad: float, drawer: Drawer) -> None:
     scene = random_scene(count=20, coefficients=16)
     owner = scene if name in ("viewmats", "Ks") else scene.gaussians
     tensor = getattr(owner, name).clone()
@@ -241,7 +266,7 @@ def test_nan_and_infinity_are_named(name: str, bad: float, drawer: Callable[...,
 
 
 @pytest.mark.parametrize("drawer", [splat_naive, splat])
-def test_wrong_numbers_are_named(drawer: Callable[..., Splatted]) -> None:
+def test_wrong_numbers_are_named(drawer: Drawer) -> None:
     scene = random_scene(count=20)
     quats, opacities, scales = (getattr(scene.gaussians, name).clone() for name in ("quats", "opacities", "scales"))
     quats[13], opacities[4], scales[7, 1] = 0.0, 1.5, -0.1
@@ -256,6 +281,31 @@ def test_wrong_numbers_are_named(drawer: Callable[..., Splatted]) -> None:
         draw(drawer, replace(scene, Ks=scene.Ks + torch.tensor([[0.0, 1, 0], [0, 0, 0], [0, 0, 0]])))
     with pytest.raises(InputError, match="size"):
         draw(drawer, replace(scene, width=0))
+
+
+@FAST
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_the_gaussian_with_nan_or_infinity_is_named(name: str, bad: float, drawer: Drawer) -> None:
+    scene = random_scene(count=20, coefficients=16, cameras=2)
+    tensor = getattr(scene.gaussians, name).clone()
+    tensor.view(-1)[-1] = bad
+    with pytest.raises(InputError, match=f"{name}: .* at Gaussian 19$"):
+        draw(drawer, change(scene, **{name: tensor}))
+
+
+@FAST
+def test_the_first_wrong_number_is_named(drawer: Drawer) -> None:
+    scene = random_scene(count=500)
+    quats, opacities, scales = (getattr(scene.gaussians, name).clone() for name in ("quats", "opacities", "scales"))
+    quats[[430, 123, 250]], opacities[4], scales[7, 1] = 0.0, 1.5, -0.1
+    for tensors, message in (
+        ({"quats": quats}, r"zero quaternion at Gaussian 123$"),
+        ({"opacities": opacities}, r"opacities: .* at Gaussian 4$"),
+        ({"scales": scales}, r"scales: .* at Gaussian 7$"),
+    ):
+        with pytest.raises(InputError, match=message):
+            draw(drawer, change(scene, **tensors))
 
 
 def test_the_first_bad_gaussian_is_named_whatever_the_threads() -> None:

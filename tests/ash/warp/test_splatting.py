@@ -34,7 +34,7 @@ from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted, splat, splat_by_warp, splat_naive
 from ash.model import views_of
 from ash.native.splatting import Viewport
-from ash.warp import blending, projecting, projecting_back, rasterizing, splatting
+from ash.warp import blending, projecting, projecting_back, rasterizing
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
 # Of float32: a splat larger than the image sums thousands of pixels in another order than the native kernels do.
@@ -51,12 +51,6 @@ def tube_scene() -> Scene:
     return Scene(gaussians=gaussians, **views, dilation=0.05)
 
 
-@pytest.mark.parametrize("compensate", [False, True])
-@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
-def test_warp_is_the_definition(coefficients: int, compensate: bool) -> None:
-    compare(replace(random_scene(coefficients=coefficients, cameras=2), compensate=compensate), drawer=splat_warp)
-
-
 @pytest.mark.parametrize(("make", "tolerance"), HARD_SPOTS, ids=lambda x: getattr(x, "__name__", ""))
 def test_warp_at_a_hard_spot(make: Callable[[], Scene], tolerance: float) -> None:
     results = compare(make(), max(tolerance, HARD), drawer=splat_warp)
@@ -68,89 +62,6 @@ def test_warp_draws_a_tube_as_the_definition_and_as_the_native_kernels_do() -> N
     native, warp = draw(splat, tube_scene()), draw(splat_warp, tube_scene())
     error = (native.rgb - warp.rgb).square().mean()
     assert -10 * math.log10(float(error)) > 100  # dB
-
-
-@pytest.mark.parametrize("output", ["rgb", "alpha", "depth"])
-def test_each_image_alone_has_its_gradient(output: str) -> None:
-    gradients = []
-    for drawer, dtype in ((splat_warp, torch.float32), (splat_naive, torch.float64)):
-        scene = cast(random_scene(), dtype)
-        image = getattr(draw(drawer, scene), output)
-        (image * torch.linspace(0.1, 1, image.numel(), dtype=dtype).reshape(image.shape)).sum().backward()
-        leaves = tensors_of(scene.gaussians)
-        gradients.append({name: torch.zeros_like(t) if t.grad is None else t.grad for name, t in leaves.items()})
-    assert_same(*gradients, TOLERANCE)
-
-
-def test_a_gradient_that_is_one_number_everywhere_is_taken_as_it_is() -> None:
-    """A sum hands back a single number for all pixels, which is made an array before a kernel reads it."""
-    gradients = []
-    for drawer, dtype in ((splat_warp, torch.float32), (splat_naive, torch.float64)):
-        scene = cast(random_scene(count=60), dtype)
-        drawn = draw(drawer, scene)
-        (drawn.rgb.sum() + 0.5 * drawn.depth.sum() - 0.3 * drawn.alpha.sum() + drawn.means2d.sum()).backward()
-        gradients.append({name: tensor.grad for name, tensor in tensors_of(scene.gaussians).items()})
-    assert_same(*gradients, TOLERANCE)
-
-
-PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
-
-
-@pytest.mark.parametrize("factor", [0.0, 0.5])
-@pytest.mark.parametrize("parameter", [*PARAMETERS, "means2d"])
-def test_a_halved_or_zeroed_gradient_is_noticed(parameter: str, factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    of_blend = parameter == "means2d"
-    node = splatting._BlendByWarp if of_blend else splatting._ProjectByWarp
-    position = 2 if of_blend else 1 + PARAMETERS.index(parameter)
-    honest = node.backward
-
-    def mutant(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        results = list(honest(ctx, *grads))
-        results[position] = factor * results[position]
-        return tuple(results)
-
-    monkeypatch.setattr(node, "backward", staticmethod(mutant))
-    with pytest.raises(AssertionError, match=f"grad_{parameter}"):
-        compare(random_scene(), drawer=splat_warp)
-
-
-def test_several_cameras_are_one_camera_several_times() -> None:
-    scene = random_scene(cameras=3)
-    together = draw(splat_warp, scene)
-    for i in range(3):
-        alone = draw(splat_warp, replace(scene, viewmats=scene.viewmats[i : i + 1], Ks=scene.Ks[i : i + 1]))
-        assert torch.equal(alone.rgb[0], together.rgb[i])
-
-
-def test_backward_may_come_twice_and_gives_the_same_bits() -> None:
-    scene = cast(random_scene(), torch.float32)
-    drawn = draw(splat_warp, scene)
-    drawn.rgb.sum().backward(retain_graph=True)
-    once = scene.gaussians.means.grad.clone()
-    drawn.rgb.sum().backward()
-    assert torch.equal(scene.gaussians.means.grad, 2 * once)
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("name", PARAMETERS)
-def test_nan_and_infinity_are_named(name: str, bad: float) -> None:
-    scene = random_scene(count=20, coefficients=16, cameras=2)
-    tensor = getattr(scene.gaussians, name).clone()
-    tensor.view(-1)[-1] = bad
-    with pytest.raises(InputError, match=f"{name}: .* at Gaussian 19$"):
-        draw(splat_warp, change(scene, **{name: tensor}))
-
-
-def test_the_first_wrong_number_is_named() -> None:
-    scene = random_scene(count=500)
-    quats, opacities, scales = (getattr(scene.gaussians, name).clone() for name in ("quats", "opacities", "scales"))
-    quats[[430, 123, 250]], opacities[4], scales[7, 1] = 0.0, 1.5, -0.1
-    with pytest.raises(InputError, match=r"zero quaternion at Gaussian 123$"):
-        draw(splat_warp, change(scene, quats=quats))
-    with pytest.raises(InputError, match=r"opacities: .* at Gaussian 4$"):
-        draw(splat_warp, change(scene, opacities=opacities))
-    with pytest.raises(InputError, match=r"scales: .* at Gaussian 7$"):
-        draw(splat_warp, change(scene, scales=scales))
 
 
 def test_what_warp_cannot_do_is_refused() -> None:

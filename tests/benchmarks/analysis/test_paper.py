@@ -32,30 +32,31 @@ def test_the_same_order_agrees_and_the_opposite_does_not() -> None:
 
 def test_methods_that_were_not_run_are_not_made_up() -> None:
     (section,) = beside_the_paper(run({"ash": 24.0, "ddc": 22.0}, seeds=1), "table")
-    table, told = section.blocks[:2]
-    assert isinstance(table, Table) and isinstance(told, Bullets)
+    table, output = section.blocks[:2]
+    assert isinstance(table, Table) and isinstance(output, Bullets)
     assert table.frame.loc["TAVA"].tolist() == ["27.31", "37.55", "26.31", "50.11", *["n/a"] * 7]
     assert table.frame.loc["ASH"].tolist()[4:7:2] == ["24.00", "n/a"], "no weights for LPIPS"
-    assert told.items[0] == "Kendall's tau, novel view: +1.00 over 2 methods"
+    assert output.items[0] == "Kendall's tau, novel view: +1.00 over 2 methods"
 
 
 def components(levels: dict[str, float]) -> tuple[Table, tuple[str, ...]]:
-    """The ablation of components as it is printed, and what is told below it."""
+    """The ablation of components as it is printed, and the sentences below it."""
     (section,) = beside_the_paper(run(levels), "table")
     at = next(i for i, block in enumerate(section.blocks) if isinstance(block, Table) and "components" in block.title)
-    table, told = section.blocks[at : at + 2]
-    assert isinstance(table, Table) and isinstance(told, Bullets)
-    return table, told.items
+    table, output = section.blocks[at : at + 2]
+    assert isinstance(table, Table) and isinstance(output, Bullets)
+    return table, output.items
 
 
 def test_the_papers_static_row_is_compared_with_ours_of_as_few_frames_or_it_is_said() -> None:
-    table, told = components({"wo_mot": 30.0, "wo_mot_truncated": 20.0, "ash": 24.0})
+    table, output = components({"wo_mot": 30.0, "wo_mot_truncated": 20.0, "ash": 24.0})
     assert (
-        table.frame.iloc[0, 4].startswith("20.10") and [item.rpartition(": ")[2][:5] for item in told] == ["+1.00"] * 2
+        table.frame.iloc[0, 4].startswith("20.10")
+        and [item.rpartition(": ")[2][:5] for item in output] == ["+1.00"] * 2
     )
-    table, told = components({"wo_mot": 30.0, "ash": 24.0})
-    assert table.frame.iloc[0, 4].startswith("30.10") and told[0].startswith("Kendall's tau, novel view: -1.00")
-    assert told[2:] == ("w/o mot.: ours saw all frames, the paper's 1,000 of 27,000 frames.",)
+    table, output = components({"wo_mot": 30.0, "ash": 24.0})
+    assert table.frame.iloc[0, 4].startswith("30.10") and output[0].startswith("Kendall's tau, novel view: -1.00")
+    assert output[2:] == ("w/o mot.: ours saw all frames, the paper's 1,000 of 27,000 frames.",)
     assert not any("saw all" in item for item in components({"wo_disp": 20.0, "ash": 24.0})[1]), "neither was run"
 
 

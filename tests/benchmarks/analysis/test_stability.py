@@ -153,8 +153,8 @@ def test_the_studio_is_all_that_the_row_knows_more_and_a_dry_run_counts_it(tmp_p
     plain = offered("ash", suite.preset)
     studio = replace(plain, training=replace(plain.training, background="studio"))
     assert configured(row.of, suite.preset, row.changes) == studio != plain
-    told = estimate(suite, RunOptions(out=tmp_path, data=tmp_path, workers=1))
-    (rows,) = {line.partition(": ")[2] for line in told.splitlines() if ", cpu, seed " in line}
+    output = estimate(suite, RunOptions(out=tmp_path, data=tmp_path, workers=1))
+    (rows,) = {line.partition(": ")[2] for line in output.splitlines() if ", cpu, seed " in line}
     assert rows.split(", ") == [row.name for row in suite.methods], "on every capture, for every seed"
 
 

@@ -1,4 +1,4 @@
-"""Before and after: what is told of two runs."""
+"""Before and after: two runs side by side."""
 
 import json
 import re
@@ -79,8 +79,8 @@ def test_compare_tells_rows_and_shows_the_worst_frames(
 ) -> None:
     before, after = runs
     assert cli.main(["compare", str(before), str(after), "--out", str(tmp_path)]) == 0
-    told = capsys.readouterr().out
-    assert told.startswith("Of ") and "worse (mine on boxes)" in told.splitlines()[0]
+    output = capsys.readouterr().out
+    assert output.startswith("Of ") and "worse (mine on boxes)" in output.splitlines()[0]
     page = (tmp_path / "compare.html").read_text()
     album = re.search(r'id="album">(.*?)</script>', page)
     assert "among the worst before" in page and album is not None and len(json.loads(album[1])) >= 3 * 3
@@ -114,8 +114,8 @@ def test_captures_of_one_name_are_told_apart(runs: tuple[Path, Path], tmp_path: 
 def test_subjects_of_a_scene_stay_one_scene(runs: tuple[Path, Path], tmp_path: Path, monkeypatch) -> None:
     run = read_run(runs[0])
     for subjects, names in (((0, 1), {"boxes"}), ((1, 1), {"capture"})):
-        told = zip(run.cells, subjects, strict=False)
-        cells = tuple(replace(c, config=replace(c.config, subject=k, truth=str(n))) for n, (c, k) in enumerate(told))
+        output = zip(run.cells, subjects, strict=False)
+        cells = tuple(replace(c, config=replace(c.config, subject=k, truth=str(n))) for n, (c, k) in enumerate(output))
         monkeypatch.setattr(runs_module, "read_run", lambda _, cells=cells: replace(run, cells=cells))
         assert {each.config.scene for each in gathered([runs[0]], tmp_path, command="").cells} == names
 
@@ -149,8 +149,8 @@ def test_subjects_are_compared_in_pairs() -> None:
     def people(shift: float) -> Rows:
         (cells,) = row(*(20.0 + 2 * n + shift + 0.01 * (n % 3) for n in range(8))).values()
         places = [replace(place.config, subject=n, seed=0) for n, (place, _) in enumerate(cells)]
-        told = [(replace(c, config=p), replace(r, config=p)) for p, (c, r) in zip(places, cells, strict=True)]
-        return {("loose", "ash"): told}
+        output = [(replace(c, config=p), replace(r, config=p)) for p, (c, r) in zip(places, cells, strict=True)]
+        return {("loose", "ash"): output}
 
     change = views(people(0.0), people(0.3))
     assert change.verdict == "better" and change.change == pytest.approx(0.3)

@@ -92,14 +92,14 @@ def test_the_charts_are_valid_svg_and_adapt_to_dark_pages(run: Run) -> None:
 
 
 def test_no_caption_tells_of_marks_that_are_not_there(run: Run) -> None:
-    told = "given the exact surface"
-    assert told not in (run.folder / "report.md").read_text()
+    output = "given the exact surface"
+    assert output not in (run.folder / "report.md").read_text()
     captions = []
     for methods in (("ash", "ddc"), ("ash", "ash_truth")):
         figure = speed_figure(RunTables([scored(m, view=27.0, pose=20.0) for m in methods]), "loose")
         assert figure is not None
         captions.append(figure.caption)
-    assert [told in caption for caption in captions] == [False, True]
+    assert [output in caption for caption in captions] == [False, True]
 
 
 def test_one_failure_does_not_press_the_points_of_a_chart_together() -> None:
@@ -295,12 +295,12 @@ def test_the_main_table_is_followed_by_what_training_saw_of_the_views() -> None:
         results=tuple(results),
         scene="loose",
         album=Album(),
-        room=0,
+        max_bytes=0,
         worst_frames=1,
     )
     main = next(section for section in scene_report(data).sections if section.title == "Accuracy on loose")
-    told = [block.text for block in main.blocks[1:] if isinstance(block, Text) and "training saw" in block.text]
-    assert told == [
+    output = [block.text for block in main.blocks[1:] if isinstance(block, Text) and "training saw" in block.text]
+    assert output == [
         "1/10 of cameras: training saw 2 of 20 cameras, 37 of 104 frames (paper: 12 of 120 cameras).",
         "1/2 of cameras: training saw 10 of 20 cameras, 97 to 98 of 104 frames (paper: 60 of 120 cameras).",
         "w/o mot., 1/27 of frames: training saw 20 of 20 cameras, 4 of 104 frames (paper: 1,000 of 27,000 frames).",

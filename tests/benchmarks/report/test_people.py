@@ -51,8 +51,8 @@ def test_every_subject_has_the_lead_of_ash_and_scores_their_spread() -> None:
     assert views.frame.to_numpy().tolist() == [["25.00", "+1.75"], ["28.00", "-0.75"]]
     # ASH: means 25 and 28, so a variance of 4.5, of which half of the seeds' 2 is theirs.
     assert spread.frame.iloc[:, :2].to_numpy().tolist() == [["1.87", "1.41"], ["3.88", "0.35"]]
-    (told,) = blocks(cast(PSNR), Bullets)
-    assert told.items[0] == "On novel views ASH is ahead of DDC on 1 of 2 subjects, by -0.75 to +1.75 dB."
+    (place,) = blocks(cast(PSNR), Bullets)
+    assert place.items[0] == "On novel views ASH is ahead of DDC on 1 of 2 subjects, by -0.75 to +1.75 dB."
 
 
 def test_an_ablation_that_changes_nothing_is_no_win() -> None:
@@ -89,9 +89,9 @@ def two_people(run: Run, other: Path) -> tuple[Run, list[CellResult]]:
     for subject, capture in enumerate((run.cells[0].capture_folder, other)):
         for cell, result in zip(run.cells, results_of(run), strict=True):
             if (method := names.get(cell.config.method)) is not None:
-                told = replace(cell.config, method=method, subject=subject)
-                cells.append(Cell(config=told, folder=cell.folder, capture_folder=capture))
-                results.append(replace(result, config=told))
+                place = replace(cell.config, method=method, subject=subject)
+                cells.append(Cell(config=place, folder=cell.folder, capture_folder=capture))
+                results.append(replace(result, config=place))
     return replace(run, cells=tuple(cells)), results
 
 
@@ -99,7 +99,7 @@ def test_a_report_over_people_shows_everybody(run: Run, tmp_path: Path) -> None:
     cast, results = two_people(run, tmp_path / "other")
     tables = RunTables(results, {cell.config.key: cell.capture_folder.name for cell in cast.cells})
     data = SceneData(
-        run=cast, tables=tables, results=tuple(results), scene="boxes", album=Album(), room=10**6, worst_frames=1
+        run=cast, tables=tables, results=tuple(results), scene="boxes", album=Album(), max_bytes=10**6, worst_frames=1
     )
     made = scene_report(data)
     (strips,) = (b for s in made.sections if s.title == "All subjects on boxes" for b in s.blocks if b.kind == "strips")
