@@ -1,4 +1,4 @@
-"""How long a frame takes, by stage, beside a fixed workload that tells how fast the machine was; how much memory."""
+"""Training time, a fixed workload that measures how fast the machine is, and peak memory."""
 
 import resource
 import sys
@@ -7,11 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
-from ash.capture.dataset import Capture, Pose
-from ash.protocol import Drawn, StageClock
-from benchmarks.cell.schema import Timing
-from benchmarks.cell.views import View
 
 WARM_UP_FRAMES = 3
 TIMED_FRAMES = 15
@@ -26,27 +21,6 @@ class TrainingTime:
 
     wall_s: float
     cpu_s: float | None  # None: a result from before it was measured
-
-
-def time_frames(avatar: Drawn, capture: Capture, views: list[View]) -> Timing:
-    """Time single frames after a warm-up, each after the one before it, as in playback: caches may help as there."""
-    frame_ms, reference_ms = [], []
-    stage_ms: dict[str, list[float]] = {}
-    for index in range(WARM_UP_FRAMES + TIMED_FRAMES):
-        view = views[index % len(views)]
-        camera, clock = capture.cameras[view.camera], StageClock()
-        avatar.render(Pose(capture.motion, max(0, view.frame - 1)), camera, clock=StageClock())
-        start = time.perf_counter()
-        avatar.render(Pose(capture.motion, view.frame), camera, clock=clock)
-        elapsed = (time.perf_counter() - start) * 1e3
-        reference = reference_workload_ms()
-        if index >= WARM_UP_FRAMES:
-            frame_ms.append(elapsed)
-            reference_ms.append(reference)
-            for name, value in clock.ms.items():
-                stage_ms.setdefault(name, []).append(value)
-    stages = {name: tuple(values) for name, values in sorted(stage_ms.items())}
-    return Timing(frame_ms=tuple(frame_ms), stage_ms=stages, reference_ms=tuple(reference_ms))
 
 
 def reference_workload_ms() -> float:
