@@ -159,10 +159,10 @@ class Scene:
     light: Light
     rig: Rig
     train: tuple[Clip, ...]
-    test: tuple[Clip, ...]  # held-out motion of kinds that training has not
+    test: tuple[Clip, ...]  # novel poses: kinds of motion that training does not have
     novel_view_stride: int  # novel views are judged on every so many training frames
-    near: tuple[Clip, ...] = ()  # held-out motion that is near: other takes of training's kinds
-    far: tuple[Clip, ...] = ()  # held-out motion that is far: poses that nothing in training is like
+    near: tuple[Clip, ...] = ()  # near novel poses: other takes of training's kinds
+    far: tuple[Clip, ...] = ()  # far novel poses: unlike anything in training
     near_stride: int = 1  # every so many-th frame of a near clip has images; the others are history
     far_stride: int = 1  # the same of far clips
     scanner: Scanner = Scanner()

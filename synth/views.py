@@ -19,7 +19,7 @@ class WantedView:
 
 
 def splits(scene: Scene) -> dict[str, Split]:
-    """Training views; held-out cameras on some training frames; held-out cameras on near, new and far motion."""
+    """Training views; novel views of some training frames; novel poses (near, new, far) from the novel-view cameras."""
     names = camera_names(scene.rig)
     apart = tuple(names[k] for k in held_out(scene.rig))
     training = sum(clip.frames for clip in scene.train)

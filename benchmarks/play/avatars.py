@@ -47,7 +47,7 @@ class LoadedAvatar:
     def __init__(self, cell: Cell, title: str, avatar: Avatar, capture: Capture) -> None:
         self.cell, self.title = cell, title
         self.avatar = avatar  # the method's object; `ash.protocol` says what it can do
-        self.capture = capture  # what it was trained on, held-out views included
+        self.capture = capture  # what it was trained on, test splits included
         self._cache: OrderedDict[tuple[bytes, int], Components] = OrderedDict()
 
     @property

@@ -17,9 +17,9 @@ from synth.scene import Clip
 # Motions of a capture: name -> split, title.
 CAPTURED = {
     "train": ("train", "Training motion"),
-    "test": ("novel_pose", "Held-out motion"),
-    "near": ("near_pose", "Held-out motion, near"),
-    "far": ("far_pose", "Held-out motion, far"),
+    "test": ("novel_pose", "Novel pose"),
+    "near": ("near_pose", "Novel pose, near"),
+    "far": ("far_pose", "Novel pose, far"),
 }
 GENERATED_SECONDS, GENERATED_SEED = 5.0, 7  # another walk than that of any capture
 MAX_FRAMES = 20_000  # of a file: half an hour

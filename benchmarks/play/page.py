@@ -116,7 +116,7 @@ class Page:
         self._on(self._camera, lambda value: self.cameras.jump(str(value)))
 
     def _camera_names(self) -> list[str]:
-        """Held-out cameras first: of them the truth of the held-out motion is known."""
+        """Novel-view cameras first: the truth of novel poses is known for them."""
         training = self._capture.splits["train"].cameras
         return [FREE, SPIRAL, *sorted(self._capture.cameras, key=lambda name: name in training)]
 

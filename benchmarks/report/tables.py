@@ -1,5 +1,6 @@
 """Tables of a scene's numbers, and tables as text for terminals and LaTeX."""
 
+import re
 from collections.abc import Collection, Sequence
 from typing import Any
 
@@ -55,6 +56,9 @@ def build(
     return Table(title=title, frame=frame, marks=marks, below=sum(map(is_oracle, methods)))
 
 
+UNIT = re.compile(r" \[(.*?)\]")
+
+
 def head_of(quantity: Quantity) -> tuple[str, str]:
     """Group and title of the column; no two quantities of a split share one."""
     measure = METRICS[quantity.metric]
@@ -83,17 +87,19 @@ def text_of(row: Any, measure: Metric) -> str:
 
 
 def plain(table: Table) -> str:
-    """Aligned columns for a terminal; the best is starred."""
-    heads = ["", *(title for _, title in table.heads)]
+    """Aligned columns for a terminal, units in a line of their own; the best is starred."""
+    parts = [UNIT.split(title) for _, title in table.heads]  # "PSNR [dB] ↑" -> "PSNR", "dB", " ↑"
+    heads = ["", *(part[0] + part[-1] * (len(part) > 1) for part in parts)]
+    units = ["", *(part[1] if len(part) > 1 else "" for part in parts)]
     rows = [[name, *(text + ("*" if mark == "best" else " ") for text, mark in texts)] for name, texts in table.rows]
-    widths = [max(len(line[i]) for line in (heads, *rows)) for i in range(len(heads))]
+    widths = [max(len(line[i]) for line in (heads, units, *rows)) for i in range(len(heads))]
     first = 1
     for group, span in table.groups:  # A group's title may be wider than its columns.
         widths[first] += max(0, len(group) - sum(widths[first : first + span]) - 2 * (span - 1))
         first += span
     lines = [
         "  ".join([line[0].ljust(widths[0]), *(text.rjust(w) for text, w in zip(line[1:], widths[1:], strict=True))])
-        for line in (heads, *rows)
+        for line in (heads, units, *rows)
     ]
     spans, at = " " * widths[0], 1
     for group, span in table.groups:

@@ -1,7 +1,7 @@
 """Stress: pure, seeded functions from a capture to a capture, so that truth stays truth.
 
 Only what a method may learn from or is told changes (training images, tracked motion, calibration of training cameras,
-which views exist); held-out images, their cameras and everything under `truth/` are the original's bytes.
+which views exist); test images, their cameras and everything under `truth/` are the original's bytes.
 """
 
 from collections.abc import Iterator
@@ -60,7 +60,7 @@ def perturb(source: Path, folder: Path, perturbation: Perturbation, *, seed: int
 
 
 def _subset(capture: Capture, perturbation: Perturbation) -> Capture:
-    """The capture with fewer training cameras and frames; held-out splits stay."""
+    """The capture with fewer training cameras and frames; test splits stay."""
     train = capture.splits["train"]
     cameras, frames = train.cameras, train.frames
     if perturbation.cameras is not None:

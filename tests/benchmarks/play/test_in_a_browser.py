@@ -67,7 +67,7 @@ def standing(player: PlayServer, visit: Visitor) -> Iterator[Any]:
     """A window that stands still in the held-out motion, and nothing went wrong in it."""
     visited = visit(player.url, size=WINDOW)
     assert "token" not in visited.page.url
-    visited.page.get_by_text("Held-out motion, frame").first.wait_for(timeout=1000 * PATIENCE)
+    visited.page.get_by_text("Novel pose, frame").first.wait_for(timeout=1000 * PATIENCE)
     picture_of(visited.page)
     visited.page.keyboard.press(" ")
     wait_for(lambda: not state_of(player).playing)
@@ -137,7 +137,7 @@ def test_on_a_phone_the_person_comes_first_and_nothing_is_wider_than_the_screen(
     player: PlayServer, visit: Visitor
 ) -> None:
     visited = visit(player.url, size=PHONE, scheme="dark", touch=True)
-    words = visited.page.get_by_text("Held-out motion, frame").first
+    words = visited.page.get_by_text("Novel pose, frame").first
     words.wait_for(state="attached", timeout=1000 * PATIENCE)
     words.wait_for(state="hidden", timeout=1000 * PATIENCE)
     wait_for(lambda: state_of(player).dark)
@@ -245,8 +245,8 @@ class Fingers:
 def test_fingers_turn_the_view_come_closer_and_move_the_divider(player: PlayServer, visit: Visitor) -> None:
     visited = visit(player.url, size=PHONE, touch=True)
     tab, fingers = visited.page, Fingers(visited.page)
-    tab.get_by_text("Held-out motion, frame").first.wait_for(state="attached", timeout=1000 * PATIENCE)
-    tab.get_by_text("Held-out motion, frame").first.wait_for(state="hidden", timeout=1000 * PATIENCE)
+    tab.get_by_text("Novel pose, frame").first.wait_for(state="attached", timeout=1000 * PATIENCE)
+    tab.get_by_text("Novel pose, frame").first.wait_for(state="hidden", timeout=1000 * PATIENCE)
     picture_of(tab)
     tab.keyboard.press(" ")
     wait_for(lambda: not state_of(player).playing)

@@ -1,4 +1,4 @@
-"""Held-out motion that is near, new and far."""
+"""Novel poses: near, new and far."""
 
 from pathlib import Path
 
