@@ -132,8 +132,7 @@ def test_a_format_with_a_slash_is_refused(capsys: pytest.CaptureFixture[str], ca
     assert "got 'a/b'" in refused(capsys, "export", str(capture), "--format", "a/b")
 
 
-def test_code_of_others_is_not_loaded_untrusted(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for command in (("display", str(finished)), ("export", str(finished / "cells"), "--format", "html")):
-        folder = next((finished / "cells").iterdir())
-        told = refused(capsys, command[0], str(folder), *command[2:])
-        assert "is not ours" in told and "--trust" in told
+@pytest.mark.parametrize("command", [("play",), ("export", "--format", "html"), ("export", "--format", "ply")])
+def test_code_of_others_is_not_loaded_untrusted(finished: Path, capsys, command: tuple[str, ...]) -> None:
+    message = refused(capsys, *command, str(next((finished / "cells").iterdir())))
+    assert "is not ours" in message and "--trust" in message
