@@ -52,7 +52,7 @@ def get(url: str, path: str, **headers: str) -> tuple[int, dict[str, str], bytes
 def cookie_of(url: str) -> str:
     """The cookie that the printed address gives."""
     parts = urlsplit(url)
-    status, headers, _ = get(url, f"/?{parts.query}", MethodClient=parts.netloc)
+    status, headers, _ = get(url, f"/?{parts.query}", Host=parts.netloc)
     assert status == 303, status
     return headers["Set-Cookie"].partition(";")[0]
 

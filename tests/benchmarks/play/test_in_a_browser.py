@@ -100,7 +100,7 @@ def test_it_shows_turns_scrubs_and_switches(player: PlayServer, tab: Any) -> Non
     turned = picture_of(tab, unlike=scrubbed)
     assert np.abs(state_of(player).viewpoint.viewmat - view).max() > 0.05
     tab.keyboard.press("m")
-    tab.get_by_text(f"{player.avatars.titles[1]} · Held-out").first.wait_for(timeout=1000 * PATIENCE)
+    tab.get_by_text(f"{player.avatars.titles[1]} · Novel pose").first.wait_for(timeout=1000 * PATIENCE)
     picture_of(tab, unlike=turned)
 
 
