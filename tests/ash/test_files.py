@@ -9,7 +9,7 @@ import ash.files
 import baselines.ddc
 import benchmarks.cell.registry
 from ash.files import hash_sources, source_files
-from synth.source_hash import MAKERS, READERS
+from synth.source_hash import MAKERS, NOT_HASHED
 
 DECIDE_A_CELL = (
     Path(ash.files.__file__).parent,
@@ -18,7 +18,7 @@ DECIDE_A_CELL = (
 )
 
 
-@pytest.mark.parametrize(("roots", "without"), [(DECIDE_A_CELL, ()), (MAKERS, READERS)], ids=["cell", "capture"])
+@pytest.mark.parametrize(("roots", "without"), [(DECIDE_A_CELL, ()), (MAKERS, NOT_HASHED)], ids=["cell", "capture"])
 def test_a_change_in_any_deciding_file_changes_the_hash(
     roots: tuple[Path, ...], without: tuple[Path, ...], tmp_path: Path
 ) -> None:
@@ -38,17 +38,17 @@ def test_a_change_in_any_deciding_file_changes_the_hash(
 
 
 def test_a_file_that_moves_changes_the_hash(tmp_path: Path) -> None:
-    (tmp_path / "room").mkdir()
-    (tmp_path / "room" / "a.py").write_text("x = 1\n")
-    before = hash_sources(tmp_path / "room")
-    (tmp_path / "room" / "a.py").rename(tmp_path / "room" / "b.py")
-    assert hash_sources(tmp_path / "room") != before
+    (tmp_path / "package").mkdir()
+    (tmp_path / "package" / "a.py").write_text("x = 1\n")
+    before = hash_sources(tmp_path / "package")
+    (tmp_path / "package" / "a.py").rename(tmp_path / "package" / "b.py")
+    assert hash_sources(tmp_path / "package") != before
 
 
-def test_readers_and_other_files_do_not_count(tmp_path: Path) -> None:
-    (tmp_path / "room" / "readers").mkdir(parents=True)
-    (tmp_path / "room" / "a.py").write_text("x = 1\n")
-    before = hash_sources(tmp_path / "room", without=(tmp_path / "room" / "readers",))
-    (tmp_path / "room" / "readers" / "b.py").write_text("y = 2\n")
-    (tmp_path / "room" / "notes.md").write_text("y = 2\n")
-    assert hash_sources(tmp_path / "room", without=(tmp_path / "room" / "readers",)) == before
+def test_excluded_folders_and_other_files_do_not_count(tmp_path: Path) -> None:
+    (tmp_path / "package" / "export").mkdir(parents=True)
+    (tmp_path / "package" / "a.py").write_text("x = 1\n")
+    before = hash_sources(tmp_path / "package", without=(tmp_path / "package" / "export",))
+    (tmp_path / "package" / "export" / "b.py").write_text("y = 2\n")
+    (tmp_path / "package" / "notes.md").write_text("y = 2\n")
+    assert hash_sources(tmp_path / "package", without=(tmp_path / "package" / "export",)) == before

@@ -55,9 +55,9 @@ def test_the_truth_is_none_of_the_methods_gaussians(capture):
     nearest = torch.cdist(theirs, own).min(1).values
     pitch = float(torch.cdist(own[:500], own).sort(1).values[:, 1].median())
     assert float(nearest.median()) > 0.2 * pitch, "they do not lie on the texels"
-    scales = known.base.detach()[:, 3:6].exp()
+    scales = known.base_texels.detach()[:, 3:6].exp()
     assert float((scales.max(1).values / scales.min(1).values).std()) > 0.5, "of many shapes"
-    opacities = known.base.detach()[:, 10].sigmoid()
+    opacities = known.base_texels.detach()[:, 10].sigmoid()
     assert float(opacities.min()) < 0.4 and float(opacities.max()) > 0.95
 
 
