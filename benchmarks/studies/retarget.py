@@ -4,6 +4,7 @@ The paper drives its avatars with motions of AMASS and shows pictures: nobody fi
 truth for any motion can be rendered.
 """
 
+import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -23,6 +24,8 @@ from benchmarks.cell.views import View, spread
 from benchmarks.report.pictures import on_paper
 from benchmarks.suites.progress import Progress
 from synth.capture import make_body, make_capture
+from synth.motion.importing import read_motion_file
+from synth.motion.strip import describe
 from synth.truth.retargeting import retargeted, scene_of
 
 STRIP_FRAMES = 6
@@ -79,7 +82,9 @@ def retarget(cells: list[Cell], motion: Path, out: Path, *, frames: int, workers
 def render_truth(own: Capture, motion: Path, folder: Path, *, frames: int, workers: int) -> Capture:
     """The capture of the same person doing what the motion file says."""
     scene = scene_of(own.manifest, own.folder)
-    wanted = retargeted(scene, make_body(scene), motion, frames=frames)
+    body = make_body(scene)
+    print(describe(read_motion_file(motion, body.skeleton, fps=scene.fps, most=frames)), file=sys.stderr)
+    wanted = retargeted(scene, body, motion, frames=frames)
     progress = Progress(f"images of {motion.name}", 0, expected_s=0.0, workers=workers)
     make_capture(wanted, folder, workers=workers, progress=progress.advance)
     progress.close()

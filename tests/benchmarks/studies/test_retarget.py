@@ -61,7 +61,8 @@ def test_avatars_are_driven_by_the_motion_and_scored_against_its_truth(
         assert cli.main(command) == arguments.DONE
         content = json.loads((out / "result-mannequin.json").read_text())
         rows += content["avatars"]
-    assert "steps.npz" in capsys.readouterr().out
+    printed = capsys.readouterr()
+    assert "steps.npz" in printed.out and "joints matched" in printed.err
     assert content["frames"] == 3 and content["made_by_the_same_code"] and 1 < content["novelty_deg"] < 90
     assert rows[0]["method"] == "static" and rows[0]["template_mm"] < 0.01
     assert rows[0]["iou"] > 0.8 and rows[0]["iou"] > rows[1]["iou"] + 0.05, "the avatar is where the motion says"
