@@ -154,9 +154,14 @@ def test_on_a_phone_the_person_comes_first_and_nothing_is_wider_than_the_screen(
 
 def test_a_chosen_camera_shows_its_view(player: PlayServer, tab: Any) -> None:
     before, cameras = shot(tab)[:, :500], player.avatars.capture.cameras
-    tab.keyboard.press("c")
-    tab.keyboard.press("c")
-    wait_for(lambda: state_of(player).camera in cameras, PATIENCE)
+
+    def is_chosen() -> bool:
+        if state_of(player).camera not in cameras:  # A busy browser may drop a key.
+            tab.keyboard.press("c")
+            time.sleep(1.0)
+        return state_of(player).camera in cameras
+
+    wait_for(is_chosen, PATIENCE)
     name = state_of(player).camera
     wait_for(lambda: np.abs(state_of(player).viewpoint.viewmat - cameras[name].viewmat).max() < 1e-3, PATIENCE)
     picture_of(tab, unlike=before)
