@@ -21,7 +21,6 @@ from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.initialising import blank_gaussians, initial_gaussians, released_gaussians, texel_pitch
 from ash.model import AshModel, image_of
 from ash.protocol import StageClock, TrainingOutcome
-from ash.template.template import Template
 from ash.template_learning.learning import template_of, with_template
 from ash.template_learning.refining import refined_template
 from ash.textures import FrameInputs, TexelLattice, add_texture_noise_to_frames, build_lattice
@@ -46,12 +45,10 @@ class AshAvatar:
         capture: Capture,
         *,
         make_decoders: MakeDecoders | None = None,
-        template: Template | None = None,
     ) -> None:
-        """`template`: one to stand on, where it exists already."""
         capture = training_part(capture, config.training)
         self.device = device_named(config.device)
-        self.template = template or template_of(config.template, capture, seed=config.seed, device=self.device)
+        self.template = template_of(config.template, capture, seed=config.seed, device=self.device)
         torch.manual_seed(config.seed)
         self.config = config
         if config.model.refine:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ash.files import InputError
 
-OLD_NAMES = {"base": "base_texels", "static": "fallback_texels"}  # in checkpoints of version 0.3 and earlier
+OLD_NAMES = {"base": "base_texels", "static": "fallback_texels"}  # in checkpoints of version 0.2
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -59,9 +59,7 @@ class AshModel(MovingModule):
         self.base_texels = nn.Parameter(initial.clone(), requires_grad=config.base)
         self.decoders = decoders
         fades = config.novelty_scale and self.textures is not None
-        self.fallback_texels = (
-            nn.Parameter(initial.clone()) if fades else None
-        )  # what counts far from the training motion
+        self.fallback_texels = nn.Parameter(initial.clone()) if fades else None  # for poses far from training
         self.refinement: MotionRefinement | None = None
         if isinstance(template.deformation, RefinedDeformation):
             self.refinement = template.deformation.refinement
@@ -91,11 +89,9 @@ class AshModel(MovingModule):
 
     def decode(self, conditions: FrameInputs) -> Float[Tensor, "n o"]:
         """Stg.3: raw Gaussian parameters per texel."""
-        return (
-            self.base_texels
-            if self.decoders is None
-            else self.base_texels + self.mask_offsets(self.decoders(conditions))
-        )
+        if self.decoders is None:
+            return self.base_texels
+        return self.base_texels + self.mask_offsets(self.decoders(conditions))
 
     def decode_together(self, frames: Sequence[FrameInputs]) -> list[Float[Tensor, "n o"]]:
         """`decode` of several frames, by U-Nets in one batch; by what decodes in another way frame by frame."""

@@ -174,6 +174,5 @@ class MethodFactory(Generic[Config]):
 
 
 ash = MethodFactory(config=named, build=AshAvatar)
-ash_truth = ash.with_overrides(
-    {"template": TemplateConfig(kind="exact")}
-)  # An oracle: what the template's error costs.
+# An oracle: what the template's error costs.
+ash_truth = ash.with_overrides({"template": TemplateConfig(kind="exact")})

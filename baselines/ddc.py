@@ -184,11 +184,10 @@ class DdcModel(MovingModule):
 class DdcAvatar:
     """The Avatar protocol (see `ash.protocol`) for the mesh baseline."""
 
-    def __init__(self, config: DdcConfig, capture: Capture, *, template: Template | None = None) -> None:
-        """`template`: one to stand on, where it exists already."""
+    def __init__(self, config: DdcConfig, capture: Capture) -> None:
         capture = training_part(capture, config.training)
         self.device = device_named(config.device)
-        self.template = template or template_of(config.template, capture, seed=config.seed, device=self.device)
+        self.template = template_of(config.template, capture, seed=config.seed, device=self.device)
         torch.manual_seed(config.seed)
         self.config = config
         initial = torch.full((3, config.texture, config.texture), GREY)

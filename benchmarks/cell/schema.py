@@ -34,7 +34,6 @@ Status = Literal["done", "crashed", "diverged", "timeout", "out of memory"]
 VARIED = ("factory", "changes", "subject")
 PRINTED = ("reason", "training", "provenance", "drawn_on", "evaluated_code")  # texts of a result, for people to read
 RETIRED = ("choice", "search_seconds")
-STATUSES = ("done", "crashed", "diverged", "timeout", "out of memory")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -292,7 +291,7 @@ def result_of(cell: Cell) -> CellResult | None:
 
 
 def _result_from(content: Any) -> CellResult:
-    if isinstance(content.get("training"), dict):  # Results of version 0.3 and earlier have two keys more.
+    if isinstance(content.get("training"), dict):  # Results of version 0.2 have two keys more.
         content["training"] = {key: value for key, value in content["training"].items() if key not in RETIRED}
     content = content | {name: _printable(content[name]) for name in PRINTED if name in content}
     views = [dict(view) for view in content["views"]]

@@ -16,17 +16,6 @@ from ash.files import InputError
 from benchmarks.commands.arguments import DONE, FAILED, File, Folder, Trust
 from benchmarks.commands.devices import CPU, DeviceName, chosen_device
 
-PUBLIC = (
-    "ash.capture",
-    "ash.protocol",
-    "ash.config",
-    "ash.fields",
-    "ash.presets",
-    "benchmarks.play.avatars",
-    "benchmarks.suites.files",
-    "synth.scene",
-)
-
 
 @dataclass(frozen=True, kw_only=True)
 class SpeedCommand:

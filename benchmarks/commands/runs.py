@@ -102,15 +102,10 @@ class RunCommand:
         return run_and_report(suite, options)
 
     def _print_suites(self) -> int:
-        from ash.fields import suggest
-        from benchmarks.suites.files import suite_files
+        from benchmarks.suites.files import suite_file, suite_files
 
-        known = suite_files()
-        if self.suite and self.suite not in known:
-            raise InputError(f"unknown suite {self.suite!r}, {suggest(self.suite, tuple(known))}")
-        for name, path in known.items():
-            if self.suite in ("", name):
-                print(f"# {name}.toml\n{path.read_text()}")
+        for path in [suite_file(self.suite)] if self.suite else suite_files().values():
+            print(f"# {path.name}\n{path.read_text()}")
         return DONE
 
     def _chosen(self) -> "Suite":

@@ -1,1 +1,1 @@
-"""Studies of one method: conformance, display, retargeting."""
+"""Studies of one method: conformance checks, and evaluation on a foreign motion."""

@@ -69,11 +69,20 @@ def our_rows() -> frozenset[tuple[str, str, str]]:
 
 def find_suite(name: str | Path) -> Suite:
     """A suite of ours by name, or anyone's by its file."""
+    return read_suite(suite_file(name))
+
+
+def suite_file(name: str | Path) -> Path:
+    """The file of a suite of ours, by today's or an old name, or anyone's file itself.
+
+    Raises:
+        InputError: it is neither.
+    """
     known = suite_files()
     path = known.get(OLD_SUITES.get(str(name), str(name)), Path(name))
     if path.suffix != ".toml":
         raise InputError(f"unknown suite {str(name)!r}, {suggest(str(name), (*known, 'FILE.toml'))}")
-    return read_suite(path)
+    return path
 
 
 def read_suite(path: Path) -> Suite:

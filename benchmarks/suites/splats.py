@@ -4,7 +4,6 @@ They are none of ASH's: more than it has texels, at other places, of other shape
 It is drawn here and not in `synth`, which makes the truth that the splatter is judged by and so must not know it.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from ash.template.template import RestDeformation, Template
 from ash.textures import TexelLattice
 from synth.capture import make_body
 from synth.scene import Scene
-from synth.views import WantedView, splits
+from synth.views import splits
 
 CI_COUNT, COUNT = 5_000, 60_000  # About twice as many as the presets' lattices have texels at these sizes.
 VERSION = 2
@@ -63,12 +62,6 @@ def draw_capture(scene: Scene, folder: Path) -> None:
         splits=parts,
         files=hash_files(folder),
     ).write(folder)
-
-
-def draw_views(scene: Scene, views: Sequence[WantedView]) -> list[np.ndarray]:
-    """RGBA of views of the scene, uint8 `[h, w, 4]`, straight alpha."""
-    made = _person(scene)
-    return [draw_view(made.model, Pose(made.motion, view.frame), made.cameras[view.camera]) for view in views]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.rehearsal import STEPS, Rehearsal
+from helpers.fake_learner import STEPS, FakeLearner
 from torch import Tensor
 
 import ash.avatar
@@ -82,9 +82,9 @@ class Subject:
         return self.avatar._inputs[frame] if self.is_mesh else self.avatar._inputs_of(frame)
 
     @cached_property
-    def rehearsal(self) -> Rehearsal:
+    def fake_learner(self) -> FakeLearner:
         """The avatar's own `fit`, with somebody else in its place."""
-        made = Rehearsal()
+        made = FakeLearner()
         with pytest.MonkeyPatch.context() as patch:
             for module in (ash.avatar, baselines.ddc):
                 patch.setattr(module, "fit", made.fit)
@@ -265,14 +265,18 @@ def drawing(s: Subject) -> str:
 def batches(s: Subject) -> str:
     """What the first steps are shown."""
     return fingerprint(
-        *(value for b in s.rehearsal.shown for value in (b.frame, [c.name for c in b.cameras], b.targets, b.background))
+        *(
+            value
+            for b in s.fake_learner.shown
+            for value in (b.frame, [c.name for c in b.cameras], b.targets, b.background)
+        )
     )
 
 
 def loss(s: Subject) -> str:
     drawn, target = (numbers(1, PIXELS, PIXELS, 3, seed=seed).sigmoid() for seed in (10, 11))
     batch = Batch(frame=0, cameras=[], targets=target, foreground=target[..., 0], background=torch.zeros(3))
-    return fingerprint(view_loss([drawn], [batch], s.rehearsal.config))
+    return fingerprint(view_loss([drawn], [batch], s.fake_learner.config))
 
 
 def noise(s: Subject) -> str:
@@ -298,14 +302,14 @@ def warm_up(s: Subject) -> str:
         if not s.is_mesh:
             patch.setattr(s.avatar, "_fit_frame", lambda images, frame: s.avatar.analytic + frame)
             patch.setattr(s.avatar, "_regress", teach)
-        s.rehearsal.before_start()
+        s.fake_learner.before_start()
     left_out = [s.learned_in(step) is None for step in range(STEPS)] if s.nets else []
     return fingerprint(*taught, left_out)
 
 
 def turns(s: Subject) -> str:
     """Which step ends the warm-up, and which ones also teach what counts far from the training motion."""
-    told = s.rehearsal.told
+    told = s.fake_learner.told
     return fingerprint([one for one, _ in groupby(told[: told.index(f"step {STEPS}")])])
 
 
@@ -319,17 +323,17 @@ def rates(s: Subject) -> str:
 
 def course(s: Subject) -> str:
     """How the rates rise and fall, and when and why training ends."""
-    outcome = s.rehearsal.outcome
-    return fingerprint(s.rehearsal.rates, outcome.steps, outcome.ended_by)
+    outcome = s.fake_learner.outcome
+    return fingerprint(s.fake_learner.rates, outcome.steps, outcome.ended_by)
 
 
 def files(s: Subject) -> str:
     """What is written, and after which step."""
-    return fingerprint(s.rehearsal.kept)
+    return fingerprint(s.fake_learner.kept)
 
 
 def average(s: Subject) -> str:
-    run = loop.Trainer(s.avatar, s.avatar.config.training, s.rehearsal.images, s.folder)
+    run = loop.Trainer(s.avatar, s.avatar.config.training, s.fake_learner.images, s.folder)
     return fingerprint(bool(run.average))
 
 

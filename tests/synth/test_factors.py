@@ -62,7 +62,7 @@ def test_strength_zero_is_skinned_itself(name: str, size: str):
     assert replace(changed, name="skinned", **{key: getattr(skinned, key) for key in different}) == skinned
 
 
-def test_unknown_rungs_are_refused():
+def test_unknown_factor_scenes_are_refused():
     with pytest.raises(InputError, match="wrinkles, swing"):
         presets.factor_scene("creases", size="ci")
 

@@ -278,8 +278,8 @@ def test_isolation_costs_a_cell_at_most_half_a_second(
         monkeypatch.setenv(sandbox.ISOLATION, way)
         start = time.perf_counter()
         with seen_by_method(whole, tmp_path / "input", oracle=way == "off") as seen:
-            with client.open_client(target, whole, seen, method, oracle=False) as client_of:
-                if client_of.isolated != (way == "on"):
+            with client.open_client(target, whole, seen, method, oracle=False) as opened:
+                if opened.isolated != (way == "on"):
                     pytest.skip("this kernel gives no namespaces")
             return time.perf_counter() - start
 
@@ -300,10 +300,10 @@ def test_kernels_are_compiled_once_and_every_cell_has_its_own_copy(
     method = find_method("warps")
     with (
         seen_by_method(whole, tmp_path / "input", oracle=False) as seen,
-        client.open_client(target, whole, seen, method, oracle=False) as client_of,
+        client.open_client(target, whole, seen, method, oracle=False) as opened,
     ):
-        client_of.make()
-        client_of.fit()
+        opened.make()
+        opened.fit()
     told = json.loads((target.folder / client.WORK / "compiled.json").read_text())
     assert told["seen"] == 16, "the triangle covers the whole picture"
     assert bool(told["before"]) == seeded and bool(told["after"])

@@ -17,7 +17,7 @@ from ash.training.loop import fit
 STEPS, SECONDS_PER_STEP = 7, 20.0  # so many steps are looked at, by a clock on which each takes so long
 
 
-class Rehearsal:
+class FakeLearner:
     """Takes an avatar's place in the avatar's own `fit`: learns one number, and notes what the loop does and when."""
 
     def __init__(self) -> None:
