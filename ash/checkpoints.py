@@ -9,7 +9,12 @@ from torch import Tensor
 
 from ash.files import InputError
 
-OLD_NAMES = {"base": "base_texels", "static": "fallback_texels"}  # in checkpoints of version 0.2
+OLD_NAMES = {  # in checkpoints of version 0.2
+    "base": "base_texels",
+    "static": "fallback_texels",
+    "texture": "base_texture",
+    "static_texture": "fallback_texture",
+}
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -101,7 +101,6 @@ class TrainingConfig:
     views_per_step: int  # images of one frame that share one decoding
     warmup: str  # "static": the base alone first; "analytic": as released; "fitted": the paper's per-frame fits; "none"
     warmup_steps: int
-    static_every: int = 2  # steps, of which one also teaches what counts far from the training motion
     l1_weight: float  # lambda_pix
     ssim_weight: float  # lambda_str
     learning_rate: float  # of the networks
@@ -118,11 +117,9 @@ class TrainingConfig:
     texture_noise: float = 0.0  # in the standardised motion-aware textures while decoders learn; not in the paper
     camera_share: float = 1.0  # of the training cameras, evenly spread
     frame_share: float = 1.0  # of the training frames, from the first on
-    fitted_every: int = 10  # frames, of which the first is fitted alone in the paper's warm-up,
-    fitted_steps: int = 2000  # in at most so many steps: less where nothing more is gained
+    fitted_steps: int = 2000  # at most, in which the paper's warm-up fits a frame alone: less where no more is gained
     seconds: float = math.inf  # of CPU time, at most
     snapshots: bool = False  # keep the weights of half a minute, of 42 s, of a minute, ... of half an hour
-    checkpoint_seconds: float = 60.0
 
     @property
     def static_steps(self) -> int:
@@ -137,8 +134,6 @@ class TrainingConfig:
         one_of("precision", self.precision, ("float32", "bfloat16"))
         if not 0 <= self.ema < 1:
             raise InputError(f"ema: expected a decay of at least 0 and below 1, got {self.ema}")
-        if self.static_every < 1:
-            raise InputError(f"static_every: expected at least 1, got {self.static_every}")
         if not self.seconds > 0:
             raise InputError(f"seconds: expected more than 0, got {self.seconds}")
         if not 0 <= self.texture_noise < math.inf:
@@ -146,8 +141,8 @@ class TrainingConfig:
         for name in ("camera_share", "frame_share"):
             if not 0 < getattr(self, name) <= 1:
                 raise InputError(f"{name}: expected more than 0 and at most 1, got {getattr(self, name)}")
-        if min(self.fitted_every, self.fitted_steps) < 1:
-            raise InputError("fitted_every and fitted_steps: expected at least 1")
+        if self.fitted_steps < 1:
+            raise InputError(f"fitted_steps: expected at least 1, got {self.fitted_steps}")
         if min(self.steps, self.views_per_step) < 1 or not 0 <= self.warmup_steps <= self.steps:
             raise InputError("expected steps >= 1, views_per_step >= 1 and 0 <= warmup_steps <= steps")
         if self.frames_per_step < 1:
@@ -168,36 +163,27 @@ class TemplateConfig:
 
     kind: str = "skinned"  # "skinned": rest mesh, skinned; "learned": deformed as training frames were; "exact"
     error_mm: float = 0.0  # rms of a smooth error that is planted in the exact surface
-    error_static: float = 0.25  # share of its square that is the same in all frames; learned: 0.15 loose, 0.39 tight
-    error_lag: float = 0.5  # correlation of the rest from frame to frame; learned from images: 0.35 loose, 0.70 tight
     supervision: str = "images"  # nothing but the videos; "scans": of a scanner
-    passes: int = 4  # over all training images, where they supervise
     network: str = "linear"  # a map per node of the embedded graph; "graph": the paper's graph convolutions
-    skinning: str = "direct"  # "graph": the nodes' transforms, blended, as released
     nodes: int = 400  # of the embedded graph
     window: int = 2  # frames of motion that are seen
-    weights: str = "shared"  # of the graph convolutions; "per-node": as released
-    dense: bool = False  # one full matrix over the vertices in the displacement network, as released
-    width: int = 16  # of the graph convolutions
-    blocks: int = 2
-    steps: int = 300  # of the graph convolutions' training
+    blocks: int = 2  # of the graph convolutions
+    steps: int = 300  # of their training
+    # as the release: convolutions with weights per node, a full matrix over the vertices in the displacement network,
+    # and skinning by the nodes' blended transforms
+    released: bool = False
 
     def __post_init__(self) -> None:
         """Refuse what does not exist."""
         one_of("template", self.kind, ("skinned", "learned", "exact"))
         one_of("template supervision", self.supervision, SUPERVISIONS)
         one_of("template network", self.network, ("linear", "graph"))
-        one_of("template skinning", self.skinning, ("direct", "graph"))
-        one_of("template weights", self.weights, ("shared", "per-node"))
         if not 0 <= self.error_mm < 1000:
             raise InputError(f"template error_mm: expected 0 to 1000 mm, got {self.error_mm}")
         if self.error_mm > 0 and self.kind != "exact":
             raise InputError(f"template error_mm: a planted error needs the exact surface, got {self.kind!r}")
-        if not (0 <= self.error_static <= 1 and -1 < self.error_lag < 1):
-            given = f"{self.error_static} and {self.error_lag}"
-            raise InputError(f"template error_static, error_lag: expected 0 to 1 and above -1 and below 1, got {given}")
-        if min(self.nodes, self.window, self.passes, self.width, self.blocks, self.steps) < 1:
-            raise InputError("template: nodes, window, passes, width, blocks and steps must be at least 1")
+        if min(self.nodes, self.window, self.blocks, self.steps) < 1:
+            raise InputError("template: nodes, window, blocks and steps must be at least 1")
         if self.window > MAX_WINDOW:
             raise InputError(f"template window: expected 1 to {MAX_WINDOW} frames, got {self.window}")
 

@@ -199,7 +199,7 @@ def apart(batch: Tensor) -> Sequence[Tensor]:
     return [batch.squeeze(0)] if len(batch) == 1 else batch.unbind()
 
 
-def seen_together(
+def batched_inputs(
     frames: Sequence[DecoderInputs], phi: GlobalFeatures | None
 ) -> tuple[Float[Tensor, "b c r r"], Float[Tensor, "*each 16"] | None]:
     """Frames as one batch for U-Nets: textures in their memory order, and Phi."""
@@ -233,17 +233,13 @@ class Decoders(nn.Module):
         self.phi = GlobalFeatures(config.global_mlp) if config.global_features else None
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def forward(self, conditions: FrameInputs) -> Float[Tensor, "n o"]:
-        """Decode one frame."""
-        return self.together([conditions])[0]
-
-    def together(self, conditions: Sequence[FrameInputs]) -> Sequence[Float[Tensor, "n o"]]:
+    def forward(self, inputs: Sequence[FrameInputs]) -> Float[Tensor, "b n o"]:
         """Decode several frames as one batch."""
-        x, phi = seen_together(conditions, self.phi)
-        seen_by = [None] * (len(self.nets) - 1) + [phi]  # E_geo does not see Phi, unless the trunk is shared.
+        x, phi = batched_inputs(inputs, self.phi)
+        features = [None] * (len(self.nets) - 1) + [phi]  # E_geo does not get Phi, unless the trunk is shared.
         nets = cast(Iterable[UNet], self.nets)
-        decoded = [net.picked(x, features, self.texels) for net, features in zip(nets, seen_by, strict=True)]
-        return apart(decoded[0] if len(decoded) == 1 else torch.cat(decoded, -1))
+        decoded = [net.picked(x, extra, self.texels) for net, extra in zip(nets, features, strict=True)]
+        return decoded[0] if len(decoded) == 1 else torch.cat(decoded, -1)
 
 
 class TexelRows(nn.Module):

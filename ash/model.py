@@ -12,11 +12,10 @@ from torch import Tensor, nn
 
 from ash.capture.dataset import Camera, Pose
 from ash.config import ModelConfig
-from ash.decoders import Decoders
 from ash.devices import MovingModule, finish
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted, splat
-from ash.gaussians.texels import LIGHT_COEFFICIENTS, pose, sample_surface
+from ash.gaussians.texels import pose, sample_surface
 from ash.protocol import StageClock
 from ash.template.motion import normalised_motion
 from ash.template.template import Template
@@ -27,7 +26,8 @@ from ash.textures import FrameInputs, TexelLattice, TextureDrawer, build_lattice
 class AshModel(MovingModule):
     """The learned part of ASH, and how the stages are joined.
 
-    Not in the paper: learned `base_texels`, `fallback_texels` and `light`.
+    A frame is `frame_inputs` (Stg. 1 and 2), `decode` (Stg. 3), `gaussians` and `rasterize` (Stg. 4). What the paper
+    does not have is in `ash.plus.AshPlusModel`.
     """
 
     def __init__(
@@ -38,9 +38,9 @@ class AshModel(MovingModule):
         initial: Float[Tensor, "n o"],
         decoders: nn.Module | None,
     ) -> None:
-        """`initial`: raw parameters per texel, to which the decoders add theirs; no decoders: they are all there is.
+        """`initial`: raw parameters per texel, to which the decoders add theirs; learned where there are no decoders.
 
-        Decoders map `FrameInputs` to `[n, o]`; those of the paper are `ash.decoders.Decoders`.
+        Decoders map a sequence of b `FrameInputs` to `[b, n, o]`; those of the paper are `ash.decoders.Decoders`.
         """
         super().__init__()
         self.config = config
@@ -56,17 +56,14 @@ class AshModel(MovingModule):
                 bound=config.bound,
                 novelty_scale=config.novelty_scale,
             )
-        self.base_texels = nn.Parameter(initial.clone(), requires_grad=config.base)
+        self.base_texels = nn.Parameter(initial.clone(), requires_grad=decoders is None)
         self.decoders = decoders
-        fades = config.novelty_scale and self.textures is not None
-        self.fallback_texels = nn.Parameter(initial.clone()) if fades else None  # for poses far from training
         self.refinement: MotionRefinement | None = None
         if isinstance(template.deformation, RefinedDeformation):
             self.refinement = template.deformation.refinement
-        self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.light else None
 
     def frame_inputs(self, pose: Pose, clock: StageClock | None = None, threads: int = 1) -> FrameInputs:
-        """Stg.1 and Stg.2: pose the template, and draw what the decoders see."""
+        """Stg. 1 and 2: pose the template, and draw what the decoders take."""
         device = self.base_texels.device
         with stage(clock, "stg1", device):
             learns = self.refinement is not None and torch.is_grad_enabled()
@@ -87,62 +84,59 @@ class AshModel(MovingModule):
     def _textures(self, pose: Pose) -> Float[Tensor, "c r r"]:
         return self.base_texels.new_zeros(0, 1, 1) if self.textures is None else self.textures(self.template, pose)
 
-    def decode(self, conditions: FrameInputs) -> Float[Tensor, "n o"]:
-        """Stg.3: raw Gaussian parameters per texel."""
+    def decode(self, inputs: Sequence[FrameInputs]) -> Float[Tensor, "b n o"]:
+        """Stg. 3: raw Gaussian parameters per texel of several frames, decoded as one batch."""
         if self.decoders is None:
-            return self.base_texels
-        return self.base_texels + self.mask_offsets(self.decoders(conditions))
+            return self.base_texels[None].expand(len(inputs), -1, -1)
+        return self.base_texels[None] + self.residual(inputs)
 
-    def decode_together(self, frames: Sequence[FrameInputs]) -> list[Float[Tensor, "n o"]]:
-        """`decode` of several frames, by U-Nets in one batch; by what decodes in another way frame by frame."""
-        if len(frames) == 1 or not isinstance(self.decoders, Decoders):
-            return [self.decode(seen) for seen in frames]
-        return [self.base_texels + self.mask_offsets(decoded) for decoded in self.decoders.together(frames)]
-
-    def mask_offsets(self, decoded: Float[Tensor, "n o"]) -> Float[Tensor, "n o"]:
-        """What of the decoders' output counts: all of it, or all but the offsets."""
+    def residual(self, inputs: Sequence[FrameInputs]) -> Float[Tensor, "b n o"]:
+        """What the decoders add: all of their output, or all but the offsets."""
+        assert self.decoders is not None
+        decoded: Tensor = self.decoders(inputs)
         if self.config.motion_offset:
             return decoded
-        return torch.cat([torch.zeros_like(decoded[:, :3]), decoded[:, 3:]], 1)
+        return torch.cat([torch.zeros_like(decoded[..., :3]), decoded[..., 3:]], -1)
 
-    def pose(self, raw: Float[Tensor, "n o"], conditions: FrameInputs, threads: int = 1) -> Gaussians:
+    def gaussians(self, raw: Float[Tensor, "n o"], inputs: FrameInputs, threads: int = 1) -> Gaussians:
         """Activate the raw parameters and carry them from canonical to posed space (Eq. 5)."""
-        return pose(raw, conditions, self.config, self.light, threads=threads)
+        return pose(raw, inputs, self.config, None, threads=threads)
 
-    def draw(
+    def rasterize(
         self, gaussians: Gaussians, cameras: list[Camera], background: Tensor | None, threads: int = 1
     ) -> Splatted:
-        """Stg.4: splat into cameras of one size."""
+        """Stg. 4: splat into cameras of one size; no background: over black."""
         return splat(
             gaussians, **views_of(cameras), background=background, dilation=self.config.dilation, threads=threads
         )
 
     def forward(self, pose: Pose, camera: Camera, clock: StageClock | None = None) -> Splatted:
         """Motion and camera to image: the whole of ASH, over black, on as many threads as torch is given."""
-        shared = self.gaussians(pose, clock)
+        components = self.pose_components(pose, clock)
         with stage(clock, "stg4", self.base_texels.device):
             threads = torch.get_num_threads()
             return blend_renders(
-                [(share, self.draw(gaussians, [camera], None, threads)) for share, gaussians in shared]
+                [(weight, self.rasterize(gaussians, [camera], None, threads)) for weight, gaussians in components]
             )
 
-    def gaussians(self, pose: Pose, clock: StageClock | None = None) -> list[tuple[float, Gaussians]]:
-        """Motion to posed Gaussians: all that does not depend on the camera; one set per `blend_components`."""
+    def pose_components(self, pose: Pose, clock: StageClock | None = None) -> list[tuple[float, Gaussians]]:
+        """Motion to posed Gaussians: all that does not depend on the camera; one set per component of the picture."""
         threads = torch.get_num_threads()
-        conditions = self.frame_inputs(pose, clock, threads)  # Stg.1, Stg.2
+        inputs = self.frame_inputs(pose, clock, threads)  # Stg. 1 and 2
         with stage(clock, "stg3", self.base_texels.device):
-            shares = self.blend_components(self.decode(conditions), conditions)
+            components = self.components(self.decode([inputs])[0], inputs)
         with stage(clock, "stg4", self.base_texels.device):
-            return [(share, self.pose(raw, conditions, threads)) for share, raw in shares]
+            return [(weight, self.gaussians(raw, inputs, threads)) for weight, raw in components]
 
-    def blend_components(self, decoded: Float[Tensor, "n o"], conditions: FrameInputs) -> list[tuple[float, Tensor]]:
-        """Raw parameters whose renders are blended, with their weights, the decoded ones first.
+    def components(
+        self, decoded: Float[Tensor, "n o"], inputs: FrameInputs
+    ) -> list[tuple[float, Float[Tensor, "n o"]]]:
+        """Raw parameters whose renders make the picture, and their weights: here the decoded ones alone."""
+        return [(1.0, decoded)]
 
-        Where `TextureDrawer.decoder_weight` is below 1 the rest is a static avatar. Not in the paper.
-        """
-        if self.fallback_texels is None or conditions.decoder_weight == 1:
-            return [(1.0, decoded)]
-        return [(conditions.decoder_weight, decoded), (1 - conditions.decoder_weight, self.fallback_texels)]
+    def direct_parameters(self) -> list[nn.Parameter]:
+        """What is learned directly, not through a network."""
+        return [self.base_texels] if self.base_texels.requires_grad else []
 
 
 def blend_renders(drawn: Sequence[tuple[float, Splatted]]) -> Splatted:

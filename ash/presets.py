@@ -125,7 +125,7 @@ def official() -> AshConfig:
         base,
         model=replace(base.model, sh_degree=0, norm="batch-as-released", quat_frame="world", global_mlp="released"),
         training=replace(base.training, warmup="analytic", l1_weight=0.9, ssim_weight=0.1),
-        template=replace(base.template, weights="per-node", dense=True, skinning="graph"),
+        template=replace(base.template, released=True),
     )
 
 
@@ -173,6 +173,6 @@ class MethodFactory(Generic[Config]):
         return replace(self, config=lambda preset: apply_overrides(self.config(preset), changes, of=preset))
 
 
-ash = MethodFactory(config=named, build=AshAvatar)
+ash = MethodFactory(config=named, build=AshAvatar.from_capture)
 # An oracle: what the template's error costs.
 ash_truth = ash.with_overrides({"template": TemplateConfig(kind="exact")})

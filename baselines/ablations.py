@@ -32,7 +32,7 @@ class BareBodyAvatar(AshAvatar):
 
 
 def _on_bare_body(config: AshConfig, capture: Capture) -> BareBodyAvatar:
-    return BareBodyAvatar(config, replace(capture, template=read_body(capture)))
+    return BareBodyAvatar.from_capture(config, replace(capture, template=read_body(capture)))
 
 
 # The paper's rows. Its w/o disp. removes the motion-aware offset; where texels are learned (the fast presets), their

@@ -8,11 +8,9 @@ coverage, and so is where its vertices lie: one displacement for all frames, and
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors.torch
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -20,25 +18,23 @@ from torch import Tensor, nn
 import ash.native.shading
 from ash.bounded_cache import BoundedCache
 from ash.capture.dataset import Camera, Capture, Pose, TemplateMesh
-from ash.checkpoints import contiguous_state, load_module, read_safetensors
 from ash.config import AshConfig, AtlasConfig, TemplateConfig, TrainingConfig, check_device, one_of
-from ash.decoders import GLOBAL_FEATURES, GlobalFeatures, UNet, apart, decoding_in, decoding_precision, seen_together
-from ash.devices import CPU, MovingModule, device_named, moved
-from ash.files import InputError, write_atomic
+from ash.decoders import GLOBAL_FEATURES, GlobalFeatures, UNet, apart, as_batch, batched_inputs
+from ash.devices import CPU, MovingModule, moved
+from ash.files import InputError
 from ash.gaussians.initialising import initial_texture
 from ash.gaussians.texels import LIGHT_COEFFICIENTS
 from ash.mesh.drawing import MeshView, draw_seen, see_mesh, textured, topology_of
 from ash.model import stage
 from ash.presets import MethodFactory, named
-from ash.protocol import Display, DressedMesh, StageClock, TrainingOutcome
+from ash.protocol import Display, DressedMesh, StageClock
 from ash.rotations import RigidTransforms
 from ash.template.template import PosedTemplate, Template
-from ash.template_learning.learning import template_of, with_template
 from ash.template_learning.refining import MotionRefinement, Refinement
-from ash.textures import DecoderInputs, TextureDrawer, add_texture_noise_to_frames, build_lattice
+from ash.textures import DecoderInputs, TextureDrawer, build_lattice
+from ash.training.avatar import TrainedAvatar
 from ash.training.batches import over
-from ash.training.images import load_training_images, training_part
-from ash.training.loop import fit
+from ash.training.images import TrainingImages
 from baselines.display import MeshDisplay, texture_gain
 
 # Texture pixels per Gaussian of ASH's lattice, per side: the mesh must not be starved. At 256x256 a body's pixel is
@@ -91,9 +87,10 @@ def ddc_config(ash: AshConfig, *, seed: int, template: TemplateConfig) -> DdcCon
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class MeshInputs(DecoderInputs):
-    """What the networks see of a frame."""
+    """What Stg. 1 and 2 hand to the networks for one frame."""
 
     window: list[RigidTransforms]  # for the vertices' networks
+    posed: PosedTemplate  # as the template has it, before images move its vertices
 
 
 class DdcModel(MovingModule):
@@ -108,10 +105,8 @@ class DdcModel(MovingModule):
         self.uv_faces = torch.from_numpy(mesh.uv_faces)
         self.uvs = torch.from_numpy(mesh.uvs).float()
         self.topology = topology_of(template.faces)
-        self.texture = nn.Parameter(initial.clone(), requires_grad=config.model.base)
-        self.static_texture = (
-            nn.Parameter(initial.clone()) if config.model.novelty_scale else None
-        )  # far from training motion
+        self.base_texture = nn.Parameter(initial.clone(), requires_grad=config.model.base)
+        self.fallback_texture = nn.Parameter(initial.clone()) if config.model.novelty_scale else None
         self.refinement: Refinement | MotionRefinement | None = None
         if config.refine == "motion":
             self.refinement = MotionRefinement(config.template, mesh, template.skeleton)
@@ -129,40 +124,44 @@ class DdcModel(MovingModule):
         self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.model.light else None
 
     @torch.no_grad()
-    def frame_inputs(self, pose: Pose) -> MeshInputs:
-        """Stg.2: draw what the networks see."""
-        textures = self.textures(self.template, pose)
-        return MeshInputs(
-            textures=textures,
-            decoder_weight=self.textures.decoder_weight(textures),
-            root_translation=torch.from_numpy(pose.dofs[:3]).float().to(self.texture.device),
-            window=self.refinement.window(pose) if isinstance(self.refinement, MotionRefinement) else [],
-        )
+    def frame_inputs(self, pose: Pose, clock: StageClock | None = None) -> MeshInputs:
+        """Stg. 1 and 2: pose the template, and draw what the networks take."""
+        device = self.base_texture.device
+        with stage(clock, "stg1", device):
+            posed = self.template.pose(pose)
+        with stage(clock, "stg2", device):
+            textures = self.textures(self.template, pose)
+            return MeshInputs(
+                textures=textures,
+                decoder_weight=self.textures.decoder_weight(textures),
+                root_translation=torch.from_numpy(pose.dofs[:3]).float().to(device),
+                window=self.refinement.window(pose) if isinstance(self.refinement, MotionRefinement) else [],
+                posed=posed,
+            )
 
-    def dynamic_texture(self, conditions: MeshInputs) -> Float[Tensor, "3 t t"]:
-        """The texture of a frame, blended with a static one by `TextureDrawer.decoder_weight`."""
-        (texture,) = self.corrected_textures([conditions])
-        return texture if self.static_texture is None else self.static_texture.lerp(texture, conditions.decoder_weight)
+    def decode(self, inputs: Sequence[MeshInputs]) -> Float[Tensor, "b 3 t t"]:
+        """Stg. 3: the textures of several frames, decoded as one batch at 1/shuffle of the resolution."""
+        factor, decoded = self.config.shuffle, self.network(*batched_inputs(inputs, self.phi))
+        if self.base_texture.dtype == torch.float32 and self.base_texture.device.type == "cpu":
+            add = ash.native.shading.add_shuffled
+            return as_batch([add(self.base_texture, added, factor) for added in apart(decoded)])
+        return self.base_texture[None] + nn.functional.pixel_shuffle(decoded, factor)
 
-    def corrected_textures(self, frames: Sequence[MeshInputs]) -> list[Float[Tensor, "3 t t"]]:
-        """The texture with what the network adds in each frame; frames are decoded together."""
-        factor, decoded = self.config.shuffle, self._decoded(frames)
-        if self.texture.dtype == torch.float32 and self.texture.device.type == "cpu":
-            return [ash.native.shading.add_shuffled(self.texture, added, factor) for added in decoded]
-        return [self.texture + nn.functional.pixel_shuffle(added, factor) for added in decoded]
+    def residual(self, inputs: Sequence[MeshInputs]) -> Float[Tensor, "b 3 t t"]:
+        """What the network adds to the base."""
+        return nn.functional.pixel_shuffle(self.network(*batched_inputs(inputs, self.phi)), self.config.shuffle)
 
-    def correction(self, conditions: MeshInputs) -> Float[Tensor, "3 t t"]:
-        """What the network adds: decoded at the resolution of the motion-aware textures and shuffled up."""
-        return nn.functional.pixel_shuffle(self._decoded([conditions])[0], self.config.shuffle)
-
-    def _decoded(self, frames: Sequence[MeshInputs]) -> Sequence[Float[Tensor, "o r r"]]:
-        return apart(self.network(*seen_together(frames, self.phi)))
+    def blended_texture(self, inputs: MeshInputs) -> Float[Tensor, "3 t t"]:
+        """The texture of a frame, blended with the fallback by `TextureDrawer.decoder_weight`."""
+        (texture,) = self.decode([inputs])
+        fallback = self.fallback_texture
+        return texture if fallback is None else fallback.lerp(texture, inputs.decoder_weight)
 
     def see(self, posed: PosedTemplate, cameras: list[Camera]) -> list[MeshView]:
         """What cameras of one size see of the posed mesh, whatever its texture."""
         return see_mesh(posed.vertices, self.topology, cameras)
 
-    def draw(
+    def rasterize(
         self, texture: Float[Tensor, "3 t t"], posed: PosedTemplate, views: list[MeshView], background: Tensor
     ) -> Float[Tensor, "c h w 4"]:
         """Rgb over `background`, and coverage. Differentiable in the texture, the light and the posed vertices.
@@ -172,27 +171,28 @@ class DdcModel(MovingModule):
         shade = textured(texture, self.uvs, self.uv_faces, posed.normals, self.template.faces, self.light)
         return draw_seen(views, self.topology, shade, background, outlines=any(v.corners.requires_grad for v in views))
 
-    def refined(self, posed: PosedTemplate, conditions: MeshInputs) -> PosedTemplate:
+    def refined(self, inputs: MeshInputs) -> PosedTemplate:
         """The template with its vertices where the images moved them. The light keeps the normals that it had."""
+        posed = inputs.posed
         if self.refinement is None:
             return posed
-        seen = (conditions.window, conditions.decoder_weight) if isinstance(self.refinement, MotionRefinement) else ()
-        canonical = posed.canonical + self.refinement(*seen)
+        moving = (inputs.window, inputs.decoder_weight) if isinstance(self.refinement, MotionRefinement) else ()
+        canonical = posed.canonical + self.refinement(*moving)
         return replace(posed, canonical=canonical, vertices=posed.transforms.apply(canonical))
 
 
-class DdcAvatar:
+class DdcAvatar(TrainedAvatar):
     """The Avatar protocol (see `ash.protocol`) for the mesh baseline."""
 
-    def __init__(self, config: DdcConfig, capture: Capture) -> None:
-        capture = training_part(capture, config.training)
-        self.device = device_named(config.device)
-        self.template = template_of(config.template, capture, seed=config.seed, device=self.device)
+    config: DdcConfig
+    module: DdcModel
+
+    def __init__(self, config: DdcConfig, capture: Capture, template: Template) -> None:
+        super().__init__(config, capture, template)
         torch.manual_seed(config.seed)
-        self.config = config
         initial = torch.full((3, config.texture, config.texture), GREY)
         if config.model.base:
-            initial = initial_texture(capture, self.template, build_lattice(capture.template, config.texture))
+            initial = initial_texture(capture, template, build_lattice(capture.template, config.texture))
         textures = TextureDrawer(
             build_lattice(capture.template, config.model.decoded_texels),
             window=config.model.window,
@@ -201,31 +201,32 @@ class DdcAvatar:
             bound=config.model.bound,
             novelty_scale=config.model.novelty_scale,
         )
-        textures.fit_normalization(self.template, capture.motion, capture.splits["train"].frames)
-        self.module = DdcModel(config, capture.template, self.template, textures, initial).to(self.device)
+        textures.fit_normalization(template, capture.motion, capture.splits["train"].frames)
+        self.module = DdcModel(config, capture.template, template, textures, initial).to(self.device)
         self.template = self.module.template
-        self._motion = capture.motion
-        self._outcome: TrainingOutcome | None = None
-        self._seen: tuple[Tensor, list[Camera], list[MeshView]] = (torch.empty(0), [], [])  # vertices drawn last
+        self._drawn_last: tuple[Tensor, list[Camera], list[MeshView]] = (torch.empty(0), [], [])  # vertices, ...
         # The template is frozen: each training frame is posed once, as far as there is room.
         self._inputs: BoundedCache[int, MeshInputs] = BoundedCache(
             lambda frame: self.module.frame_inputs(Pose(capture.motion, frame))
         )
-        self._posed: BoundedCache[int, PosedTemplate] = BoundedCache(
-            lambda frame: self.template.pose(Pose(capture.motion, frame))
-        )
 
-    def fit(self, capture: Capture, *, folder: Path) -> None:
-        """Train texture and network on the training images; see `ash.training.loop.fit`."""
-        images = load_training_images(training_part(capture, self.config.training), self.device)
-        outcome = fit(self, images, self.config.training, seed=self.config.seed, folder=folder)
-        self._outcome = replace(outcome, precision=self._precision)
+    @property
+    def base(self) -> nn.Parameter:
+        """A texture, `[3, t, t]`."""
+        return self.module.base_texture
+
+    @property
+    def fallback(self) -> nn.Parameter | None:
+        """The same for poses far from training; the vertices are shared."""
+        return self.module.fallback_texture
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Networks, and what is learned directly: texture, light, a displacement of the vertices; as ASH has it."""
         training, module = self.config.training, self.module
         nets = [*module.network.parameters(), *(module.phi.parameters() if module.phi is not None else ())]
-        static = [p for p in (module.texture, module.static_texture, module.light) if p is not None and p.requires_grad]
+        static = [
+            p for p in (module.base_texture, module.fallback_texture, module.light) if p is not None and p.requires_grad
+        ]
         if isinstance(module.refinement, MotionRefinement):
             nets += module.refinement.nets.networks()
             static.append(module.refinement.shared.rough)
@@ -234,64 +235,42 @@ class DdcAvatar:
         groups = (nets, training.learning_rate), (static, training.base_learning_rate)
         return [{"params": group, "lr": rate} for group, rate in groups]
 
-    def draw_training_views(
-        self, frame: int, cameras: list[Camera], background: Tensor, step: int, decoded: Tensor
-    ) -> Tensor:
-        """The texture of the frame, drawn into each camera."""
-        with torch.set_grad_enabled(torch.is_grad_enabled() and step % self.config.vertices_every == 0):
-            posed = self._refined(frame)
-        views = self.module.see(posed, cameras)
-        self._seen = posed.vertices.detach(), cameras, [replace(v, corners=v.corners.detach()) for v in views]
-        return self._drawn(decoded, posed, views, background)
+    def _warm_up(self, images: TrainingImages) -> None:
+        """Nothing: the texture starts from the training images."""
 
-    def draw_static_views(self, frame: int, cameras: list[Camera], background: Tensor) -> Tensor | None:
-        """Views with the texture that counts far from the training motion; its vertices are not its own."""
-        if (static := self.module.static_texture) is None:
-            return None
+    def _inputs_of(self, frame: int) -> MeshInputs:
+        return self._inputs[frame]
+
+    def _draw(
+        self, decoded: Tensor, inputs: MeshInputs, cameras: list[Camera], background: Tensor, step: int
+    ) -> Tensor:
+        with torch.set_grad_enabled(torch.is_grad_enabled() and step % self.config.vertices_every == 0):
+            posed = self.module.refined(inputs)
+        views = self.module.see(posed, cameras)
+        self._drawn_last = posed.vertices.detach(), cameras, [replace(v, corners=v.corners.detach()) for v in views]
+        return self._rasterize(decoded, posed, views, background)
+
+    def _draw_fallback(self, inputs: MeshInputs, cameras: list[Camera], background: Tensor) -> Tensor:
+        """Its gradient leaves the vertices alone: they are not its own."""
+        assert self.fallback is not None
         with torch.no_grad():
-            posed = self._refined(frame)
-        vertices, by, views = self._seen
+            posed = self.module.refined(inputs)
+        vertices, by, views = self._drawn_last
         if by is not cameras or not torch.equal(vertices, posed.vertices):
             views = self.module.see(posed, cameras)
-        return self._drawn(static, posed, views, background)
+        return self._rasterize(self.fallback, posed, views, background)
 
-    @torch.no_grad()
-    def end_warmup(self) -> None:
-        """Let the static texture start from what the warm-up made."""
-        if self.module.static_texture is not None:
-            self.module.static_texture.copy_(self.module.texture)
-
-    def _drawn(self, texture: Tensor, posed: PosedTemplate, views: list[MeshView], background: Tensor) -> Tensor:
-        drawn = self.module.draw(texture, posed, views, background if background.ndim == 1 else background.new_zeros(3))
+    def _rasterize(self, texture: Tensor, posed: PosedTemplate, views: list[MeshView], background: Tensor) -> Tensor:
+        behind = background if background.ndim == 1 else background.new_zeros(3)
+        drawn = self.module.rasterize(texture, posed, views, behind)
         return drawn[..., :3] if background.ndim == 1 else over(drawn[..., :3], drawn[..., 3], background)
-
-    def decoder_residual(self, frame: int) -> Tensor | None:
-        """What the network adds to the static texture in a training frame, `[3, t, t]`."""
-        return self.module.correction(self._inputs[frame])
-
-    def _refined(self, frame: int) -> PosedTemplate:
-        return self.module.refined(self._posed[frame], self._inputs[frame])
-
-    def decode_together(self, frames: Sequence[int], step: int) -> list[Float[Tensor, "3 t t"]]:
-        """The textures of a step's frames; the static texture alone while the warm-up lasts."""
-        training = self.config.training
-        if step < training.static_steps:
-            return [self.module.texture] * len(frames)
-        seen = [self._inputs[frame] for frame in frames]
-        noisy = add_texture_noise_to_frames(seen, training.texture_noise, seed=self.config.seed, step=step)
-        with decoding_in(self._precision, self.device):
-            return [texture.float() for texture in self.module.corrected_textures(noisy)]
-
-    @property
-    def _precision(self) -> str:
-        return decoding_precision(self.config.training.precision, self.device, self.config.model.width)
 
     @torch.no_grad()
     def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
         """Premultiplied RGBA, float32 `[h, w, 4]`."""
         posed, texture = self.dress(pose, clock)
         with stage(clock, "stg4", self.device):
-            drawn = self.module.draw(texture, posed, self.module.see(posed, [camera]), texture.new_zeros(3))
+            drawn = self.module.rasterize(texture, posed, self.module.see(posed, [camera]), texture.new_zeros(3))
             return drawn[0].clamp(0, 1).cpu().numpy()
 
     @torch.no_grad()
@@ -301,12 +280,9 @@ class DdcAvatar:
         Training may leave negative colours between texels; no display knows those, and held-out views are better
         without them.
         """
-        with stage(clock, "stg1", self.device):
-            posed = self.template.pose(pose)
-        with stage(clock, "stg2", self.device):
-            conditions = self.module.frame_inputs(pose)
+        inputs = self.module.frame_inputs(pose, clock)
         with stage(clock, "stg3", self.device):
-            return self.module.refined(posed, conditions), self.module.dynamic_texture(conditions).clamp(min=0)
+            return self.module.refined(inputs), self.module.blended_texture(inputs).clamp(min=0)
 
     @torch.no_grad()
     def dressed_mesh(self, pose: Pose) -> DressedMesh:
@@ -330,38 +306,17 @@ class DdcAvatar:
 
     def template_vertices(self, pose: Pose) -> np.ndarray:
         """The posed template, `[v, 3]` metres."""
-        posed = self.template.pose(pose)
         if self.module.refinement is None:
-            return posed.vertices.cpu().numpy()
-        return self.module.refined(posed, self.module.frame_inputs(pose)).vertices.detach().cpu().numpy()
-
-    def outcome(self) -> TrainingOutcome | None:
-        """How training ended; None before it did."""
-        return with_template(self._outcome, self.template)
-
-    def template_seconds(self) -> float | None:
-        """What learning the template took, once for all methods that stand on it; None where it was not learned."""
-        return None if self.template.learned is None else self.template.learned.seconds
+            return self.template.pose(pose).vertices.cpu().numpy()
+        return self.module.refined(self.module.frame_inputs(pose)).vertices.detach().cpu().numpy()
 
     def gaussian_means(self, pose: Pose) -> np.ndarray:
         """A mesh has none."""
         return np.zeros((0, 3))
 
-    def parameter_count(self) -> int:
-        """Numbers that training may change."""
-        return sum(p.numel() for p in self.module.parameters() if p.requires_grad)
-
     def gaussian_count(self) -> int:
         """A mesh has none."""
         return 0
-
-    def save(self, path: Path) -> None:
-        """Write the weights."""
-        write_atomic(path, safetensors.torch.save(contiguous_state(self.module)))
-
-    def load(self, path: Path) -> None:
-        """Read the weights that `save` wrote."""
-        load_module(self.module, read_safetensors(path)[0], path)
 
 
 def _of_preset(preset: str) -> DdcConfig:
@@ -374,5 +329,7 @@ def _on_exact(preset: str) -> DdcConfig:
     return ddc_config(named(preset), seed=0, template=TemplateConfig(kind="exact"))
 
 
-ddc = MethodFactory(config=_of_preset, build=DdcAvatar)  # On the template that ASH gets.
-ddc_truth = MethodFactory(config=_on_exact, build=DdcAvatar)  # An oracle on the exact surface, to see when a mesh wins.
+ddc = MethodFactory(config=_of_preset, build=DdcAvatar.from_capture)  # On the template that ASH gets.
+ddc_truth = MethodFactory(
+    config=_on_exact, build=DdcAvatar.from_capture
+)  # An oracle on the exact surface, to see when a mesh wins.

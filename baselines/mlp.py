@@ -1,15 +1,17 @@
 """The paper's ablation w/ MLP: Gaussian parameters straight from 3D, without the texture space (ASH appendix B)."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from ash.avatar import AshAvatar
-from ash.capture.dataset import Capture
-from ash.config import AshConfig, ModelConfig
+from ash.config import ModelConfig
+from ash.decoders import as_batch
 from ash.gaussians.gaussians import raw_channels
 from ash.presets import MethodFactory, named
-from ash.textures import FrameInputs
+from ash.textures import FrameInputs, TexelLattice
 
 LAYERS, WIDTH = 8, 256
 OCTAVES = 6
@@ -33,10 +35,13 @@ class MlpDecoder(nn.Module):
         nn.init.zeros_(head.bias)
         self.layers = nn.Sequential(*layers, head)
 
-    def forward(self, conditions: FrameInputs) -> Float[Tensor, "n o"]:
+    def forward(self, inputs: Sequence[FrameInputs]) -> Float[Tensor, "b n o"]:
         """One Gaussian per row of the canonical positions."""
-        position = encode(conditions.canonical)
-        motion = conditions.motion.flatten().expand(len(position), -1)
+        return as_batch([self._decode(of_frame) for of_frame in inputs])
+
+    def _decode(self, inputs: FrameInputs) -> Float[Tensor, "n o"]:
+        position = encode(inputs.canonical)
+        motion = inputs.motion.flatten().expand(len(position), -1)
         with torch.autocast(position.device.type, torch.bfloat16):  # In float32 it is four times as slow.
             return self.layers(torch.cat([position, motion], 1)).float()
 
@@ -47,11 +52,16 @@ def encode(positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n e"]:
     return torch.cat([positions, angles.sin(), angles.cos()], 1)
 
 
-def _with_mlp(config: AshConfig, capture: Capture) -> AshAvatar:
-    dofs = capture.motion.dofs.shape[1]
-    return AshAvatar(config, capture, make_decoders=lambda model, _: MlpDecoder(model, dofs=dofs))
+class MlpAvatar(AshAvatar):
+    """ASH with `MlpDecoder`."""
+
+    def make_decoders(self, lattice: TexelLattice) -> nn.Module:
+        """Stg. 3 without the texture space."""
+        return MlpDecoder(self.config.model, dofs=self._motion.dofs.shape[1])
 
 
-mlp_base = MethodFactory(config=named, build=_with_mlp)  # In place of the 2D decoders, on ASH's learned texels.
+mlp_base = MethodFactory(
+    config=named, build=MlpAvatar.from_capture
+)  # In place of the 2D decoders, on ASH's learned texels.
 # The paper's row: Gaussians straight from 3D, so no learned texels beneath; its limits of training as the preset says.
 mlp = mlp_base.with_overrides({"model.base": False, "model.novelty_scale": 0.0, "training.warmup": "fitted"})

@@ -8,12 +8,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ash.capture.dataset import Camera, Capture, Pose
+from ash.capture.dataset import Capture, Pose
 from ash.config import TemplateConfig
 from ash.model import stage
 from ash.presets import MethodFactory, named
 from ash.protocol import StageClock
-from ash.template.template import PosedTemplate
+from ash.template.template import PosedTemplate, Template
+from ash.textures import DecoderInputs
 from baselines.ddc import DdcAvatar, DdcConfig, ddc_config
 
 # Texture pixels per Gaussian of ASH's lattice, per side. On the mannequin, 4 in place of 2 bring 4.5 dB on training
@@ -24,36 +25,25 @@ TEXTURE_FACTOR = 4
 class OracleTexture(DdcAvatar):
     """The mesh baseline without its network: one texture, and the light, for all frames."""
 
-    def __init__(self, config: DdcConfig, capture: Capture) -> None:
-        super().__init__(config, capture)
+    def __init__(self, config: DdcConfig, capture: Capture, template: Template) -> None:
+        super().__init__(config, capture, template)
         self.module.add_module("network", nn.Identity())
-        self._surfaces: dict[int, PosedTemplate] = {}
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """The texture and the light."""
         return [{"params": list(self.module.parameters()), "lr": self.config.training.base_learning_rate}]
 
-    def decode_together(self, frames: Sequence[int], step: int) -> list[Float[Tensor, "3 t t"]]:
-        """There is nothing to decode."""
-        return [self.module.texture] * len(frames)
+    def _has_decoders(self) -> bool:
+        return False
 
-    def draw_training_views(
-        self, frame: int, cameras: list[Camera], background: Tensor, step: int, decoded: Tensor
-    ) -> Tensor:
-        """The texture, drawn into each camera."""
-        if frame not in self._surfaces:
-            self._surfaces[frame] = self.template.pose(Pose(self._motion, frame))
-        posed = self._surfaces[frame]
-        return self._drawn(decoded, posed, self.module.see(posed, cameras), background)
-
-    def decoder_residual(self, frame: int) -> None:
-        """There is nothing that could differ between frames."""
+    def _decode(self, inputs: Sequence[DecoderInputs]) -> list[Tensor]:
+        return [self.base] * len(inputs)
 
     @torch.no_grad()
     def dress(self, pose: Pose, clock: StageClock) -> tuple[PosedTemplate, Float[Tensor, "3 t t"]]:
         """The posed surface and the texture."""
         with stage(clock, "stg1", self.device):
-            return self.template.pose(pose), self.module.texture.clamp(min=0)
+            return self.template.pose(pose), self.base.clamp(min=0)
 
 
 def _on_exact(preset: str) -> DdcConfig:
@@ -63,4 +53,6 @@ def _on_exact(preset: str) -> DdcConfig:
     return replace(mesh, texture=TEXTURE_FACTOR * config.model.texels, model=model)
 
 
-oracle_texture = MethodFactory(config=_on_exact, build=OracleTexture)  # One texture, at the preset's budget.
+oracle_texture = MethodFactory(
+    config=_on_exact, build=OracleTexture.from_capture
+)  # One texture, at the preset's budget.

@@ -13,8 +13,10 @@ from baselines.nearest import central_frame
 class StaticAvatar(AshAvatar):
     """ASH without motion, which sees what the cameras saw of a single training frame."""
 
-    def __init__(self, config: AshConfig, capture: Capture) -> None:
-        super().__init__(config, of_one_frame(capture))
+    @classmethod
+    def from_capture(cls, config: AshConfig, capture: Capture) -> "StaticAvatar":
+        """The avatar, untrained."""
+        return super().from_capture(config, of_one_frame(capture))
 
     def fit(self, capture: Capture, *, folder: Path) -> None:
         """Train on the one frame."""
@@ -29,4 +31,4 @@ def of_one_frame(capture: Capture) -> Capture:
 
 
 # One set of Gaussians from one frame, at the preset's budget; one frame teaches no deformation.
-static = replace(wo_mot, build=StaticAvatar).with_overrides({"template": TemplateConfig(kind="skinned")})
+static = replace(wo_mot, build=StaticAvatar.from_capture).with_overrides({"template": TemplateConfig(kind="skinned")})

@@ -52,7 +52,7 @@ def initial_gaussians(
 
 
 def released_gaussians(
-    config: ModelConfig, analytic: Float[Tensor, "n o"], conditions: FrameInputs
+    config: ModelConfig, analytic: Float[Tensor, "n o"], inputs: FrameInputs
 ) -> Float[Tensor, "n o"]:
     """What the release regresses its decoders to in a frame, before it renders: no fit, but a guess from the mesh.
 
@@ -61,12 +61,12 @@ def released_gaussians(
     """
     raw = torch.zeros_like(analytic)
     raw[:, 11:14] = analytic[:, 11:14]
-    points = conditions.transforms.apply(conditions.canonical).cpu().numpy()
+    points = inputs.transforms.apply(inputs.canonical).cpu().numpy()
     near = torch.from_numpy(cKDTree(points).query(points, k=4)[0][:, 1:]).to(raw)
     raw[:, 3:6] = near.square().mean(1).sqrt().clamp(min=1e-4).log()[:, None]
-    normals = conditions.normals
+    normals = inputs.normals
     if config.quat_frame == "canonical":
-        normals = rotate(quat_conjugate(conditions.transforms.quats), normals)
+        normals = rotate(quat_conjugate(inputs.transforms.quats), normals)
     x, y, z = normals.unbind(1)
     turn = torch.stack([1 + x, torch.zeros_like(x), -z, y], 1)
     half_turn = raw.new_tensor([0.0, 0.0, 0.0, 1.0])

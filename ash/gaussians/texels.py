@@ -64,20 +64,20 @@ def sample_surface(lattice: TexelLattice, posed: PosedTemplate, anchor: str = "b
 
 
 def pose_naive(
-    raw: Float[Tensor, "n o"], conditions: FrameInputs, config: ModelConfig, light: Float[Tensor, "9 3"] | None
+    raw: Float[Tensor, "n o"], inputs: FrameInputs, config: ModelConfig, light: Float[Tensor, "9 3"] | None
 ) -> Gaussians:
     """Activate raw parameters and carry them from canonical to posed space (Eq. 5): the definition.
 
     `light`: coefficients of the exponent by which colours are multiplied, a function of the posed normal.
     """
     offset, log_scales, quats, logits, sh = split_raw(raw)
-    transforms = conditions.transforms
-    canonical = conditions.canonical + config.offset_unit_m * offset if config.offset else conditions.canonical
+    transforms = inputs.transforms
+    canonical = inputs.canonical + config.offset_unit_m * offset if config.offset else inputs.canonical
     if config.quat_frame == "canonical":
         quats = quat_multiply(transforms.quats, quats)
         sh = rotate_sh(transforms.quats, sh)
     if light is not None:
-        sh = _lit(sh, (sh_basis(conditions.normals, 2) @ light).exp())
+        sh = _lit(sh, (sh_basis(inputs.normals, 2) @ light).exp())
     return Gaussians(
         means=transforms.apply(canonical),
         quats=quats,
@@ -89,17 +89,17 @@ def pose_naive(
 
 def pose(
     raw: Float[Tensor, "n o"],
-    conditions: FrameInputs,
+    inputs: FrameInputs,
     config: ModelConfig,
     light: Float[Tensor, "9 3"] | None,
     *,
     threads: int = 1,
 ) -> Gaussians:
     """`pose_naive`, by native kernels where only `raw` and `light` need gradients."""
-    transforms = conditions.transforms
-    constants = (conditions.canonical, conditions.normals, transforms.quats, transforms.translations)
+    transforms = inputs.transforms
+    constants = (inputs.canonical, inputs.normals, transforms.quats, transforms.translations)
     if raw.dtype != torch.float32 or not ash.native.skinning.can_use_native(*constants):
-        return pose_naive(raw, conditions, config, light)
+        return pose_naive(raw, inputs, config, light)
     canonical_frame = config.quat_frame == "canonical"
     options = ash.native.texels.PoseOptions(
         config.offset_unit_m if config.offset else 0.0, int(canonical_frame), threads

@@ -16,6 +16,7 @@ from ash.template.skinning import SkinWeights, dual_quaternion_skinning, forward
 
 GRAPH_UNIT = 0.1  # Metres and radians per unit of the graph net's output.
 DISPLACEMENT_UNIT = 0.01  # Metres per unit of the displacement net's output.
+WIDTH = 16  # Channels of the graph convolutions.
 
 
 class GraphConvolution(nn.Module):
@@ -55,15 +56,14 @@ class GraphNet(nn.Module):
         super().__init__()
 
         def hop(i: int, o: int) -> nn.Module:
-            return PerNodeConvolution(i, o, nodes=nodes) if config.weights == "per-node" else GraphConvolution(i, o)
+            return PerNodeConvolution(i, o, nodes=nodes) if config.released else GraphConvolution(i, o)
 
-        width = config.width
-        self.first = hop(inputs, width)
-        self.blocks = nn.ModuleList(hop(width, width) for _ in range(2 * config.blocks))
+        self.first = hop(inputs, WIDTH)
+        self.blocks = nn.ModuleList(hop(WIDTH, WIDTH) for _ in range(2 * config.blocks))
         self.across = nn.Linear(nodes, nodes, bias=False) if dense else None
         if self.across is not None:
             nn.init.normal_(self.across.weight, std=1e-3 / nodes**0.5)
-        self.head = nn.Linear(width, outputs)
+        self.head = nn.Linear(WIDTH, outputs)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
 
@@ -93,7 +93,7 @@ class GraphDeformation(MovingModule):
         self.skin: SkinWeights = sparse_skin_weights(torch.from_numpy(mesh.skin_weights).float())
         vertices, nodes = len(mesh.vertices), len(self.graph.nodes)
         self.graph_net = GraphNet(7 * config.window + 3, 6, config, nodes=nodes)
-        self.displacement_net = GraphNet(3 * config.window + 3, 3, config, nodes=vertices, dense=config.dense)
+        self.displacement_net = GraphNet(3 * config.window + 3, 3, config, nodes=vertices, dense=config.released)
         self.static = nn.Parameter(torch.zeros_like(self.rest), requires_grad=False)
 
     def networks(self) -> list[nn.Parameter]:

@@ -34,6 +34,7 @@ from ash.template_learning.tracking import Tracked
 from ash.textures import TexelLattice, build_lattice
 from ash.training.images import READERS, ReadAhead, View, load_training_images
 
+PASSES = 4  # Over all training images.
 TEXELS = 192  # Points of the surface: the texels of such a lattice.
 BLURS = (1.5, 0.5)  # Pixels, in the first and in the last pass.
 FACING = 0.2  # Cosine from which a point is seen squarely enough,
@@ -52,7 +53,7 @@ STIFFNESS = 3e6  # against those that leave their neighbours, per squared metre.
 SEEN_OFTEN = 0.3  # Weight from which a point's mean colour is worth something.
 
 
-def track_images(capture: Capture, template: Template, graph: EmbeddedGraph, *, passes: int) -> Tracked:
+def track_images(capture: Capture, template: Template, graph: EmbeddedGraph, *, passes: int = PASSES) -> Tracked:
     """Fit the template to the training images, frame by frame, `passes` times over."""
     images = load_training_images(capture, template.device)
     frames = images.frames

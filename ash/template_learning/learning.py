@@ -1,7 +1,7 @@
 """Which template a method stands on. A learned one is made once per capture, configuration and seed, and kept."""
 
 import time
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import safetensors.torch
@@ -13,7 +13,6 @@ from ash.checkpoints import load_module, read_safetensors
 from ash.config import TemplateConfig
 from ash.devices import CPU
 from ash.files import InputError, file_lock, hash_of, hash_sources, write_atomic
-from ash.protocol import TrainingOutcome
 from ash.template.graph import EmbeddedGraph
 from ash.template.template import (
     Deformation,
@@ -38,7 +37,7 @@ def template_of(config: TemplateConfig, capture: Capture, *, seed: int, device: 
     if config.kind == "skinned":
         return skinned_template(capture)
     if config.kind == "exact":
-        planted = PlantedError(rms_mm=config.error_mm, static=config.error_static, lag=config.error_lag)
+        planted = PlantedError(rms_mm=config.error_mm)
         return exact_template(capture, read_template_truth(capture), planted=planted, seed=seed)
     return learned_template(config, capture, seed=seed, device=device)
 
@@ -69,13 +68,6 @@ def learned_template(config: TemplateConfig, capture: Capture, *, seed: int, dev
     return template
 
 
-def with_template(outcome: TrainingOutcome | None, template: Template) -> TrainingOutcome | None:
-    """The outcome of a training on this template, which tells what the template was learned from."""
-    if outcome is None or template.learned is None:
-        return outcome
-    return replace(outcome, template=template.learned.found)
-
-
 def template_key(config: TemplateConfig, capture: Capture, *, seed: int, device: torch.device = CPU) -> str:
     """Hash of everything that decides a learned template, sources included."""
     train = capture.splits["train"]
@@ -92,7 +84,7 @@ def template_key(config: TemplateConfig, capture: Capture, *, seed: int, device:
 
 
 def _around(deformation: Deformation, graph: EmbeddedGraph, config: TemplateConfig, capture: Capture) -> Template:
-    through = graph if config.skinning == "graph" else None
+    through = graph if config.released else None
     return Template(capture.template, capture.skeleton, deformation, through=through)
 
 
@@ -116,7 +108,7 @@ def _learn(
 
 def _track(config: TemplateConfig, capture: Capture, at_rest: Template, graph: EmbeddedGraph) -> Tracked:
     if config.supervision == "images":
-        return track_images(capture, at_rest, graph, passes=config.passes)
+        return track_images(capture, at_rest, graph)
     return track_scans(capture, at_rest)
 
 

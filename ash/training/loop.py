@@ -10,7 +10,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -30,7 +30,6 @@ from ash.protocol import TrainingOutcome
 from ash.training.adam import Adam
 from ash.training.batches import Batch, draw_step, make_batch
 from ash.training.images import READERS, ReadAhead, TrainingImages
-from ash.training.losses import exact_target, l1_ssim_loss
 from ash.training.stopping import (
     ReservedScore,
     ScheduleState,
@@ -42,7 +41,7 @@ from ash.training.stopping import (
 )
 
 LOG_EVERY = 50
-COMPARED_FRAMES = 40  # Training frames, evenly taken, over which the decoders' output is averaged and compared.
+CHECKPOINT_SECONDS = 60.0  # Between two checkpoints.
 SNAPSHOT_SECONDS = tuple(round(30 * 2 ** (i / 2)) for i in range(13))  # Half a minute to half an hour of CPU time.
 
 
@@ -65,180 +64,137 @@ class Trainable(Protocol):
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Adam's groups, each with its own `lr`."""
 
-    def decode_together(self, frames: Sequence[int], step: int) -> Sequence[Any]:
-        """What `draw_training_views` takes as `decoded`, of each frame of a step."""
-
-    def draw_training_views(
-        self, frame: int, cameras: list[Camera], background: Tensor, step: int, decoded: Any
-    ) -> Tensor:
-        """Differentiable rgb `[c, h, w, 3]` over `background`, for cameras of one size.
+    def losses(self, batches: Sequence[Batch], step: int) -> Sequence[Tensor]:
+        """What a step minimises, scalars; each is differentiated by itself, and the first is logged.
 
         Raises:
             FloatingPointError: what the weights make cannot be drawn, because it holds NaN or infinity, say.
         """
 
-    def decoder_residual(self, frame: int) -> Tensor | None:
-        """What the decoders add to the static parameters in a training frame, in any shape; None without decoders."""
+    def render_views(self, frame: int, cameras: list[Camera], background: Tensor) -> Float[Tensor, "c h w 3"]:
+        """Rgb of a training frame over `background`, for cameras of one size.
 
-    def draw_static_views(self, frame: int, cameras: list[Camera], background: Tensor) -> Tensor | None:
-        """Views of what counts far from the training motion, whatever the pose; None where nothing does."""
-
-    def end_warmup(self) -> None:
-        """The static parameters learned alone until now."""
-
-
-def fit(
-    learner: Trainable,
-    images: TrainingImages,
-    config: TrainingConfig,
-    *,
-    seed: int,
-    folder: Path,
-    before_start: Callable[[], None] = lambda: None,
-) -> TrainingOutcome:
-    """Train until nothing more is learned or a limit is spent, from the checkpoint in `folder` if there is one.
-
-    `before_start` runs only when training starts afresh (warm-ups that do not render).
-
-    Raises:
-        Diverged: a loss, gradient or weight was not finite, again after one roll-back with half the learning rate.
-        Interrupted: SIGTERM came; the checkpoint holds everything up to the last whole step.
-    """
-    images = replace(images, whole=not config.crop)
-    run = Trainer(learner, config, images, folder)
-    if not run.resume():
-        before_start()
-        run.average_afresh()
-        if not run.save():
-            raise Diverged("the warm-up left weights that are not finite")
-    # A thread beside the one core that a cell has on the CPU would gain nothing.
-    ahead = ReadAhead(images.views, readers=0 if images.device == CPU else READERS)
-    with closing(ahead), _sigterm() as asked_to_stop:
-        while not run.has_ended or not run.save():  # What cannot be saved was rolled back: on from there.
-            run.advance(draw_step(ahead, images, config, seed, run.step))
-            if asked_to_stop():
-                run.save()
-                raise Interrupted(f"stopped at step {run.step} of {config.steps}; run again to go on")
-            run.save_if_due()
-    return run.finish()
-
-
-def draw_training_step(learner: Trainable, batches: Sequence[Batch], step: int) -> list[Float[Tensor, "_ _ _ 3"]]:
-    """The views of each batch; their frames are decoded together."""
-    decoded = learner.decode_together([batch.frame for batch in batches], step)
-    return [
-        learner.draw_training_views(batch.frame, batch.cameras, batch.background, step, of_frame)
-        for batch, of_frame in zip(batches, decoded, strict=True)
-    ]
-
-
-def view_loss(
-    drawn: Sequence[Float[Tensor, "_ _ _ 3"]], batches: Sequence[Batch], config: TrainingConfig
-) -> Float[Tensor, ""]:
-    """ASH Eq. 9, mean over the views of all batches."""
-    losses = [
-        l1_ssim_loss(image, exact_target(target), l1_weight=config.l1_weight, ssim_weight=config.ssim_weight)
-        for images, batch in zip(drawn, batches, strict=True)
-        for image, target in zip(images, batch.targets, strict=True)
-    ]
-    return torch.stack(losses).mean()
+        Raises:
+            FloatingPointError: as `losses`.
+        """
 
 
 class Trainer:
-    """The state of one training: model, optimiser, step, CPU seconds, and what was decided so far."""
+    """Trains a `Trainable` on images: the loop, and all that a checkpoint holds.
 
-    def __init__(self, learner: Trainable, config: TrainingConfig, images: TrainingImages, folder: Path) -> None:
+    Optimiser, number of steps made, CPU seconds, and what the schedule decided so far.
+    """
+
+    def __init__(
+        self, learner: Trainable, config: TrainingConfig, images: TrainingImages, *, folder: Path, seed: int
+    ) -> None:
+        """Checkpoints and `log.jsonl` go to `folder`."""
         keep_freed_memory()
-        self.learner, self.config, self.images = learner, config, images
+        self.learner, self.config, self.seed = learner, config, seed
+        self.images = replace(images, whole=not config.crop)
         groups = learner.parameter_groups()
         self.optimiser = Adam(groups, eps=1e-15)
         self.initial_rates = [group["lr"] for group in groups]
         self.folder, self.path, self.log = folder, folder / "checkpoint.safetensors", folder / "log.jsonl"
-        self.step, self.seconds, self.rate_scale = 0, 0.0, 1.0
-        self.course = ScheduleState()
+        self.steps, self.seconds, self.rate_scale = 0, 0.0, 1.0
+        self.state = ScheduleState()
         self.average: dict[str, Tensor] = {}
         self.averaged: list[Tensor] = []  # the parameters, in the order of `average`
-        self.average_afresh()
+        self._average_afresh()
         self.started, self.saved_at = time.process_time(), time.monotonic()
+
+    def fit(self, before_start: Callable[[], None] = lambda: None) -> TrainingOutcome:
+        """Train until nothing more is learned or a limit is spent, from the checkpoint in the folder if there is one.
+
+        `before_start` runs only when training starts afresh (warm-ups that do not render).
+
+        Raises:
+            Diverged: a loss, gradient or weight was not finite, again after one roll-back with half the learning rate.
+            Interrupted: SIGTERM came; the checkpoint holds everything up to the last whole step.
+        """
+        if not self.load():
+            before_start()
+            self._average_afresh()
+            if not self.save():
+                raise Diverged("the warm-up left weights that are not finite")
+        # A thread beside the one core that a cell has on the CPU would gain nothing.
+        ahead = ReadAhead(self.images.views, readers=0 if self.images.device == CPU else READERS)
+        with closing(ahead), _sigterm() as asked_to_stop:
+            while not self.has_ended or not self.save():  # What cannot be saved was rolled back: on from there.
+                self.step(draw_step(ahead, self.images, self.config, self.seed, self.steps))
+                if asked_to_stop():
+                    self.save()
+                    raise Interrupted(f"stopped at step {self.steps} of {self.config.steps}; run again to go on")
+                if time.monotonic() - self.saved_at > CHECKPOINT_SECONDS:
+                    self.save()
+        self._load_weights(self.average)  # The result is the average, if there is one; the checkpoint holds both.
+        return self._outcome()
 
     @property
     def has_ended(self) -> bool:
         """Whether no step is left."""
-        return self.step >= last_step(self.course, self.config)
+        return self.steps >= last_step(self.state, self.config)
 
-    def average_afresh(self) -> None:
+    def _average_afresh(self) -> None:
         """Let the average of the weights start from the weights as they are."""
         if self.config.ema:
             learned = dict(self.learner.module.named_parameters())
             self.average = {name: value.detach().clone() for name, value in learned.items()}
             self.averaged = [value.detach() for value in learned.values()]
 
-    def advance(self, batches: Sequence[Batch]) -> None:
-        """One step of Adam."""
-        factor = rate_factor(self.course, self.config, step=self.step) * self.rate_scale
+    def step(self, batches: Sequence[Batch]) -> None:
+        """One step of Adam; one that is not finite is rolled back to the last checkpoint."""
+        factor = rate_factor(self.state, self.config, step=self.steps) * self.rate_scale
         for group, rate in zip(self.optimiser.groups, self.initial_rates, strict=True):
             group["lr"] = rate * factor
         self.optimiser.zero_grad()
-        if self.step == self.config.static_steps:
-            self.learner.end_warmup()
-        with_static = self.step >= self.config.static_steps and self.step % self.config.static_every == 0
         try:
-            drawn = draw_training_step(self.learner, batches, self.step)
-            static = self._static_views(batches) if with_static else []
+            losses = self.learner.losses(batches, self.steps)
         except FloatingPointError as error:
             self._roll_back(str(error))
             return
-        loss = view_loss(drawn, batches, self.config)
-        loss.backward()  # type: ignore[no-untyped-call]
-        if static:
-            view_loss(static, batches, self.config).backward()  # type: ignore[no-untyped-call]
-        if not (math.isfinite(loss.item()) and self.optimiser.step()):
+        for loss in losses:
+            loss.backward()  # type: ignore[no-untyped-call]
+        if not (math.isfinite(losses[0].item()) and self.optimiser.step()):
             self._roll_back("loss or gradient not finite")
             return
         if self.average:
             # A short memory at first, so that the start is soon forgotten.
-            weight = 1 - min(self.config.ema, (1 + self.step) / (10 + self.step))
+            weight = 1 - min(self.config.ema, (1 + self.steps) / (10 + self.steps))
             torch._foreach_lerp_(list(self.average.values()), self.averaged, weight)
-        self.step += 1
-        self._look(loss)
-
-    def _static_views(self, batches: Sequence[Batch]) -> list[Tensor]:
-        found = [self.learner.draw_static_views(batch.frame, batch.cameras, batch.background) for batch in batches]
-        return [views for views in found if views is not None]
+        self.steps += 1
+        self._look(losses[0])
 
     def _look(self, loss: Tensor) -> None:
         """Score the reserved views where it is time to, decide what follows from it, and write the log."""
-        if self.images.reserved and (is_eval_step(self.step) or self.has_ended):
+        if self.images.reserved and (is_eval_step(self.steps) or self.has_ended):
             self._score()
-        self.course = update(self.course, self.config, step=self.step, seconds=self._elapsed())
-        if self.step % LOG_EVERY == 1 or self.has_ended or self._score_of_this_step() is not None:
+        self.state = update(self.state, self.config, step=self.steps, seconds=self._elapsed())
+        if self.steps % LOG_EVERY == 1 or self.has_ended or self._score_of_this_step() is not None:
             self._write_log(loss)
         if self.config.snapshots:
             self._save_snapshots()
 
     def _score(self) -> None:
         with self._ema_weights():
-            score = ReservedScore(step=self.step, psnr=self._reserved_psnr())
+            score = ReservedScore(step=self.steps, psnr=self._reserved_psnr())
         if math.isfinite(score.psnr):  # Else the next step meets the same, and deals with it.
-            self.course = replace(self.course, scores=(*self.course.scores, score))
+            self.state = replace(self.state, scores=(*self.state.scores, score))
 
     def _score_of_this_step(self) -> float | None:
-        last = self.course.scores[-1:]
-        return last[0].psnr if last and last[0].step == self.step else None
+        last = self.state.scores[-1:]
+        return last[0].psnr if last and last[0].step == self.steps else None
 
     def _roll_back(self, why: str) -> None:
         if self.rate_scale < 1:
-            raise Diverged(f"{why} at step {self.step}, again after a roll-back")
-        self.resume()
+            raise Diverged(f"{why} at step {self.steps}, again after a roll-back")
+        self.load()
         self.rate_scale = 0.5
 
     def _write_log(self, loss: Tensor) -> None:
-        row = {"step": self.step, "seconds": round(self._elapsed(), 3), "loss": float(loss.detach())}
+        row = {"step": self.steps, "seconds": round(self._elapsed(), 3), "loss": float(loss.detach())}
         if (psnr := self._score_of_this_step()) is not None:
             row["train_psnr"] = psnr
-        self._append(row)
-
-    def _append(self, row: dict[str, Any]) -> None:
         self.log.parent.mkdir(parents=True, exist_ok=True)
         with self.log.open("a") as file:
             file.write(json.dumps(row) + "\n")
@@ -250,7 +206,7 @@ class Trainer:
         for name, frame in self.images.reserved:
             view = make_batch(self.images, frame, [name], torch.zeros(3, device="cpu"))
             try:
-                (drawn,) = draw_training_step(self.learner, [view], self.step)
+                drawn = self.learner.render_views(frame, view.cameras, view.background)
             except FloatingPointError:
                 return math.nan
             errors.append((drawn.clamp(0, 1) - view.targets)[view.foreground > 0.5].square().flatten())
@@ -258,11 +214,6 @@ class Trainer:
 
     def _elapsed(self) -> float:
         return self.seconds + time.process_time() - self.started
-
-    def save_if_due(self) -> None:
-        """Save once per `checkpoint_seconds`."""
-        if time.monotonic() - self.saved_at > self.config.checkpoint_seconds:
-            self.save()
 
     def save(self) -> bool:
         """Write the checkpoint atomically. False: the weights are not finite, and were rolled back instead."""
@@ -275,8 +226,8 @@ class Trainer:
             for name, value in (moments or {}).items():
                 tensors[f"adam.{index}.{name}"] = value.contiguous()
         tensors |= {f"average.{name}": value.contiguous() for name, value in self.average.items()}
-        facts = {"step": str(self.step), "seconds": repr(self._elapsed()), "rate_scale": repr(self.rate_scale)}
-        facts["course"] = self.course.to_json()
+        facts = {"step": str(self.steps), "seconds": repr(self._elapsed()), "rate_scale": repr(self.rate_scale)}
+        facts["course"] = self.state.to_json()
         write_atomic(self.path, safetensors.torch.save(tensors, metadata=facts))
         self.saved_at = time.monotonic()
         return True
@@ -307,33 +258,18 @@ class Trainer:
                 with self._ema_weights():
                     write_atomic(path, safetensors.torch.save(contiguous_state(self.learner.module)))
 
-    def finish(self) -> TrainingOutcome:
-        """Give the model the averaged weights, if they were averaged (the checkpoint keeps both), and tell the end."""
-        self._load_weights(self.average)
-        outcome = TrainingOutcome(
-            steps=self.step,
+    def _outcome(self) -> TrainingOutcome:
+        return TrainingOutcome(
+            steps=self.steps,
             seconds=self._elapsed(),
-            ended_by=self.course.ended_by,
-            gained=gain_of_last_third(self.course.scores),
+            ended_by=self.state.ended_by,
+            gained=gain_of_last_third(self.state.scores),
             reserved_psnr=self._score_of_this_step(),
-            correction_spread=self._spread(),
             cameras=len(self.images.cameras),
             frames=len(self.images.frames),
         )
-        self._append({"outcome": asdict(outcome)})
-        return outcome
 
-    @torch.no_grad()
-    def _spread(self) -> float | None:
-        """How far what the decoders add differs between training frames, rms; None without decoders."""
-        frames = self.images.frames[:: -(-len(self.images.frames) // COMPARED_FRAMES)]
-        found = [added for frame in frames if (added := self.learner.decoder_residual(frame)) is not None]
-        if not found:
-            return None
-        mean = torch.stack(found).mean(0)
-        return float(torch.stack([(added - mean).square().mean() for added in found]).mean().sqrt())
-
-    def resume(self) -> bool:
+    def load(self) -> bool:
         """Load the checkpoint, if there is one.
 
         Raises:
@@ -362,10 +298,10 @@ class Trainer:
                 value.copy_(tensors[f"adam.{index}.{name}"])
         for name, value in self.average.items():
             value.copy_(tensors[f"average.{name}"])
-        self.step, self.seconds = int(facts["step"]), float(facts["seconds"])
-        self.rate_scale, self.course = float(facts["rate_scale"]), ScheduleState.from_json(facts["course"])
-        if self.step < 0 or not (0 <= self.seconds < math.inf and 0 < self.rate_scale <= 1):
-            raise ValueError(f"step {self.step} after {self.seconds} s at {self.rate_scale} of the rate")
+        self.steps, self.seconds = int(facts["step"]), float(facts["seconds"])
+        self.rate_scale, self.state = float(facts["rate_scale"]), ScheduleState.from_json(facts["course"])
+        if self.steps < 0 or not (0 <= self.seconds < math.inf and 0 < self.rate_scale <= 1):
+            raise ValueError(f"step {self.steps} after {self.seconds} s at {self.rate_scale} of the rate")
         self.started = time.process_time()
 
 

@@ -4,6 +4,7 @@ SSIM (Wang et al. 2004) per channel: 11x11 Gaussian windows of sigma 1.5, zeros 
 C2 = 0.03^2.
 """
 
+from collections.abc import Sequence
 from ctypes import c_double
 from dataclasses import dataclass
 from typing import Any
@@ -14,13 +15,27 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
+from ash.config import TrainingConfig
 from ash.files import InputError
 from ash.native.library import address, check_memory, float32_on_cpu, load
+from ash.training.batches import Batch
 
 WINDOW_SIZE = 11
 WINDOW_SIGMA = 1.5
 C1 = 0.01**2
 C2 = 0.03**2
+
+
+def view_loss(
+    drawn: Sequence[Float[Tensor, "_ _ _ 3"]], batches: Sequence[Batch], config: TrainingConfig
+) -> Float[Tensor, ""]:
+    """ASH Eq. 9, mean over the views of all batches."""
+    losses = [
+        l1_ssim_loss(image, exact_target(target), l1_weight=config.l1_weight, ssim_weight=config.ssim_weight)
+        for images, batch in zip(drawn, batches, strict=True)
+        for image, target in zip(images, batch.targets, strict=True)
+    ]
+    return torch.stack(losses).mean()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

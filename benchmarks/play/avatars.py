@@ -111,7 +111,7 @@ class LoadedAvatar:
         key = (pose.motion.dofs[pose.window(8)].tobytes(), pose.frame)
         if key not in self._cache:
             if isinstance(self.avatar, AshAvatar):
-                posed = self.avatar.shared_gaussians(pose, clock=clock)
+                posed = self.avatar.pose_components(pose, clock=clock)
             else:
                 posed = [(1.0, self.avatar.gaussians(pose))]
             self._cache[key] = posed

@@ -21,13 +21,14 @@ from ash.files import InputError, write_json
 from ash.gaussians.splatting import Splatted, splat_naive
 from ash.gaussians.texels import pose_naive, sample_surface_naive
 from ash.model import AshModel, blend_renders, image_of, views_of
+from ash.plus import AshPlusModel
 from ash.presets import named
 from ash.protocol import Avatar, StageClock
+from ash.textures import FrameInputs
 from ash.training.adam import Adam
 from ash.training.batches import Batch, draw_batch
 from ash.training.images import load_training_images
-from ash.training.loop import draw_training_step
-from ash.training.losses import l1_ssim_loss, l1_ssim_loss_naive, ssim_target
+from ash.training.losses import l1_ssim_loss_naive, ssim_target
 from benchmarks.cell.metrics import psnr
 from benchmarks.speed.timing import (
     Candidate,
@@ -128,7 +129,7 @@ def speed_frame(
     frames = capture.splits["train"].frames
     for subject in timed or subjects():
         config = replace(subject.config, device=str(device))
-        avatar = AshAvatar(replace(config, template=replace(config.template, steps=1)), capture)
+        avatar = AshAvatar.from_capture(replace(config, template=replace(config.template, steps=1)), capture)
         _fill_heads(avatar)
         large = config.model.width >= 64
         count = max(2, rounds // 10) if large else rounds
@@ -192,17 +193,18 @@ def frame_by_definition(model: AshModel, pose: Pose, camera: Camera) -> np.ndarr
     """The image of a frame by the definitions alone: premultiplied RGBA, float32 `[h, w, 4]`."""
     posed = model.template.pose(pose)
     canonical, normals, transforms = sample_surface_naive(model.lattice, posed, model.config.anchor)
-    conditions = replace(model.frame_inputs(pose), canonical=canonical, normals=normals, transforms=transforms)
-    shares = model.blend_components(model.decode(conditions), conditions)
+    inputs = replace(model.frame_inputs(pose), canonical=canonical, normals=normals, transforms=transforms)
+    components = model.components(model.decode([inputs])[0], inputs)
     return image_of(
-        blend_renders([(share, _splat_by_definition(model, raw, conditions, [camera])) for share, raw in shares])
+        blend_renders([(weight, _splat_by_definition(model, raw, inputs, [camera])) for weight, raw in components])
     )
 
 
 def _splat_by_definition(
-    model: AshModel, raw: Tensor, conditions: object, cameras: list[Camera], background: Tensor | None = None
+    model: AshModel, raw: Tensor, inputs: FrameInputs, cameras: list[Camera], background: Tensor | None = None
 ) -> Splatted:
-    gaussians = pose_naive(raw, conditions, model.config, model.light)  # type: ignore[arg-type]
+    light = model.light if isinstance(model, AshPlusModel) else None
+    gaussians = pose_naive(raw, inputs, model.config, light)
     views = {name: moved(value, gaussians.means.device) for name, value in views_of(cameras).items()}
     return splat_naive(gaussians, **views, background=background, dilation=model.config.dilation)
 
@@ -315,18 +317,20 @@ def time_steps(avatar: AshAvatar, preset: str, capture: Capture, *, rounds: int)
 def _step(avatar: AshAvatar, batch: Batch, optimiser: Adam, *, naive: bool) -> None:
     training = avatar.config.training
     if naive:
-        conditions = avatar._inputs_of(batch.frame)
-        raw = avatar.module.decode(conditions)
-        drawn = _splat_by_definition(avatar.module, raw, conditions, batch.cameras, batch.background).rgb
+        inputs = avatar._inputs_of(batch.frame)
+        (raw,) = avatar.module.decode([inputs])
+        drawn = _splat_by_definition(avatar.module, raw, inputs, batch.cameras, batch.background).rgb
+        by_view = [
+            l1_ssim_loss_naive(
+                image, ssim_target(target), l1_weight=training.l1_weight, ssim_weight=training.ssim_weight
+            )
+            for image, target in zip(drawn, batch.targets, strict=True)
+        ]
+        loss = torch.stack(by_view).mean()
     else:
-        (drawn,) = draw_training_step(avatar, [batch], training.steps)
-    loss = l1_ssim_loss_naive if naive else l1_ssim_loss
-    losses = [
-        loss(image, ssim_target(target), l1_weight=training.l1_weight, ssim_weight=training.ssim_weight)
-        for image, target in zip(drawn, batch.targets, strict=True)
-    ]
+        loss = avatar.losses([batch], 2 * training.steps + 1)[0]  # Odd: the fallback does not learn.
     optimiser.zero_grad()
-    torch.stack(losses).mean().backward()  # type: ignore[no-untyped-call]
+    loss.backward()  # type: ignore[no-untyped-call]
     optimiser.step()
 
 

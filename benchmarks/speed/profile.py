@@ -21,7 +21,7 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-import ash.training.loop
+import ash.training.avatar
 from ash import presets
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture
@@ -32,6 +32,7 @@ from ash.gaussians.splatting import Splatted
 from ash.native.library import has_tiles
 from ash.training.batches import draw_batch
 from ash.training.images import TrainingImages, load_training_images
+from ash.training.loop import Trainer
 from baselines.ddc import DdcAvatar, ddc
 from benchmarks.speed.frames import captured
 from benchmarks.speed.timing import (
@@ -104,7 +105,7 @@ def _tensors_in(result: Any) -> list[Tensor]:
         return [getattr(result, name) for name in result.__slots__]
     if isinstance(result, Splatted):
         return [result.rgb]
-    parts = result if isinstance(result, list) else [result]
+    parts = result if isinstance(result, list | tuple) else [result]
     return [part for part in parts if isinstance(part, Tensor)]
 
 
@@ -116,15 +117,15 @@ def profiled(learner: AshAvatar | DdcAvatar, images: TrainingImages, name: str, 
     training = learner.config.training
     first = training.warmup_steps  # Before, decoders do not take part.
     config = replace(training, warmup="none", warmup_steps=0, steps=10**9)
-    trainer = ash.training.loop.Trainer(learner, config, images, folder)
+    trainer = Trainer(learner, config, images, folder=folder, seed=0)
     epoch = len(images.frames)
 
     def step(number: int) -> dict[str, float]:
-        trainer.step = first + number
+        trainer.steps = first + number
         parts = _Parts(learner.device)
         start = parts.now()
         with _timed_parts(parts, learner, trainer):
-            trainer.advance([parts.timed("batch", draw_batch)(images, config, 0, trainer.step)])
+            trainer.step([parts.timed("batch", draw_batch)(images, config, 0, trainer.steps)])
         whole = parts.now() - start
         if kind := _extra_work(learner, first + number):
             return {kind: 1e3 * whole}
@@ -141,24 +142,22 @@ def _extra_work(learner: AshAvatar | DdcAvatar, step: int) -> str:
     """What a step does besides; empty: nothing."""
     if isinstance(learner, DdcAvatar) and step % learner.config.vertices_every == 0:
         return VERTICES
-    return STATIC if step % learner.config.training.static_every == 0 else ""
+    return STATIC if step % ash.training.avatar.FALLBACK_EVERY == 0 else ""
 
 
 @contextmanager
-def _timed_parts(parts: _Parts, learner: AshAvatar | DdcAvatar, trainer: ash.training.loop.Trainer) -> Iterator[None]:
+def _timed_parts(parts: _Parts, learner: AshAvatar | DdcAvatar, trainer: Trainer) -> Iterator[None]:
     """Time the parts of the step that the body makes."""
-    if isinstance(learner, AshAvatar):
-        drawing = [(learner, "_decode", "decode"), (learner.module, "pose", "pose"), (learner.module, "draw", "draw")]
-    else:
-        drawing = [
-            (learner, "decode_together", "decode"),
-            (learner.module, "refined", "pose"),
-            (learner.module, "see", "draw"),
-            (learner.module, "draw", "draw"),
-        ]
-    rest = [(ash.training.loop, "view_loss", "loss"), (trainer.optimiser, "step", "adam")]
+    parts_of = {"gaussians": "pose", "rasterize": "draw"}
+    if isinstance(learner, DdcAvatar):
+        parts_of = {"refined": "pose", "see": "draw", "rasterize": "draw"}
+    timed: list[tuple[Any, str, str]] = [
+        (learner, "_decode", "decode"),
+        *((learner.module, name, part) for name, part in parts_of.items()),
+    ]
+    timed += [(ash.training.avatar, "view_loss", "loss"), (trainer.optimiser, "step", "adam")]
     with ExitStack() as stack:
-        for owner, name, part in (*drawing, *rest):
+        for owner, name, part in timed:
             stack.enter_context(patch.object(owner, name, parts.timed(part, getattr(owner, name))))
         yield
 

@@ -35,7 +35,7 @@ def frame_inputs(textures: torch.Tensor) -> FrameInputs:
 
 
 def test_untrained_decoders_return_zero_so_that_training_starts_from_the_initial_gaussians():
-    decoded = Decoders(config(), LATTICE)(frame_inputs(torch.randn(12, 16, 16)))
+    (decoded,) = Decoders(config(), LATTICE)([frame_inputs(torch.randn(12, 16, 16))])
     assert decoded.shape == (len(LATTICE.texels), 11 + 12)
     assert not decoded.any()
 
@@ -56,7 +56,7 @@ def test_every_parameter_learns_once_the_heads_have_moved():
             torch.nn.init.normal_(net.head.weight)
         side = 16 // changes.get("shuffle", 1)
         textures = torch.randn(12, side, side)
-        decoders(frame_inputs(textures)).square().sum().backward()
+        decoders([frame_inputs(textures)]).square().sum().backward()
         assert all(p.grad is not None and p.grad.any() for p in decoders.parameters()), changes
 
 
@@ -66,8 +66,8 @@ def test_global_features_reach_appearance_alone():
         torch.nn.init.normal_(net.head.weight)
     here = frame_inputs(torch.randn(12, 16, 16))
     there = replace(here, root_translation=torch.tensor([1.0, 0.0, 2.0]))
-    assert torch.equal(decoders(here)[:, :11], decoders(there)[:, :11])
-    assert not torch.allclose(decoders(here)[:, 11:], decoders(there)[:, 11:])
+    assert torch.equal(decoders([here])[..., :11], decoders([there])[..., :11])
+    assert not torch.allclose(decoders([here])[..., 11:], decoders([there])[..., 11:])
 
 
 def test_shuffled_decoding_puts_every_value_on_its_own_texel():
@@ -169,8 +169,8 @@ def test_frames_decoded_together_are_those_decoded_alone(shared_trunk, kind):
         )
         for _ in range(3)
     ]
-    together = torch.stack(list(decoders.together(frames)))
-    alone = torch.stack([decoders(frame) for frame in frames])
+    together = decoders(frames)
+    alone = torch.cat([decoders([frame]) for frame in frames])
     assert decoders.nets[0]._can_use_native(frames[0].textures[None]) == (kind == torch.float32)
     assert not torch.allclose(alone[0], alone[1])
     weights = torch.randn(alone.shape, generator=numbers).to(kind)

@@ -11,8 +11,7 @@ import torch
 from helpers.captures import write_tube_capture
 from helpers.devices import META, as_if_averaged, learning_without_numbers, step_of, tiny, without_numbers
 
-import ash.avatar
-import baselines.ddc
+import ash.training.avatar
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture, Pose
 from ash.config import AshConfig, TemplateConfig
@@ -51,7 +50,7 @@ VARIANTS = {
 def test_a_training_step_stays_on_its_device(variant: str, tube: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     without_numbers(monkeypatch)
     config, template = VARIANTS[variant]
-    avatar = AshAvatar(tiny(config, **template), tube)
+    avatar = AshAvatar.from_capture(tiny(config, **template), tube)
     learned = step_of(avatar, tube, META)
     assert learned and all(parameter.device == META for parameter in learned)
     assert {tensor.device for tensor in (*avatar.module.buffers(), *avatar.module.parameters())} == {META}
@@ -60,7 +59,7 @@ def test_a_training_step_stays_on_its_device(variant: str, tube: Capture, monkey
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_nothing_of_a_step_is_made_on_the_default_device(variant: str, tube: Capture) -> None:
     config, template = VARIANTS[variant]
-    avatar = AshAvatar(tiny(config, **template), tube)
+    avatar = AshAvatar.from_capture(tiny(config, **template), tube)
     with META:
         learned = step_of(avatar, tube, CPU)
     assert learned and all(bool(torch.isfinite(parameter).all()) for parameter in learned)
@@ -80,8 +79,8 @@ LEARNED = [("linear", "images"), ("linear", "scans"), ("graph", "scans")]
 
 def learning(network: str, supervision: str) -> TemplateConfig:
     """A small template, through all that a larger one is learned by."""
-    parts = {"network": network, "supervision": supervision, "weights": "per-node", "skinning": "graph", "dense": True}
-    return TemplateConfig(kind="learned", nodes=30, width=4, blocks=1, steps=3, passes=1, **parts)
+    small = {"nodes": 30, "blocks": 1, "steps": 3}
+    return TemplateConfig(kind="learned", network=network, supervision=supervision, released=True, **small)
 
 
 def unlearned(config: TemplateConfig, tube: Capture) -> LinearDeformation | GraphDeformation:
@@ -129,12 +128,11 @@ def test_an_avatar_learns_its_template_on_its_own_device(
     def ask(*_: object, device: torch.device, **__: object) -> None:
         raise Asked(device)
 
-    for module in (ash.avatar, baselines.ddc):
-        monkeypatch.setattr(module, "device_named", lambda name: META)
-        monkeypatch.setattr(module, "template_of", ask)
+    monkeypatch.setattr(ash.training.avatar, "device_named", lambda name: META)
+    monkeypatch.setattr(ash.training.avatar, "template_of", ask)
     config = named("ci") if kind is AshAvatar else ddc.config("ci")
     with pytest.raises(Asked, match="meta"):
-        kind(config, tube)
+        kind.from_capture(config, tube)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
@@ -161,7 +159,7 @@ def test_a_device_that_is_not_there_is_refused_with_the_reason(tube: Capture) ->
     with pytest.raises(InputError, match=re.escape(f"device cuda:1: {cuda_error('cuda:1')}")):
         device_named("cuda:1")
     with pytest.raises(InputError, match=r"^device cuda: torch"):
-        AshAvatar(replace(tiny(named("ci")), device="cuda"), tube)
+        AshAvatar.from_capture(replace(tiny(named("ci")), device="cuda"), tube)
     with pytest.raises(InputError, match="expected cpu, cuda or cuda:N, got 'gpu'"):
         replace(named("ci"), device="gpu")
 
@@ -169,6 +167,6 @@ def test_a_device_that_is_not_there_is_refused_with_the_reason(tube: Capture) ->
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
 @pytest.mark.parametrize("preset", ["ci", "paper", "official"])
 def test_a_gpu_learns_what_the_cpu_learns(preset: str, tube: Capture) -> None:
-    there, here = (AshAvatar(replace(tiny(named(preset)), device=name), tube) for name in ("cuda", "cpu"))
+    there, here = (AshAvatar.from_capture(replace(tiny(named(preset)), device=name), tube) for name in ("cuda", "cpu"))
     for learned, expected in zip(step_of(there, tube, torch.device("cuda")), step_of(here, tube, CPU), strict=True):
         torch.testing.assert_close(learned.grad.cpu(), expected.grad, rtol=1e-2, atol=1e-2 * expected.grad.abs().max())

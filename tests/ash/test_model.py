@@ -13,14 +13,14 @@ from ash.files import InputError
 from ash.gaussians.gaussians import split_raw
 from ash.gaussians.initialising import blank_gaussians, texel_pitch
 from ash.harmonics import SH_C0, sh_basis
-from ash.model import AshModel
+from ash.plus import AshPlusModel
 from ash.protocol import StageClock
 from ash.rotations import rotate, unitquat_to_rotmat
 from ash.template.template import RestDeformation, Template
 from ash.textures import build_lattice
 
 
-def model(**changes) -> AshModel:
+def model(**changes) -> AshPlusModel:
     torch.manual_seed(0)
     config = tube_model_config(**changes)
     template = Template(tube_mesh(), tube_skeleton(), RestDeformation(tube_mesh()))
@@ -29,68 +29,68 @@ def model(**changes) -> AshModel:
     decoders = Decoders(config, lattice) if config.motion else None
     for net in decoders.nets if decoders is not None else ():
         torch.nn.init.normal_(net.head.weight, std=0.1)
-    return AshModel(config, template, lattice, raw + 0.1 * torch.randn_like(raw), decoders)
+    return AshPlusModel(config, template, lattice, raw + 0.1 * torch.randn_like(raw), decoders)
 
 
 def test_eq_5_the_offset_is_added_before_posing():
     ash = model()
-    conditions = ash.frame_inputs(Pose(tube_motion(), 4))
-    raw = ash.decode(conditions)
+    inputs = ash.frame_inputs(Pose(tube_motion(), 4))
+    raw = ash.decode([inputs])[0]
     offset, *_ = split_raw(raw)
-    expected = conditions.transforms.apply(conditions.canonical + 0.01 * offset)
-    torch.testing.assert_close(ash.pose(raw, conditions).means, expected)
+    expected = inputs.transforms.apply(inputs.canonical + 0.01 * offset)
+    torch.testing.assert_close(ash.gaussians(raw, inputs).means, expected)
 
 
 def test_each_switch_changes_what_it_names_and_nothing_else():
     full = model(sh_degree=1, light=True)
     full.light.data.normal_(std=0.3)
-    conditions = full.frame_inputs(Pose(tube_motion(), 4))
-    raw = full.decode(conditions)
-    reference = full.pose(raw, conditions)
+    inputs = full.frame_inputs(Pose(tube_motion(), 4))
+    raw = full.decode([inputs])[0]
+    reference = full.gaussians(raw, inputs)
     changed_by = {
         "offset": ({"offset": False}, {"means"}),
         "quat_frame": ({"quat_frame": "world"}, {"quats", "sh"}),
     }
     for name, (change, expected) in changed_by.items():
         full.config = replace(full.config, **change)
-        posed = full.pose(raw, conditions)
+        posed = full.gaussians(raw, inputs)
         parts = ("means", "quats", "scales", "opacities", "sh")
         differing = {part for part in parts if not torch.equal(getattr(posed, part), getattr(reference, part))}
         assert differing == expected, name
         full.config = replace(full.config, offset=True, quat_frame="canonical")
     full.light.data.zero_()
-    dark = full.pose(raw, conditions)
+    dark = full.gaussians(raw, inputs)
     assert not torch.allclose(dark.sh, reference.sh)
     assert torch.equal(dark.means, reference.means)
 
 
 def test_rotations_turn_with_the_surface():
     ash = model()
-    conditions = ash.frame_inputs(Pose(tube_motion(), 4))
-    raw = ash.decode(conditions)
+    inputs = ash.frame_inputs(Pose(tube_motion(), 4))
+    raw = ash.decode([inputs])[0]
     _, _, quats, _, _ = split_raw(raw)
     canonical = unitquat_to_rotmat(torch.nn.functional.normalize(quats, dim=-1))
-    posed = unitquat_to_rotmat(torch.nn.functional.normalize(ash.pose(raw, conditions).quats, dim=-1))
-    turned = unitquat_to_rotmat(conditions.transforms.quats) @ canonical
+    posed = unitquat_to_rotmat(torch.nn.functional.normalize(ash.gaussians(raw, inputs).quats, dim=-1))
+    turned = unitquat_to_rotmat(inputs.transforms.quats) @ canonical
     torch.testing.assert_close(posed, turned, atol=1e-5, rtol=0)
 
 
 def test_light_multiplies_the_colour_by_the_exponential_of_the_irradiance():
     ash = model(light=True)
-    conditions = ash.frame_inputs(Pose(tube_motion(), 4))
-    raw = ash.decode(conditions)
-    plain = 0.5 + SH_C0 * ash.pose(raw, conditions).sh[:, 0]
+    inputs = ash.frame_inputs(Pose(tube_motion(), 4))
+    raw = ash.decode([inputs])[0]
+    plain = 0.5 + SH_C0 * ash.gaussians(raw, inputs).sh[:, 0]
     ash.light.data.normal_(std=0.5)
-    lit = 0.5 + SH_C0 * ash.pose(raw, conditions).sh[:, 0]
-    torch.testing.assert_close(lit, plain * (sh_basis(conditions.normals, 2) @ ash.light).exp(), atol=1e-5, rtol=1e-5)
+    lit = 0.5 + SH_C0 * ash.gaussians(raw, inputs).sh[:, 0]
+    torch.testing.assert_close(lit, plain * (sh_basis(inputs.normals, 2) @ ash.light).exp(), atol=1e-5, rtol=1e-5)
 
 
 def test_static_gaussians_do_not_depend_on_the_motion():
     ash = model(motion=False)
-    one, other = (ash.decode(ash.frame_inputs(Pose(tube_motion(seed=s), 4))) for s in (1, 2))
+    one, other = (ash.decode([ash.frame_inputs(Pose(tube_motion(seed=s), 4))])[0] for s in (1, 2))
     assert torch.equal(one, other)
     moving = model()
-    one, other = (moving.decode(moving.frame_inputs(Pose(tube_motion(seed=s), 4))) for s in (1, 2))
+    one, other = (moving.decode([moving.frame_inputs(Pose(tube_motion(seed=s), 4))])[0] for s in (1, 2))
     assert not torch.allclose(one, other)
 
 
@@ -128,13 +128,13 @@ def test_texel_pitch_is_the_spacing_of_texels_on_the_surface():
     assert float(pitch.mean()) == pytest.approx(expected, rel=0.15)
 
 
-def test_rotated_normals_reach_the_conditions():
+def test_rotated_normals_reach_the_inputs():
     ash = model()
-    conditions = ash.frame_inputs(Pose(tube_motion(), 0))
+    inputs = ash.frame_inputs(Pose(tube_motion(), 0))
     at_rest = ash.lattice.interpolate(torch.from_numpy(tube_mesh().vertices * [1, 0, 1] / 0.1).float())
-    below = conditions.canonical[:, 1] < 0.3
-    expected = rotate(conditions.transforms.quats[below], torch.nn.functional.normalize(at_rest[below], dim=-1))
-    assert ((expected * conditions.normals[below]).sum(1) > 0.98).all()
+    below = inputs.canonical[:, 1] < 0.3
+    expected = rotate(inputs.transforms.quats[below], torch.nn.functional.normalize(at_rest[below], dim=-1))
+    assert ((expected * inputs.normals[below]).sum(1) > 0.98).all()
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,8 @@ from ash.textures import smooth_noise
 from ash.training.adam import Adam
 from ash.training.batches import draw_batch
 from ash.training.images import load_training_images
-from ash.training.loop import fit, view_loss
+from ash.training.loop import Trainer
+from ash.training.losses import view_loss
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +34,7 @@ def small(config: AshConfig, **training) -> AshConfig:
     shuffle = min(config.model.shuffle, 2)
     model = replace(config.model, texels=16, width=4, levels=2, window=2, shuffle=shuffle)
     settings = {"steps": 4, "warmup_steps": 2, "views_per_step": 1} | training
-    template = replace(config.template, nodes=30, blocks=1, width=4, steps=2)
+    template = replace(config.template, nodes=30, blocks=1, steps=2)
     return replace(config, model=model, training=replace(config.training, **settings), template=template)
 
 
@@ -53,15 +54,13 @@ def test_paper_and_release_differ_in_named_switches_alone():
         "training.warmup",
         "training.l1_weight",
         "training.ssim_weight",
-        "template.weights",
-        "template.dense",
-        "template.skinning",
+        "template.released",
     }
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
 def test_every_preset_trains(name, capture, tmp_path):
-    avatar = AshAvatar(small(named(name), fitted_steps=3), capture)
+    avatar = AshAvatar.from_capture(small(named(name), fitted_steps=3), capture)
     before = {key: value.clone() for key, value in avatar.module.named_parameters() if value.requires_grad}
     avatar.fit(capture, folder=tmp_path)
     after = dict(avatar.module.named_parameters())
@@ -102,14 +101,14 @@ def test_the_global_mlps_are_as_wide_as_stated():
 
 
 def test_the_offsets_unit_scales_the_offset_alone(capture):
-    avatar = AshAvatar(AshConfig(model=tube_model_config(), training=small(named("ci")).training), capture)
-    conditions = avatar.module.frame_inputs(Pose(capture.motion, 2))
+    avatar = AshAvatar.from_capture(AshConfig(model=tube_model_config(), training=small(named("ci")).training), capture)
+    inputs = avatar.module.frame_inputs(Pose(capture.motion, 2))
     raw = avatar.module.base_texels.detach().clone()
     raw[:, :3] = torch.randn(len(raw), 3, generator=torch.Generator().manual_seed(0))
-    fine = avatar.module.pose(raw, conditions)
+    fine = avatar.module.gaussians(raw, inputs)
     avatar.module.config = replace(avatar.module.config, offset_unit_m=0.02)
-    coarse = avatar.module.pose(raw, conditions)
-    unmoved = conditions.transforms.apply(conditions.canonical)
+    coarse = avatar.module.gaussians(raw, inputs)
+    unmoved = inputs.transforms.apply(inputs.canonical)
     torch.testing.assert_close(coarse.means - unmoved, 2 * (fine.means - unmoved), atol=1e-5, rtol=0)
     assert all(torch.equal(getattr(fine, p), getattr(coarse, p)) for p in ("quats", "scales", "opacities", "sh"))
 
@@ -118,7 +117,7 @@ def test_degrees_of_sh_add_coefficients_and_leave_the_others_alone(capture):
     """What a preset of degree 3 draws without its higher coefficients is what one of degree 0 draws."""
     images = []
     for degree in (0, 3):
-        avatar = AshAvatar(
+        avatar = AshAvatar.from_capture(
             AshConfig(model=tube_model_config(sh_degree=degree), training=small(named("ci")).training), capture
         )
         assert avatar.module.base_texels.shape[1] == 11 + 3 * (degree + 1) ** 2
@@ -148,14 +147,14 @@ def test_the_weights_of_the_loss_weigh_its_two_parts(capture):
 @pytest.mark.parametrize("quat_frame", ["world", "canonical"])
 def test_the_releases_warm_up_aims_at_round_gaussians_turned_to_the_normal(capture, quat_frame):
     model = replace(small(named("official")).model, quat_frame=quat_frame)
-    avatar = AshAvatar(replace(small(named("official")), model=model, template=TemplateConfig()), capture)
-    conditions = avatar.module.frame_inputs(Pose(capture.motion, 3))
-    target = released_gaussians(model, avatar.analytic, conditions)
+    avatar = AshAvatar.from_capture(replace(small(named("official")), model=model, template=TemplateConfig()), capture)
+    inputs = avatar.module.frame_inputs(Pose(capture.motion, 3))
+    target = released_gaussians(model, avatar.analytic, inputs)
     axis = unitquat_to_rotmat(target[:, 6:10])[:, :, 0]
     if quat_frame == "canonical":
-        axis = rotate(conditions.transforms.quats, axis)
-    torch.testing.assert_close(axis, conditions.normals, atol=1e-4, rtol=0)
-    points = conditions.transforms.apply(conditions.canonical)
+        axis = rotate(inputs.transforms.quats, axis)
+    torch.testing.assert_close(axis, inputs.normals, atol=1e-4, rtol=0)
+    points = inputs.transforms.apply(inputs.canonical)
     nearest = torch.cdist(points, points).sort(1).values[:, 1:4].square().mean(1).sqrt()
     torch.testing.assert_close(target[:, 3].exp(), nearest, atol=1e-5, rtol=1e-3)
     assert torch.equal(target[:, 3], target[:, 5])
@@ -166,16 +165,18 @@ def test_the_releases_warm_up_aims_at_round_gaussians_turned_to_the_normal(captu
 def seen_by_steps(capture, tmp_path, **training) -> list[tuple]:
     """What the steps of a training are given: sizes of the images, and the learning rate."""
     config = small(named("ci"), steps=6, **training)
-    avatar = AshAvatar(config, capture)
-    seen, draw = [], avatar.draw_training_views
+    avatar = AshAvatar.from_capture(config, capture)
+    seen, losses = [], avatar.losses
 
-    def watch(frame, cameras, background, step, decoded):
-        seen.append((frame, [c.name for c in cameras], cameras[0].width, cameras[0].height, background.tolist()))
-        return draw(frame, cameras, background, step, decoded)
+    def watch(batches, step):
+        for b in batches:
+            size = b.cameras[0].width, b.cameras[0].height
+            seen.append((b.frame, [c.name for c in b.cameras], *size, b.background.tolist()))
+        return losses(batches, step)
 
-    avatar.draw_training_views = watch
+    avatar.losses = watch
     images = replace(load_training_images(capture), reserved=())
-    fit(avatar, images, config.training, seed=0, folder=tmp_path)
+    Trainer(avatar, config.training, images, seed=0, folder=tmp_path).fit()
     return seen
 
 
@@ -199,13 +200,13 @@ def test_a_constant_schedule_keeps_the_learning_rates(capture, tmp_path, monkeyp
 @pytest.mark.skipif(not has_tiles(), reason="on a CPU without tiles (AMX) decoders learn in float32")
 def test_bfloat16_is_a_matter_of_the_decoders_alone(capture):
     config = small(named("ci"))
-    avatar = AshAvatar(replace(config, model=replace(config.model, width=16)), capture)
+    avatar = AshAvatar.from_capture(replace(config, model=replace(config.model, width=16)), capture)
     for net in avatar.module.decoders.nets:
         torch.nn.init.normal_(net.head.weight, std=0.1)
-    conditions = avatar._inputs_of(1)
-    exact = avatar._decode([conditions])[0].detach()
+    inputs = avatar._inputs_of(1)
+    exact = avatar._decode([inputs])[0].detach()
     avatar.config = replace(avatar.config, training=replace(avatar.config.training, precision="bfloat16"))
-    rough = avatar._decode([conditions])[0].detach()
+    rough = avatar._decode([inputs])[0].detach()
     assert rough.dtype == torch.float32
     assert (
         0 < float((rough - exact).abs().max()) < 0.05 * float((exact - avatar.module.base_texels.detach()).abs().max())
@@ -213,8 +214,8 @@ def test_bfloat16_is_a_matter_of_the_decoders_alone(capture):
 
 
 def test_noise_in_the_textures_is_for_learning_alone_and_another_one_in_every_step(capture):
-    noisy = AshAvatar(small(named("ci"), texture_noise=0.5), capture)
-    plain = AshAvatar(small(named("ci")), capture)
+    noisy = AshAvatar.from_capture(small(named("ci"), texture_noise=0.5), capture)
+    plain = AshAvatar.from_capture(small(named("ci")), capture)
     seen = []
     for avatar in (noisy, plain):
         torch.nn.init.normal_(avatar.module.decoders.nets[0].head.weight, std=0.1, generator=torch.manual_seed(1))

@@ -147,7 +147,7 @@ def test_training_in_bfloat16_says_in_which_precision_it_was(method, tmp_path):
     weights = []
     for number in range(2):
         made = ddc_config(config, seed=0, template=config.template) if method == "ddc" else config
-        avatar = (DdcAvatar if method == "ddc" else AshAvatar)(made, capture)
+        avatar = (DdcAvatar if method == "ddc" else AshAvatar).from_capture(made, capture)
         avatar.fit(capture, folder=tmp_path / str(number))
         assert avatar.outcome().precision == ("bfloat16" if has_tiles() else "float32")
         weights.append(torch.cat([p.detach().flatten() for p in avatar.module.parameters()]))

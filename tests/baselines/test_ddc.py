@@ -29,7 +29,7 @@ def avatar(capture, *, steps: int = 120) -> DdcAvatar:
     ash = named("ci")
     small = replace(ash.model, texels=16, width=4, levels=2, window=2)
     training = replace(ash.training, steps=steps, warmup_steps=steps // 2)
-    return DdcAvatar(
+    return DdcAvatar.from_capture(
         ddc_config(replace(ash, model=small, training=training), seed=0, template=TemplateConfig()), capture
     )
 
@@ -48,7 +48,7 @@ def test_a_constant_texture_draws_a_flat_silhouette_over_the_background(capture)
     colour, background = torch.tensor([0.2, 0.5, 0.8]), torch.tensor([1.0, 0.0, 0.0])
     texture = colour[:, None, None].expand(3, 32, 32)
     with torch.no_grad():
-        image = model.draw(texture, posed, model.see(posed, [front_camera()]), background)[0]
+        image = model.rasterize(texture, posed, model.see(posed, [front_camera()]), background)[0]
     coverage = image[..., 3:]
     torch.testing.assert_close(image[..., :3], colour * coverage + background * (1 - coverage), atol=1e-6, rtol=0)
     steps = coverage * SUPERSAMPLING**2
@@ -60,7 +60,7 @@ def test_gradients_reach_exactly_the_texture_pixels_that_are_seen(capture):
     model = avatar(capture).module
     posed = model.template.pose(Pose(tube_motion(), 0))
     texture = torch.full((3, 32, 32), 0.5, requires_grad=True)
-    model.draw(texture, posed, model.see(posed, [front_camera()]), torch.zeros(3))[..., 1].sum().backward()
+    model.rasterize(texture, posed, model.see(posed, [front_camera()]), torch.zeros(3))[..., 1].sum().backward()
     assert texture.grad is not None
     assert not texture.grad[[0, 2]].any()
     lit = texture.grad[1] != 0
@@ -69,7 +69,7 @@ def test_gradients_reach_exactly_the_texture_pixels_that_are_seen(capture):
 
 def test_a_known_texture_is_recovered_from_its_images(capture, tmp_path):
     known = avatar(capture)
-    known.module.texture.data = torch.rand(3, 8, 8).repeat_interleave(4, 1).repeat_interleave(4, 2)
+    known.module.base_texture.data = torch.rand(3, 8, 8).repeat_interleave(4, 1).repeat_interleave(4, 2)
     folder = shutil.copytree(capture.folder, tmp_path / "capture")
     for split in capture.splits.values():
         for camera, frame in split.views:
@@ -95,7 +95,7 @@ def _psnr(made, capture) -> float:
 def test_noise_in_the_textures_is_for_learning_alone(capture):
     config = named("ci")
     config = replace(config, training=replace(config.training, texture_noise=0.5, warmup_steps=2))
-    avatar = DdcAvatar(ddc_config(config, seed=0, template=TemplateConfig(kind="exact")), capture)
+    avatar = DdcAvatar.from_capture(ddc_config(config, seed=0, template=TemplateConfig(kind="exact")), capture)
     for parameter in avatar.module.network.parameters():
         parameter.data += 0.05 * torch.randn(parameter.shape, generator=torch.manual_seed(0))
     cameras = [capture.cameras["cam1"]]
@@ -121,14 +121,16 @@ def test_the_network_is_sized_as_the_presets_decoders_and_fills_its_texture():
 def test_far_from_training_a_static_texture_is_what_counts(capture, tmp_path):
     mesh = avatar(capture, steps=40)
     mesh.fit(capture, folder=tmp_path)
-    module, seen = mesh.module, mesh._inputs[1]
+    module, inputs = mesh.module, mesh._inputs[1]
     with torch.no_grad():
-        near = module.dynamic_texture(seen)
-        torch.testing.assert_close(near, module.texture + module.correction(seen))
-        assert not torch.equal(module.static_texture, module.texture), "each has learned for itself since the warm-up"
+        near = module.blended_texture(inputs)
+        torch.testing.assert_close(near, module.base_texture + module.residual([inputs])[0])
+        assert not torch.equal(module.fallback_texture, module.base_texture), (
+            "each has learned for itself since the warm-up"
+        )
         for decoder_weight in (0.0, 0.25):
-            expected = (1 - decoder_weight) * module.static_texture + decoder_weight * near
-            torch.testing.assert_close(module.dynamic_texture(replace(seen, decoder_weight=decoder_weight)), expected)
+            expected = (1 - decoder_weight) * module.fallback_texture + decoder_weight * near
+            torch.testing.assert_close(module.blended_texture(replace(inputs, decoder_weight=decoder_weight)), expected)
 
 
 def test_static_views_are_drawn_into_what_the_training_views_saw(capture, monkeypatch):
@@ -138,11 +140,11 @@ def test_static_views_are_drawn_into_what_the_training_views_saw(capture, monkey
     monkeypatch.setattr(ash.mesh.drawing, "rasterize_mesh", lambda *a, **k: (seen.append(1), find(*a, **k))[1])
 
     def static_and_gradient(by: list[Camera]) -> tuple[torch.Tensor, torch.Tensor]:
-        drawn = mesh.draw_static_views(1, by, background)
+        drawn = mesh._draw_fallback(mesh._inputs_of(1), by, background)
         mesh.module.zero_grad()
         drawn.square().sum().backward()
         assert mesh.module.refinement.rough.grad is None
-        return drawn, mesh.module.static_texture.grad
+        return drawn, mesh.module.fallback_texture.grad
 
     assert training_views(mesh, 1, cameras, background, step=0).requires_grad
     assert mesh.module.refinement is not None

@@ -30,9 +30,10 @@ capture, scratch = load_capture(Path(sys.argv[1])), Path(sys.argv[2])
 ash = named("ci")
 model = replace(ash.model, texels=16, shuffle=1, width=4, levels=2, window=2)
 training = replace(ash.training, steps=25, warmup_steps=5)
-avatar = DdcAvatar(ddc_config(replace(ash, model=model, training=training), seed=0, template=ash.template), capture)
+config = ddc_config(replace(ash, model=model, training=training), seed=0, template=ash.template)
+avatar = DdcAvatar.from_capture(config, capture)
 avatar.fit(capture, folder=scratch)
-avatar.module.texture.data -= 0.3  # As training may leave it: with colours below zero.
+avatar.module.base_texture.data -= 0.3  # As training may leave it: with colours below zero.
 avatar.module.light.data = 0.05 * torch.randn(9, 3, generator=torch.Generator().manual_seed(0))
 try:
     display = avatar.open_display()

@@ -96,8 +96,8 @@ def test_static_learns_its_one_frame_and_reads_no_other(capture, tmp_path):
 
 def test_oracle_texture_recovers_a_texture_on_the_exact_surface(capture, tmp_path):
     known = oracle_texture(capture, seed=0, preset="ci")
-    assert known.parameter_count() == known.module.texture.numel() + 27
-    known.module.texture.data = torch.rand(3, 8, 8).repeat_interleave(4, 1).repeat_interleave(4, 2)
+    assert known.parameter_count() == known.module.base_texture.numel() + 27
+    known.module.base_texture.data = torch.rand(3, 8, 8).repeat_interleave(4, 1).repeat_interleave(4, 2)
     folder = shutil.copytree(capture.folder, tmp_path / "capture")
     for camera, frame in {view for split in capture.splits.values() for view in split.views}:
         drawn = draw(known, capture, camera, frame)

@@ -97,8 +97,13 @@ CHANGED_BY_SWITCH = {
     "blended_anchor": {"places"},
     "wo_light": {"light", "rates"},
     "wo_light_and_motion": DECODERS
-    | {"light", "rates", "textures", "decoder_weight", "warm_up"},  # No motion: no decoders.
-    "wo_standardise": {"textures", "decoder_weight", "rates"},  # Novelty is told in units of the standardised textures.
+    | {"light", "rates", "textures", "decoder_weight", "warm_up", "turns"},  # No motion: no decoders.
+    "wo_standardise": {
+        "textures",
+        "decoder_weight",
+        "rates",
+        "turns",
+    },  # Novelty is told in units of the standardised textures.
     "wo_bound": {"textures"},
     "wo_heading": {"textures"},
     "two_trunks": DECODERS,
@@ -171,20 +176,16 @@ FITTED = {"training.warmup": "fitted"}
 PLANTED = {
     "template.kind": "exact",
     "template.error_mm": 8.0,
-    "template.error_static": 0.4,
-    "template.error_lag": 0.2,
 }
-FROM_IMAGES = {"template.kind": "learned", "template.passes": 1}
+FROM_IMAGES = {"template.kind": "learned"}
 NETS = {
     "template.kind": "learned",
-    "template.supervision": "scans",
     "template.network": "graph",
-    "template.skinning": "graph",
-    "template.width": 4,
+    "template.released": True,
     "template.blocks": 1,
     "template.steps": 20,
 }
-MOVED = {"refine": "motion", "template.width": 4, "template.blocks": 1}
+MOVED = {"refine": "motion", "template.blocks": 1}
 # The networks that move a template are drawn before the decoders: where they are others, so are the decoders' weights.
 MOVING = {"refinement", "weights"}
 OF_BOTH = {
@@ -199,7 +200,6 @@ OF_BOTH = {
     "training.steps": Case(9, {"course"}),
     "training.views_per_step": Case(1, {"batches"}),
     "training.warmup_steps": Case(5, {"warm_up", "turns"}),
-    "training.static_every": Case(3, {"turns"}),
     "training.l1_weight": Case(0.5, {"loss"}),
     "training.ssim_weight": Case(0.5, {"loss"}),
     "training.learning_rate": Case(1e-3, {"rates"}),
@@ -211,24 +211,17 @@ OF_BOTH = {
     "training.precision": Case("bfloat16", {"precision"}, {"model.width": 16}),
     "training.seconds": Case(140.0, {"course"}),
     "training.snapshots": Case(True, {"files"}),
-    "training.checkpoint_seconds": Case(30.0, {"files"}),
 }
 OF_ASH = {
-    "model.motion": Case(False, NO_MOTION - {"turns"}),
+    "model.motion": Case(False, NO_MOTION),
     "model.refine": Case(True, SURFACE | MOVING | {"rates"}),  # It starts at nothing, but for the last bit.
     "training.frame_share": Case(0.5, {"batches", "start", "textures"}),  # Standardised by what is seen.
     "template.error_mm": Case(4.0, SURFACE, PLANTED),
-    "template.error_static": Case(0.9, SURFACE, PLANTED),
-    "template.error_lag": Case(0.9, SURFACE, PLANTED),
-    "template.passes": Case(2, SURFACE, FROM_IMAGES),
-    "template.supervision": Case("images", SURFACE, NETS),
+    "template.supervision": Case("scans", SURFACE, NETS),
     "template.network": Case("linear", SURFACE | {"deformation"}, NETS),
-    "template.skinning": Case("direct", SURFACE | {"skinning"}, NETS),
     "template.nodes": Case(25, SURFACE | {"deformation", "skinning"}, NETS),
     "template.window": Case(3, SURFACE | {"deformation"}, NETS),
-    "template.weights": Case("per-node", SURFACE | {"deformation"}, NETS),
-    "template.dense": Case(True, SURFACE | {"deformation"}, NETS),
-    "template.width": Case(5, SURFACE | {"deformation"}, NETS),
+    "template.released": Case(False, SURFACE | {"deformation", "skinning"}, NETS),
     "template.blocks": Case(2, SURFACE | {"deformation"}, NETS),
     "template.steps": Case(10, SURFACE, NETS),
 }
@@ -248,13 +241,10 @@ OF_THE_MESH = {
     "training.texture_noise": Case(0.5, {"noise"}),
     "training.camera_share": Case(0.5, {"batches", "start"}),
     "training.frame_share": Case(0.5, {"batches", "start", "textures"}),
-    "training.fitted_every": Case(2, set(), FITTED),  # A mesh has no Gaussians that could be fitted.
-    "training.fitted_steps": Case(3, set(), FITTED),
+    "training.fitted_steps": Case(3, set(), FITTED),  # A mesh has no Gaussians that could be fitted.
     "template.nodes": Case(25, {"refinement"}, MOVED),
     "template.window": Case(3, MOVING, MOVED),
-    "template.weights": Case("per-node", MOVING, MOVED),
-    "template.dense": Case(True, MOVING, MOVED),
-    "template.width": Case(5, MOVING, MOVED),
+    "template.released": Case(True, MOVING, MOVED),
     "template.blocks": Case(2, MOVING, MOVED),
 }
 CASES = {"ash": OF_BOTH | OF_ASH, "ddc": OF_BOTH | OF_THE_MESH}
@@ -276,7 +266,6 @@ def test_the_mesh_stands_on_the_template_that_ash_gets(on: Changes, apart: Apart
 ELSEWHERE = {
     "ash": {
         "model.offset_unit_m": ("ash/test_presets.py", "test_the_offsets_unit_scales_the_offset_alone"),
-        "training.fitted_every": ("ash/training/test_warm_up.py", "test_every_so_manyth_frame_is_fitted_and_no_other"),
         "training.fitted_steps": ("ash/training/test_warm_up.py", "test_a_fit_ends_where_nothing_is_gained"),
         "device": ("ash/test_devices.py", "test_a_training_step_stays_on_its_device"),
     },
@@ -285,12 +274,8 @@ ELSEWHERE = {
 OF_THE_TEMPLATE = (
     "kind",
     "error_mm",
-    "error_static",
-    "error_lag",
     "supervision",
-    "passes",
     "network",
-    "skinning",
     "steps",
 )
 HERE: dict[str, dict[str, Callable[..., None]]] = {

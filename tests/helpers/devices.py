@@ -13,7 +13,6 @@ import torch
 from helpers.captures import tiny_preset
 from torch import Tensor
 
-import ash.avatar
 import ash.mesh.drawing
 import ash.model
 import ash.template.graph
@@ -22,7 +21,7 @@ import ash.template_learning.learning
 import ash.template_learning.regressing
 import ash.textures
 import ash.training.adam
-import baselines.ddc
+import ash.training.avatar
 from ash.capture.dataset import Camera, Capture
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted
@@ -32,7 +31,6 @@ from ash.template.graph import NeighbourMean
 from ash.training.adam import Adam
 from ash.training.batches import draw_batch
 from ash.training.images import load_training_images
-from ash.training.loop import draw_training_step, view_loss
 
 META = torch.device("meta")
 
@@ -55,18 +53,15 @@ def step_of(avatar: Any, capture: Capture, device: torch.device) -> list[Tensor]
     training = avatar.config.training
     batch = draw_batch(load_training_images(capture, device), training, 0, 0)
     optimiser = Adam(avatar.parameter_groups(), eps=1e-15)
-    view_loss(draw_training_step(avatar, [batch], 0), [batch], training).backward()
-    static = avatar.draw_static_views(batch.frame, batch.cameras, batch.background)
-    if static is not None:
-        view_loss([static], [batch], training).backward()
+    for loss in avatar.losses([batch], 0):
+        loss.backward()
     assert optimiser.step()
     return [parameter for parameter in optimiser.parameters if parameter.grad is not None]
 
 
 def without_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Avatars are made for `meta`, and what needs numbers is replaced."""
-    for module in (ash.avatar, baselines.ddc):
-        monkeypatch.setattr(module, "device_named", lambda name: META)
+    monkeypatch.setattr(ash.training.avatar, "device_named", lambda name: META)
     monkeypatch.setattr(ash.template.graph.NeighbourMean, "__call__", as_if_averaged)
     monkeypatch.setattr(ash.model, "splat", _shapes_of_images)
     monkeypatch.setattr(ash.mesh.drawing, "_view_of", _some_samples)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -12,7 +13,7 @@ from ash.config import TrainingConfig
 from ash.protocol import TrainingOutcome
 from ash.training.batches import Batch, draw_step
 from ash.training.images import TrainingImages
-from ash.training.loop import fit
+from ash.training.loop import Trainer
 
 STEPS, SECONDS_PER_STEP = 7, 20.0  # so many steps are looked at, by a clock on which each takes so long
 
@@ -26,44 +27,34 @@ class FakeLearner:
         self.step = 0
         self.rates: list[float] = []
         self.shown: list[Batch] = []
-        self.told: list[str] = []
-        self.kept: list[tuple[int, str]] = []
+        self.written: list[tuple[int, str]] = []
         self.outcome: TrainingOutcome
         self.images: TrainingImages
-        self.config: TrainingConfig  # by which views are compared
+        self.config: TrainingConfig
         self.before_start: Callable[[], None]
 
-    def fit(
-        self, learner: Any, images: TrainingImages, *arguments: Any, before_start: Any = lambda: None, **named: Any
-    ) -> TrainingOutcome:
-        """In place of `ash.training.loop.fit`; what comes before the first step is left to who wants it."""
-        self.before_start, self.images = before_start, images
-        self.outcome = fit(self, images, *arguments, **named)
-        return self.outcome
+    def trainer(self, learner: Any, config: TrainingConfig, images: TrainingImages, **options: Any) -> Any:
+        """In place of `Trainer`; what comes before the first step is left to who wants it."""
+        self.config, self.images = config, images
+        trainer = Trainer(self, config, images, **options)
+
+        def fit(before_start: Callable[[], None]) -> TrainingOutcome:
+            self.before_start = before_start
+            self.outcome = trainer.fit()
+            return self.outcome
+
+        return SimpleNamespace(fit=fit)
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         return self.groups
 
-    def decode_together(self, frames: Sequence[int], step: int) -> list[None]:
-        if torch.is_grad_enabled():  # Reserved views are drawn besides.
-            self.step = step
-            self.told.append(f"step {step}")
-            self.rates.append(self.groups[0]["lr"])
-        return [None] * len(frames)
+    def losses(self, batches: Sequence[Batch], step: int) -> list[Tensor]:
+        self.step = step
+        self.rates.append(self.groups[0]["lr"])
+        return [self.module.weight.mean()]
 
-    def draw_training_views(
-        self, frame: int, cameras: list[Camera], background: Tensor, step: int, decoded: None
-    ) -> Tensor:
+    def render_views(self, frame: int, cameras: list[Camera], background: Tensor) -> Tensor:
         return self.module.weight.reshape(()).expand(len(cameras), cameras[0].height, cameras[0].width, 3)
-
-    def draw_static_views(self, frame: int, cameras: list[Camera], background: Tensor) -> None:
-        self.told.append("static")
-
-    def end_warmup(self) -> None:
-        self.told.append("warm-up ends")
-
-    def decoder_residual(self, frame: int) -> None:
-        return None
 
     def clock(self) -> float:
         return SECONDS_PER_STEP * self.step
@@ -74,10 +65,6 @@ class FakeLearner:
             self.shown += batches
         return batches
 
-    def view_loss(self, drawn: Sequence[Tensor], batches: Sequence[Batch], config: TrainingConfig) -> Tensor:
-        self.config = config
-        return torch.stack([views.mean() for views in drawn]).mean()
-
     def write(self, path: Path, content: bytes) -> None:
         if self.step < STEPS:
-            self.kept.append((self.step, path.name))
+            self.written.append((self.step, path.name))

@@ -9,5 +9,6 @@ from ash.capture.dataset import Camera
 
 def training_views(avatar: Any, frame: int, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
     """What a step of training draws of one frame."""
-    (decoded,) = avatar.decode_together([frame], step)
-    return avatar.draw_training_views(frame, cameras, background, step, decoded)
+    inputs = avatar._inputs_of(frame)
+    (decoded,) = avatar._decode_step([inputs], step)
+    return avatar._draw(decoded, inputs, cameras, background, step)

@@ -4,7 +4,6 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import groupby
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,21 +14,21 @@ import torch
 from helpers.fake_learner import STEPS, FakeLearner
 from torch import Tensor
 
-import ash.avatar
 import ash.native.library
-import baselines.ddc
+import ash.training.avatar
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Camera, Capture, Pose
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.texels import pose
 from ash.mesh.drawing import MeshView
+from ash.model import AshModel
 from ash.rotations import RigidTransforms
 from ash.template.template import PosedTemplate, skinned_template
 from ash.template_learning.refining import MotionRefinement, RefinedDeformation
 from ash.textures import DecoderInputs, FrameInputs
 from ash.training import loop
 from ash.training.batches import Batch
-from ash.training.loop import view_loss
+from ash.training.losses import view_loss
 from baselines.ddc import DdcAvatar, MeshInputs
 
 TEXELS, CHANNELS, PIXELS = 40, 14, 32
@@ -67,7 +66,7 @@ class Subject:
     @property
     def static(self) -> torch.nn.Parameter:
         """What the decoders add to."""
-        made: torch.nn.Parameter = self.avatar.module.texture if self.is_mesh else self.avatar.module.base_texels
+        made: torch.nn.Parameter = self.avatar.base
         return made
 
     @property
@@ -77,20 +76,18 @@ class Subject:
         return {name: p for name, p in self.avatar.module.named_parameters() if name.startswith(of)}
 
     @torch.no_grad()
-    def seen(self, frame: int) -> Any:
-        """The conditions of a frame."""
-        return self.avatar._inputs[frame] if self.is_mesh else self.avatar._inputs_of(frame)
+    def inputs(self, frame: int) -> Any:
+        """What decoders take of a frame."""
+        return self.avatar._inputs_of(frame)
 
     @cached_property
     def fake_learner(self) -> FakeLearner:
         """The avatar's own `fit`, with somebody else in its place."""
         made = FakeLearner()
         with pytest.MonkeyPatch.context() as patch:
-            for module in (ash.avatar, baselines.ddc):
-                patch.setattr(module, "fit", made.fit)
+            patch.setattr(ash.training.avatar, "Trainer", made.trainer)
             patch.setattr(loop, "time", SimpleNamespace(process_time=made.clock, monotonic=made.clock))
             patch.setattr(loop, "draw_step", made.draw_step)
-            patch.setattr(loop, "view_loss", made.view_loss)
             patch.setattr(loop, "write_atomic", made.write)
             self.avatar.fit(self.capture.training_only(), folder=self.folder)
         return made
@@ -99,14 +96,14 @@ class Subject:
         """What decoders see in a step, and whether in bfloat16 where tiles are there; None: they are left out."""
         learned: list[tuple[Tensor, bool]] = []
 
-        def decode(frames: Sequence[DecoderInputs]) -> list[Tensor]:
+        def decode(frames: Sequence[DecoderInputs]) -> Tensor:
             learned.append((frames[0].textures, torch.is_autocast_enabled("cpu")))
-            return [self.static] * len(frames)
+            return self.static[None]
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(ash.native.library, "has_tiles", lambda: True)
-            patch.setattr(self.avatar.module, "corrected_textures" if self.is_mesh else "decode_together", decode)
-            self.avatar.decode_together([2], step)
+            patch.setattr(self.avatar.module, "decode", decode)
+            self.avatar._decode_step([self.inputs(2)], step)
         return learned[0] if learned else None
 
     @property
@@ -124,12 +121,12 @@ def fixed_frame(s: Subject) -> Any:
         "root_translation": numbers(3, seed=2),
     }
     if s.is_mesh:
-        return MeshInputs(**seen, window=[])
+        return MeshInputs(**seen, window=[], posed=s.inputs(0).posed)
     texels = len(s.avatar.lattice.texels)
     unit = torch.nn.functional.normalize(numbers(texels, 4), dim=1)
     return FrameInputs(
         **seen,
-        motion=s.seen(0).motion,
+        motion=s.inputs(0).motion,
         canonical=0.1 * numbers(texels, 3, seed=3),
         normals=torch.nn.functional.normalize(numbers(texels, 3, seed=4), dim=1),
         transforms=RigidTransforms(quats=unit, translations=0.1 * numbers(texels, 3, seed=5)),
@@ -182,14 +179,14 @@ def pulls(s: Subject) -> str:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(s.avatar.module, "see", see)
-        patch.setattr(s.avatar.module, "draw", lambda *_: torch.zeros(0, 1, 1, 4))
+        patch.setattr(s.avatar.module, "rasterize", lambda *_: torch.zeros(0, 1, 1, 4))
         for step in range(STEPS):
-            s.avatar.draw_training_views(0, [], torch.zeros(3), step, s.static)
+            s.avatar._draw(s.static, s.inputs(0), [], torch.zeros(3), step)
     return fingerprint(pulled)
 
 
 def places(s: Subject) -> str:
-    made = s.seen(2)
+    made = s.inputs(2)
     return fingerprint(made.canonical, made.normals, made.transforms.quats, made.transforms.translations)
 
 
@@ -197,7 +194,7 @@ def textures(s: Subject) -> str:
     """Of a pose that was learned from, and of one that was not."""
     drawer, last = s.avatar.module.textures, len(s.capture.motion.dofs) - 1
     unseen = None if drawer is None else drawer(s.avatar.template, Pose(s.capture.motion, last))
-    return fingerprint(s.seen(2).textures, unseen)
+    return fingerprint(s.inputs(2).textures, unseen)
 
 
 def decoder_weight(s: Subject) -> str:
@@ -215,14 +212,16 @@ def decoding(s: Subject) -> str:
     if not s.nets:
         return fingerprint("none")
     let_be_known(s.nets)
-    decode = s.avatar.module.correction if s.is_mesh else s.avatar.module.decoders
+    decode = s.avatar.module.residual if s.is_mesh else s.avatar.module.decoders
     with torch.no_grad():
-        return fingerprint(sorted(s.nets), decode(fixed_frame(s)))
+        return fingerprint(sorted(s.nets), decode([fixed_frame(s)])[0])
 
 
 def counting(s: Subject) -> str:
     """What of the decoders' output counts."""
-    return fingerprint(s.avatar.module.mask_offsets(numbers(TEXELS, CHANNELS))[:, :CHANNELS])
+    decoded = numbers(1, TEXELS, CHANNELS)
+    known: Any = SimpleNamespace(decoders=lambda _: decoded, config=s.avatar.config.model)
+    return fingerprint(AshModel.residual(known, []))
 
 
 def start(s: Subject) -> str:
@@ -243,7 +242,7 @@ def posing(s: Subject) -> str:
 
 
 def light(s: Subject) -> str:
-    return fingerprint(s.avatar.module.light is None)
+    return fingerprint(getattr(s.avatar.module, "light", None) is None)
 
 
 def drawing(s: Subject) -> str:
@@ -251,7 +250,7 @@ def drawing(s: Subject) -> str:
     camera, module = s.capture.cameras["cam1"], s.avatar.module
     if s.is_mesh:
         posed, texture = skinned_template(s.capture).pose(Pose(s.capture.motion, 3)), numbers(3, PIXELS, PIXELS)
-        return fingerprint(module.draw(texture, posed, module.see(posed, [camera]), torch.zeros(3)))
+        return fingerprint(module.rasterize(texture, posed, module.see(posed, [camera]), torch.zeros(3)))
     known = Gaussians(
         means=0.1 * numbers(TEXELS, 3, seed=7) + torch.tensor([0.0, 0.5, 0.0]),
         quats=numbers(TEXELS, 4, seed=8),
@@ -259,7 +258,7 @@ def drawing(s: Subject) -> str:
         opacities=torch.full((TEXELS,), 0.7),
         sh=numbers(TEXELS, 1, 3, seed=9),
     )
-    return fingerprint(module.draw(known, [camera], None).rgb)
+    return fingerprint(module.rasterize(known, [camera], None).rgb)
 
 
 def batches(s: Subject) -> str:
@@ -282,7 +281,7 @@ def loss(s: Subject) -> str:
 def noise(s: Subject) -> str:
     """Whether decoders see more while they learn than they are given."""
     learned = s.learned_in(s.first_decoded)
-    return fingerprint(learned is not None and not torch.equal(learned[0], s.seen(2).textures))
+    return fingerprint(learned is not None and not torch.equal(learned[0], s.inputs(2).textures))
 
 
 def precision(s: Subject) -> str:
@@ -308,9 +307,19 @@ def warm_up(s: Subject) -> str:
 
 
 def turns(s: Subject) -> str:
-    """Which step ends the warm-up, and which ones also teach what counts far from the training motion."""
-    told = s.fake_learner.told
-    return fingerprint([one for one, _ in groupby(told[: told.index(f"step {STEPS}")])])
+    """In which steps the fallback starts from the base, and in which it learns."""
+    fallback, noted = s.avatar.fallback, []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(s.avatar, "_decode", lambda inputs: [s.static] * len(inputs))
+        for name in ("_draw", "_draw_fallback"):
+            patch.setattr(s.avatar, name, lambda *_: torch.zeros(0))
+        patch.setattr(ash.training.avatar, "view_loss", lambda *_: torch.zeros(()))
+        for step in range(STEPS):
+            if fallback is not None:
+                fallback.data.fill_(7.0)
+            losses = len(s.avatar.losses(s.fake_learner.shown[:1], step))
+            noted.append((losses, fallback is not None and not bool((fallback == 7.0).all())))
+    return fingerprint(noted)
 
 
 def rates(s: Subject) -> str:
@@ -329,11 +338,11 @@ def course(s: Subject) -> str:
 
 def files(s: Subject) -> str:
     """What is written, and after which step."""
-    return fingerprint(s.fake_learner.kept)
+    return fingerprint(s.fake_learner.written)
 
 
 def average(s: Subject) -> str:
-    run = loop.Trainer(s.avatar, s.avatar.config.training, s.fake_learner.images, s.folder)
+    run = loop.Trainer(s.avatar, s.avatar.config.training, s.fake_learner.images, folder=s.folder, seed=0)
     return fingerprint(bool(run.average))
 
 

@@ -14,6 +14,7 @@ import torch
 import ash.avatar
 import ash.gaussians.texels
 import ash.model
+import ash.plus
 import ash.template.template
 import ash.textures
 from ash.avatar import AshAvatar
@@ -32,7 +33,7 @@ _held: list[torch.Tensor] = []
 def _ash(capture: Capture, seed: int, preset: str, *, model: Any = None, training: Any = None) -> AshAvatar:
     """ASH with some fields of its configuration replaced."""
     config = named(preset)
-    return AshAvatar(
+    return AshAvatar.from_capture(
         AshConfig(
             model=replace(config.model, **(model or {})),
             training=replace(config.training, **(training or {})),
@@ -114,7 +115,7 @@ class _Miscalibrated(AshAvatar):
 
 def one_camera_off(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
     """The extrinsics of one training camera are off by about 2 pixels."""
-    return _Miscalibrated(replace(named(preset), seed=seed), capture)
+    return _Miscalibrated.from_capture(replace(named(preset), seed=seed), capture)
 
 
 def normals_flipped(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
@@ -139,7 +140,7 @@ def holes(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
         shown[::4] = 0
         return replace(gaussians, opacities=gaussians.opacities * shown)
 
-    ash.model.pose = pose
+    ash.model.pose = ash.plus.pose = pose
     return _ash(capture, seed, preset)
 
 

@@ -74,7 +74,7 @@ def test_too_few_or_too_many_nodes_are_refused():
 
 def learned(**changes) -> GraphDeformation:
     torch.manual_seed(0)
-    config = TemplateConfig(network="graph", window=3, **({"nodes": 30, "width": 8, "blocks": 1} | changes))
+    config = TemplateConfig(network="graph", window=3, **({"nodes": 30, "blocks": 1} | changes))
     deformation = GraphDeformation(config, tube_mesh(), tube_skeleton())
     for net in (deformation.graph_net, deformation.displacement_net):
         torch.nn.init.normal_(net.head.weight, std=0.1)
@@ -111,19 +111,19 @@ def test_learned_deformation_sees_the_past():
 def test_weights_per_node_tell_nodes_apart_that_shared_weights_cannot(graph):
     """Equal inputs at all nodes: shared weights give equal outputs, weights per node do not."""
     equal = torch.ones(len(graph.nodes), 4)
-    for weights, differs in (("shared", False), ("per-node", True)):
+    for released in (False, True):
         torch.manual_seed(0)
-        net = GraphNet(4, 2, TemplateConfig(width=6, blocks=1, weights=weights), nodes=len(graph.nodes))
+        net = GraphNet(4, 2, TemplateConfig(blocks=1, released=released), nodes=len(graph.nodes))
         torch.nn.init.normal_(net.head.weight)
         out = net(equal, graph.adjacency)
-        assert (out.std(0).max() > 1e-3) == differs
+        assert (out.std(0).max() > 1e-3) == released
 
 
 def test_the_dense_layer_alone_carries_news_across_the_whole_mesh(graph):
     """One block reaches three hops; what a node says farther away can only come through the full matrix."""
     for dense in (False, True):
         torch.manual_seed(0)
-        net = GraphNet(3, 3, TemplateConfig(width=4, blocks=1), nodes=len(rest()), dense=dense)
+        net = GraphNet(3, 3, TemplateConfig(blocks=1), nodes=len(rest()), dense=dense)
         torch.nn.init.normal_(net.head.weight)
         if net.across is not None:
             torch.nn.init.normal_(net.across.weight)

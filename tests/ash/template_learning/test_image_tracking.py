@@ -10,8 +10,7 @@ from helpers.figures import ring_cameras, tube_mesh, tube_motion
 from scipy.ndimage import gaussian_filter, minimum_filter
 
 from ash.capture.dataset import Capture, Pose, image_path
-from ash.config import TemplateConfig
-from ash.files import InputError, write_image
+from ash.files import write_image
 from ash.mesh.drawing import draw_mesh, textured, topology_of
 from ash.mesh.rasterizing import Rasterized, rasterize_by_warp
 from ash.template.graph import build_graph
@@ -125,11 +124,6 @@ def test_all_distances_track_what_the_tree_tracks(capture: Capture, monkeypatch:
     assert len(asked) == 2 * 2 * 8 and min(asked) > 50
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)  # Metres: before, it is a hundred times as much.
     assert before.max() > 1e-2
-
-
-def test_passes_are_at_least_one() -> None:
-    with pytest.raises(InputError, match="passes"):
-        TemplateConfig(passes=0)
 
 
 def test_a_view_is_cut_out_around_the_subject_with_its_outline() -> None:

@@ -142,7 +142,7 @@ def test_graph_networks_learn_what_they_are_shown_and_stop_where_it_no_longer_he
     at_rest = skinned_template(capture)
     tracked = Tracked(frames=capture.splits["train"].frames, canonical=true_canonical(capture, at_rest))
     torch.manual_seed(0)
-    config = TemplateConfig(network="graph", width=8, blocks=1, **SMALL)
+    config = TemplateConfig(network="graph", blocks=1, **SMALL)
     deformation = GraphDeformation(config, tube_mesh(), tube_skeleton())
     kept = fit_graph(deformation, capture.motion, tracked, steps=60, seed=0)
     learned = Template(tube_mesh(), tube_skeleton(), deformation)
@@ -154,7 +154,7 @@ def test_graph_networks_learn_from_all_frames_for_as_long_as_those_held_out_gain
     """The frames held out choose the number of steps, and are learned from like the others: moved, they move it."""
     at_rest = skinned_template(capture)
     tracked = Tracked(frames=capture.splits["train"].frames, canonical=true_canonical(capture, at_rest))
-    config = TemplateConfig(network="graph", width=8, blocks=1, **SMALL)
+    config = TemplateConfig(network="graph", blocks=1, **SMALL)
 
     def learned(tracked: Tracked) -> tuple[int, GraphDeformation]:
         torch.manual_seed(0)
@@ -242,7 +242,7 @@ def test_noise_and_holes_of_a_scan_are_borne(capture, tmp_path):
 
 
 def test_skinning_through_the_graph_blends_the_nodes_transforms(capture):
-    deformation = LinearDeformation(TemplateConfig(skinning="graph", **SMALL), tube_mesh(), tube_skeleton())
+    deformation = LinearDeformation(TemplateConfig(released=True, **SMALL), tube_mesh(), tube_skeleton())
     unlearned = Template(tube_mesh(), tube_skeleton(), RestDeformation(tube_mesh()), through=deformation.graph)
     tracked = Tracked(frames=tuple(range(18)), canonical=true_canonical(capture, unlearned))
     fit_linear(deformation, capture.motion, tracked)

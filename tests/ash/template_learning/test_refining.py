@@ -94,7 +94,7 @@ def test_a_refined_template_is_the_old_one_moved_and_all_that_is_drawn_from_it_f
 
 
 def test_splats_of_a_refined_template_see_textures_redrawn_from_it(capture):
-    avatar = AshAvatar(replace(named("ci"), model=tube_model_config(refine=True)), capture)
+    avatar = AshAvatar.from_capture(replace(named("ci"), model=tube_model_config(refine=True)), capture)
     before = avatar._inputs_of(1)
     assert before.canonical.requires_grad and before.normals.requires_grad and not before.textures.requires_grad
     avatar.module.refinement.load_state_dict(moving_like(avatar, capture))
@@ -115,7 +115,7 @@ def ddc(capture: Capture, *, refine: str) -> DdcAvatar:
     model = replace(ash.model, texels=16, width=4, levels=2, window=2)
     training = replace(ash.training, steps=120, warmup_steps=60, base_learning_rate=0.1)
     config = ddc_config(replace(ash, model=model, training=training), seed=0, template=TemplateConfig())
-    return DdcAvatar(replace(config, refine=refine), capture)
+    return DdcAvatar.from_capture(replace(config, refine=refine), capture)
 
 
 @pytest.mark.parametrize("refine", ["static", "motion"])
@@ -135,8 +135,9 @@ def test_ddc_moves_its_vertices_to_where_the_images_show_them(refine, capture, t
 def test_without_refine_ddc_draws_the_template_it_was_given(capture):
     still = ddc(capture, refine="none")
     assert still.module.refinement is None
-    posed = still.template.pose(Pose(capture.motion, 2))
-    assert still.module.refined(posed, still.module.frame_inputs(Pose(capture.motion, 2))) is posed
+    inputs = still.module.frame_inputs(Pose(capture.motion, 2))
+    posed = still.module.refined(inputs)
+    assert posed is inputs.posed
     np.testing.assert_array_equal(still.template_vertices(Pose(capture.motion, 2)), posed.vertices.numpy())
 
 
@@ -150,7 +151,7 @@ def test_splats_pull_at_the_template_where_refine_is_on(capture, tmp_path):
     ash = named("ci")
     training = replace(ash.training, steps=100, warmup_steps=50, base_learning_rate=0.05)
     config = replace(ash, model=tube_model_config(refine=True, offset=False), training=training)
-    learner = AshAvatar(config, capture)
+    learner = AshAvatar.from_capture(config, capture)
     rest = torch.from_numpy(capture.template.vertices).float()
     before = learner.template_vertices(Pose(capture.motion, 1))
     learner.fit(capture, folder=tmp_path)
@@ -158,7 +159,7 @@ def test_splats_pull_at_the_template_where_refine_is_on(capture, tmp_path):
     assert excess_mm(rest + learner.module.refinement.shared().detach()) < excess_mm(rest) - 1
     assert np.abs(learner.template_vertices(Pose(capture.motion, 1)) - before).max() > 1e-3
     learner.save(tmp_path / "model.safetensors")
-    again = AshAvatar(config, capture)
+    again = AshAvatar.from_capture(config, capture)
     again.load(tmp_path / "model.safetensors")
     assert np.array_equal(
         again.template_vertices(Pose(capture.motion, 1)), learner.template_vertices(Pose(capture.motion, 1))

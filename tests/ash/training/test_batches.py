@@ -13,7 +13,7 @@ from ash import presets
 from ash.files import InputError
 from ash.training.batches import draw_batch, over
 from ash.training.images import load_training_images
-from ash.training.loop import view_loss
+from ash.training.losses import view_loss
 from benchmarks.cell.registry import find_method
 
 

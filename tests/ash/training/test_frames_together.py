@@ -8,6 +8,7 @@ import torch
 from helpers.captures import tiny_preset, write_tube_capture
 from helpers.numerics import relative_error
 
+import ash.training.avatar
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture
 from ash.config import AshConfig, TemplateConfig
@@ -16,7 +17,6 @@ from ash.files import InputError
 from ash.presets import named
 from ash.training.batches import Batch, draw_batch, draw_step
 from ash.training.images import ReadAhead, load_training_images
-from ash.training.loop import draw_training_step, view_loss
 from baselines.ddc import DdcAvatar, ddc_config
 
 FRAMES, STEP = 3, 4  # a step of so many frames, after the warm-up
@@ -58,24 +58,23 @@ def test_steps_of_several_frames_show_what_as_many_steps_of_one_frame_do(capture
 
 def gradients(avatar: AshAvatar | DdcAvatar, batches: list[Batch], step: int) -> dict[str, torch.Tensor]:
     """Of the loss of a step's views, and of its static views."""
-    training = avatar.config.training
     avatar.module.zero_grad()
-    view_loss(draw_training_step(avatar, batches, step), batches, training).backward()
-    static = [avatar.draw_static_views(batch.frame, batch.cameras, batch.background) for batch in batches]
-    if static[0] is not None:
-        view_loss(static, batches, training).backward()
+    for loss in avatar.losses(batches, step):
+        loss.backward()
     return {n: p.grad.clone() for n, p in avatar.module.named_parameters() if p.grad is not None}
 
 
 LEARNERS = {
-    "shared trunk": lambda capture: AshAvatar(of_frames(shared_trunk=True), capture),
-    "two networks": lambda capture: AshAvatar(of_frames(shared_trunk=False, global_features=True), capture),
-    "noise": lambda capture: AshAvatar(of_frames(noise=0.5, window=3), capture),
-    "instance": lambda capture: AshAvatar(of_frames(norm="instance"), capture),
-    "refining": lambda capture: AshAvatar(of_frames(refine=True), capture),
-    "motionless": lambda capture: AshAvatar(of_frames(motion=False), capture),
-    "mesh": lambda capture: DdcAvatar(mesh_of_frames(noise=0.5, global_features=True), capture),
-    "moving mesh": lambda capture: DdcAvatar(replace(mesh_of_frames(), refine="motion"), capture),
+    "shared trunk": lambda capture: AshAvatar.from_capture(of_frames(shared_trunk=True), capture),
+    "two networks": lambda capture: AshAvatar.from_capture(
+        of_frames(shared_trunk=False, global_features=True), capture
+    ),
+    "noise": lambda capture: AshAvatar.from_capture(of_frames(noise=0.5, window=3), capture),
+    "instance": lambda capture: AshAvatar.from_capture(of_frames(norm="instance"), capture),
+    "refining": lambda capture: AshAvatar.from_capture(of_frames(refine=True), capture),
+    "motionless": lambda capture: AshAvatar.from_capture(of_frames(motion=False), capture),
+    "mesh": lambda capture: DdcAvatar.from_capture(mesh_of_frames(noise=0.5, global_features=True), capture),
+    "moving mesh": lambda capture: DdcAvatar.from_capture(replace(mesh_of_frames(), refine="motion"), capture),
 }
 
 
@@ -86,6 +85,7 @@ def test_the_gradient_of_a_step_is_the_mean_of_its_frames(
 ) -> None:
     if not natively:  # As on a GPU: the frames are one batch of the U-Nets.
         monkeypatch.setattr(UNet, "_can_use_native", lambda net, texture: False)
+    monkeypatch.setattr(ash.training.avatar, "FALLBACK_EVERY", 1)
     avatar = LEARNERS[learner](capture)
     for net in avatar.module.modules():
         if isinstance(net, UNet):

@@ -21,6 +21,7 @@ from ash.devices import CPU
 from ash.files import InputError
 from ash.training.batches import draw_ahead, draw_batch, sampled
 from ash.training.images import STEPS_AHEAD, ReadAhead, load_training_images, read_crop
+from ash.training.loop import Trainer
 
 STEPS = 24
 
@@ -118,7 +119,7 @@ def test_what_a_reader_meets_reaches_the_training(
 ) -> None:
     shutil.copytree(capture.folder, tmp_path / "capture")
     copied = load_capture(tmp_path / "capture").training_only()
-    avatar = AshAvatar(tiny_preset(steps=200, warmup_steps=0), copied)
+    avatar = AshAvatar.from_capture(tiny_preset(steps=200, warmup_steps=0), copied)
     images = load_training_images(copied, max_bytes=1)  # There is no room for any image.
     lost = image_path(copied.folder, "cam2", 3)
     lost.write_bytes(lost.read_bytes()[:100])
@@ -134,7 +135,7 @@ def test_what_a_reader_meets_reaches_the_training(
     seen: list[ReadAhead] = []
     monkeypatch.setattr(ash.training.loop, "ReadAhead", noted)
     with pytest.raises(InputError, match=r"cam2/000003\.png: expected a PNG image"):
-        ash.training.loop.fit(avatar, images, avatar.config.training, seed=0, folder=tmp_path / "run")
+        Trainer(avatar, avatar.config.training, images, seed=0, folder=tmp_path / "run").fit()
     assert seen[0].waiting == 0, "its threads have ended"
 
 

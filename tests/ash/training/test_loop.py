@@ -3,7 +3,7 @@ import json
 import math
 import os
 import signal
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ import torch
 from helpers.captures import tube_model_config, write_tube_capture
 from helpers.learning import training_views
 
+import ash.training.avatar
 from ash import presets
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Pose
@@ -50,50 +51,49 @@ def psnr(avatar, capture, split: str) -> float:
 
 
 def test_known_gaussians_are_recovered_from_their_images(capture, tmp_path):
-    avatar = AshAvatar(config(steps=300, warmup_steps=200, base_learning_rate=5e-2), capture)
+    avatar = AshAvatar.from_capture(config(steps=300, warmup_steps=200, base_learning_rate=5e-2), capture)
     before = psnr(avatar, capture, "novel_view")
     avatar.fit(capture, folder=tmp_path)
     assert psnr(avatar, capture, "novel_view") > before + 12
     assert psnr(avatar, capture, "novel_pose") > before + 12
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert rows[-2]["step"] == 300
-    assert rows[-2]["loss"] < 0.5 * rows[0]["loss"]
+    assert rows[-1]["step"] == 300
+    assert rows[-1]["loss"] < 0.5 * rows[0]["loss"]
     curve = [row["train_psnr"] for row in rows if "train_psnr" in row]
     assert len(curve) == 9
     assert curve[-1] > before + 8
     outcome = avatar.outcome()
     assert (outcome.steps, outcome.ended_by, outcome.reserved_psnr) == (300, "steps", curve[-1])
-    assert rows[-1]["outcome"] == asdict(outcome)
 
 
 def stop_before_end_of(avatar: AshAvatar, step: int) -> None:
     """Send SIGTERM while the given step is drawn."""
-    draw = avatar.draw_training_views
+    losses = avatar.losses
 
-    def draw_then_signal(frame, cameras, background, at, decoded):
+    def losses_then_signal(batches, at):
         if at == step:
             os.kill(os.getpid(), signal.SIGTERM)
-        return draw(frame, cameras, background, at, decoded)
+        return losses(batches, at)
 
-    avatar.draw_training_views = draw_then_signal
+    avatar.losses = losses_then_signal
 
 
 @pytest.mark.parametrize("frames", [1, 2])
 def test_a_run_stopped_at_ten_random_steps_ends_with_the_same_bits(frames, capture, tmp_path):
     settings = config(steps=24, ema=0.9, frames_per_step=frames)
-    undisturbed = AshAvatar(settings, capture)
+    undisturbed = AshAvatar.from_capture(settings, capture)
     undisturbed.fit(capture, folder=tmp_path / "whole")
     stops = sorted(np.random.default_rng(5).choice(24, 10, replace=False))
     for stop in stops:
-        avatar = AshAvatar(settings, capture)
+        avatar = AshAvatar.from_capture(settings, capture)
         stop_before_end_of(avatar, int(stop))
         with pytest.raises(Interrupted, match=f"stopped at step {stop}|{stop + 1} of 24"):
             avatar.fit(capture, folder=tmp_path / "stopped")
-    again = AshAvatar(settings, capture)
+    again = AshAvatar.from_capture(settings, capture)
     again.fit(capture, folder=tmp_path / "stopped")
     for name, value in weights(undisturbed).items():
         assert torch.equal(weights(again)[name], value), name
-    once_more = AshAvatar(settings, capture)
+    once_more = AshAvatar.from_capture(settings, capture)
     once_more.fit(capture, folder=tmp_path / "stopped")
     assert torch.equal(weights(once_more)["base_texels"], weights(undisturbed)["base_texels"])
 
@@ -103,15 +103,15 @@ def test_a_run_stopped_before_and_in_its_decay_decides_nothing_anew(capture, tmp
     for name, value in (("FIRST_MARK", 8), ("LULL_STEPS", 0), ("LEAST_STEPS", 0), ("GAIN_DB", 99.0)):
         monkeypatch.setattr(stopping, name, value)
     settings = config(steps=200, warmup="none", warmup_steps=0)
-    undisturbed = AshAvatar(settings, capture)
+    undisturbed = AshAvatar.from_capture(settings, capture)
     undisturbed.fit(capture, folder=tmp_path / "whole")
     assert (undisturbed.outcome().ended_by, undisturbed.outcome().steps) == ("plateau", 19)
     for stop in (3, 9, 11, 13):
-        avatar = AshAvatar(settings, capture)
+        avatar = AshAvatar.from_capture(settings, capture)
         stop_before_end_of(avatar, stop)
         with pytest.raises(Interrupted):
             avatar.fit(capture, folder=tmp_path / "stopped")
-    again = AshAvatar(settings, capture)
+    again = AshAvatar.from_capture(settings, capture)
     again.fit(capture, folder=tmp_path / "stopped")
     for name, value in weights(undisturbed).items():
         assert torch.equal(weights(again)[name], value), name
@@ -123,7 +123,7 @@ def test_a_limit_in_seconds_is_met(capture, tmp_path, monkeypatch):
     ticks = itertools.count()
     monkeypatch.setattr(loop.time, "process_time", lambda: next(ticks) / 100)
     monkeypatch.setattr(stopping, "GAIN_DB", -math.inf)
-    avatar = AshAvatar(config(steps=100_000, seconds=2.0), capture)
+    avatar = AshAvatar.from_capture(config(steps=100_000, seconds=2.0), capture)
     avatar.fit(capture, folder=tmp_path)
     assert avatar.outcome().ended_by == "seconds"
     assert avatar.outcome().seconds == pytest.approx(2, abs=0.1)
@@ -131,10 +131,10 @@ def test_a_limit_in_seconds_is_met(capture, tmp_path, monkeypatch):
 
 def test_snapshots_are_what_would_be_used(capture, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "SNAPSHOT_SECONDS", (0, 10_000))
-    avatar = AshAvatar(config(snapshots=True, ema=0.5, steps=1, warmup_steps=0), capture)
+    avatar = AshAvatar.from_capture(config(snapshots=True, ema=0.5, steps=1, warmup_steps=0), capture)
     avatar.fit(capture, folder=tmp_path)
     assert [path.name for path in (tmp_path / "snapshots").iterdir()] == ["000000.safetensors"]
-    other = AshAvatar(config(), capture)
+    other = AshAvatar.from_capture(config(), capture)
     other.load(tmp_path / "snapshots" / "000000.safetensors")
     for name, value in weights(avatar).items():
         assert torch.equal(weights(other)[name], value), name
@@ -143,7 +143,7 @@ def test_snapshots_are_what_would_be_used(capture, tmp_path, monkeypatch):
 @pytest.mark.parametrize(("rate", "dead"), [(2e-3, False), (0.0, True)])
 def test_decoders_that_carry_nothing_are_found(capture, tmp_path, rate, dead):
     """A head that never leaves zero adds the same in every frame; one that learns does not."""
-    avatar = AshAvatar(config(learning_rate=rate, steps=24), capture)
+    avatar = AshAvatar.from_capture(config(learning_rate=rate, steps=24), capture)
     avatar.fit(capture, folder=tmp_path)
     assert avatar.outcome().carries_nothing == dead
     assert (avatar.outcome().correction_spread == 0) == dead
@@ -151,15 +151,18 @@ def test_decoders_that_carry_nothing_are_found(capture, tmp_path, rate, dead):
 
 def test_without_decoders_there_is_nothing_to_carry(capture, tmp_path):
     settings = config(warmup="none", warmup_steps=0)
-    avatar = AshAvatar(replace(settings, model=replace(settings.model, motion=False)), capture)
+    avatar = AshAvatar.from_capture(replace(settings, model=replace(settings.model, motion=False)), capture)
     avatar.fit(capture, folder=tmp_path)
     assert avatar.outcome().correction_spread is None
     assert not avatar.outcome().carries_nothing
 
 
 def test_the_static_avatar_learns_in_every_so_many_steps_after_the_warm_up(capture, tmp_path, monkeypatch):
-    settings = config(steps=12, warmup_steps=4, static_every=3)
-    avatar = AshAvatar(replace(settings, model=replace(settings.model, standardise=True, novelty_scale=0.5)), capture)
+    monkeypatch.setattr(ash.training.avatar, "FALLBACK_EVERY", 3)
+    settings = config(steps=12, warmup_steps=4)
+    avatar = AshAvatar.from_capture(
+        replace(settings, model=replace(settings.model, standardise=True, novelty_scale=0.5)), capture
+    )
     move, learned = Adam.step, []
 
     def step(optimiser):
@@ -169,27 +172,25 @@ def test_the_static_avatar_learns_in_every_so_many_steps_after_the_warm_up(captu
     monkeypatch.setattr(Adam, "step", step)
     avatar.fit(capture, folder=tmp_path)
     assert [number for number, did in enumerate(learned) if did] == [6, 9]
-    with pytest.raises(InputError, match="static_every: expected at least 1, got 0"):
-        config(static_every=0)
 
 
 def test_far_from_training_a_static_avatar_has_its_share_of_the_picture(capture, tmp_path, monkeypatch):
     """Pictures are mixed by decoder_weight, not parameters; of training frames all is decoded."""
     settings = config(steps=60)
     model = replace(settings.model, standardise=True, novelty_scale=0.5)
-    avatar = AshAvatar(replace(settings, model=model), capture)
+    avatar = AshAvatar.from_capture(replace(settings, model=model), capture)
     avatar.fit(capture, folder=tmp_path)
     with torch.no_grad():
-        added = [avatar.decoder_residual(frame) for frame in range(4)]
+        added = [avatar.module.residual([avatar._inputs_of(frame)])[0] for frame in range(4)]
         static, camera = avatar.module.fallback_texels, next(iter(capture.cameras.values()))
         for frame in range(4):
             pose = Pose(capture.motion, frame)
             near = avatar.module.frame_inputs(pose)
             assert near.decoder_weight == 1
-            decoded = avatar.module.decode(near)
+            (decoded,) = avatar.module.decode([near])
             torch.testing.assert_close(decoded, avatar.module.base_texels + added[frame])
-            sets = [avatar.module.pose(raw, near) for raw in (decoded, static)]
-            alone = [avatar.module.draw(gaussians, [camera], None) for gaussians in sets]
+            sets = [avatar.module.gaussians(raw, near) for raw in (decoded, static)]
+            alone = [avatar.module.rasterize(gaussians, [camera], None) for gaussians in sets]
             assert not torch.equal(alone[0].rgb, alone[1].rgb)
             for decoder_weight, larger in ((1.0, 0), (0.75, 0), (0.25, 1)):
                 with monkeypatch.context() as patched:
@@ -206,22 +207,21 @@ def test_far_from_training_a_static_avatar_has_its_share_of_the_picture(capture,
     assert not torch.equal(added[0], added[2])
     assert not torch.equal(static, avatar.module.base_texels), "each has learned for itself since the warm-up"
     avatar.save(tmp_path / "weights.safetensors")
-    other = AshAvatar(replace(settings, model=model), capture)
+    other = AshAvatar.from_capture(replace(settings, model=model), capture)
     other.load(tmp_path / "weights.safetensors")
     assert torch.equal(other.module.fallback_texels, static)
 
 
 def test_the_average_of_the_weights_is_the_result_and_nothing_else_changes(capture, tmp_path):
-    last, averaged = AshAvatar(config(), capture), AshAvatar(config(ema=0.5), capture)
+    last, averaged = AshAvatar.from_capture(config(), capture), AshAvatar.from_capture(config(ema=0.5), capture)
     passed = []
-    draw = last.draw_training_views
+    losses = last.losses
 
-    def draw_and_keep(*arguments):
-        if arguments[-2] == len(passed):  # The curve's views are drawn besides.
-            passed.append(last.module.base_texels.detach().clone())
-        return draw(*arguments)
+    def note_weights(*arguments):
+        passed.append(last.module.base_texels.detach().clone())
+        return losses(*arguments)
 
-    last.draw_training_views = draw_and_keep
+    last.losses = note_weights
     last.fit(capture, folder=tmp_path / "last")
     averaged.fit(capture, folder=tmp_path / "averaged")
     expected = passed[0]
@@ -245,7 +245,7 @@ def test_reserved_views_are_never_trained_on(capture):
 def test_equal_seeds_give_equal_bits_and_other_seeds_do_not(capture, tmp_path):
     results = []
     for run, seed in enumerate((0, 0, 1)):
-        avatar = AshAvatar(replace(config(), seed=seed), capture)
+        avatar = AshAvatar.from_capture(replace(config(), seed=seed), capture)
         avatar.fit(capture, folder=tmp_path / str(run))
         results.append(weights(avatar)["base_texels"])
     assert torch.equal(results[0], results[1])
@@ -253,15 +253,15 @@ def test_equal_seeds_give_equal_bits_and_other_seeds_do_not(capture, tmp_path):
 
 
 def test_nan_rolls_back_once_and_then_ends_the_run(capture, tmp_path):
-    avatar = AshAvatar(config(), capture)
-    draw, spoiled = avatar.draw_training_views, []
+    avatar = AshAvatar.from_capture(config(), capture)
+    losses, spoiled = avatar.losses, []
 
-    def spoil(frame, cameras, background, step, decoded):
-        image = draw(frame, cameras, background, step, decoded)
+    def spoil(batches, step):
         spoiled.append(step == 6)
-        return image * float("nan") if step == 6 and sum(spoiled) <= times else image
+        factor = float("nan") if step == 6 and sum(spoiled) <= times else 1.0
+        return [factor * loss for loss in losses(batches, step)]
 
-    avatar.draw_training_views = spoil
+    avatar.losses = spoil
     times = 1
     avatar.fit(capture, folder=tmp_path / "once")
     assert all(torch.isfinite(value).all() for value in weights(avatar).values())
@@ -273,25 +273,25 @@ def test_nan_rolls_back_once_and_then_ends_the_run(capture, tmp_path):
 
 def poison(avatar: AshAvatar, *, at: set[int], times: int) -> None:
     """Spoil a weight before the given steps are decoded, `times` times in all."""
-    decode, left = avatar.decode_together, [times]
+    losses, left = avatar.losses, [times]
 
-    def decode_poisoned(frames, step):
+    def poisoned(batches, step):
         if step in at and left[0] > 0:
             left[0] -= 1
             with torch.no_grad():
                 avatar.module.base_texels[0, 3] = float("nan")
-        return decode(frames, step)
+        return losses(batches, step)
 
-    avatar.decode_together = decode_poisoned
+    avatar.losses = poisoned
 
 
 def test_a_weight_that_is_nan_rolls_back_once_and_then_ends_the_run_as_diverged(capture, tmp_path):
     """The splatter refuses such Gaussians as wrong input; the run must not end as that."""
-    avatar = AshAvatar(config(), capture)
+    avatar = AshAvatar.from_capture(config(), capture)
     poison(avatar, at={7}, times=1)
     avatar.fit(capture, folder=tmp_path / "once")
     assert all(torch.isfinite(value).all() for value in weights(avatar).values())
-    avatar = AshAvatar(config(), capture)
+    avatar = AshAvatar.from_capture(config(), capture)
     poison(avatar, at={7}, times=2)
     with pytest.raises(Diverged, match=r"Gaussians that cannot be drawn \(scales.*at step 7, again"):
         avatar.fit(capture, folder=tmp_path / "always")
@@ -299,7 +299,7 @@ def test_a_weight_that_is_nan_rolls_back_once_and_then_ends_the_run_as_diverged(
 
 @pytest.mark.parametrize("spoiled", [{12}, {12, 24}])
 def test_weights_that_the_last_step_spoiled_are_never_the_result(capture, tmp_path, monkeypatch, spoiled):
-    avatar, made, step = AshAvatar(config(), capture), [0], Adam.step
+    avatar, made, step = AshAvatar.from_capture(config(), capture), [0], Adam.step
 
     def spoil(optimiser, *arguments):
         finite = step(optimiser, *arguments)
@@ -320,7 +320,7 @@ def test_weights_that_the_last_step_spoiled_are_never_the_result(capture, tmp_pa
 
 
 def test_a_damaged_checkpoint_is_named(capture, tmp_path):
-    avatar = AshAvatar(config(), capture)
+    avatar = AshAvatar.from_capture(config(), capture)
     avatar.save(tmp_path / "weights.safetensors")
     content = (tmp_path / "weights.safetensors").read_bytes()
     (tmp_path / "weights.safetensors").write_bytes(content[: len(content) // 2])
@@ -330,7 +330,7 @@ def test_a_damaged_checkpoint_is_named(capture, tmp_path):
 
 def test_a_checkpoint_is_taken_up_whole_or_named(capture, tmp_path):
     path = tmp_path / "checkpoint.safetensors"
-    avatar = AshAvatar(config(), capture)
+    avatar = AshAvatar.from_capture(config(), capture)
     avatar.fit(capture, folder=tmp_path)
     whole = path.read_bytes()
     tensors, facts = read_safetensors(path)
@@ -348,19 +348,19 @@ def test_a_checkpoint_is_taken_up_whole_or_named(capture, tmp_path):
     for reason, (spoiled, told) in damaged.items():
         path.write_bytes(safetensors.torch.save(spoiled, metadata=told))
         with pytest.raises(InputError, match=rf"checkpoint\.safetensors: .*{reason}") as raised:
-            AshAvatar(config(), capture).fit(capture, folder=tmp_path)
+            AshAvatar.from_capture(config(), capture).fit(capture, folder=tmp_path)
         assert str(raised.value).isprintable()
     path.write_bytes(whole)
-    again = AshAvatar(config(), capture)
+    again = AshAvatar.from_capture(config(), capture)
     again.fit(capture, folder=tmp_path)
     assert all(torch.equal(a, b) for a, b in zip(weights(avatar).values(), weights(again).values(), strict=True))
 
 
 def test_saved_weights_render_the_same_image(capture, tmp_path):
-    avatar = AshAvatar(config(), capture)
+    avatar = AshAvatar.from_capture(config(), capture)
     avatar.fit(capture, folder=tmp_path)
     avatar.save(tmp_path / "weights.safetensors")
-    other = AshAvatar(config(), capture)
+    other = AshAvatar.from_capture(config(), capture)
     other.load(tmp_path / "weights.safetensors")
     camera = capture.cameras["cam0"]
     drawn = [a.render(Pose(capture.motion, 5), camera, clock=StageClock()) for a in (avatar, other)]
@@ -370,7 +370,7 @@ def test_saved_weights_render_the_same_image(capture, tmp_path):
 def test_a_crop_draws_what_the_full_image_shows_there(capture):
     images = load_training_images(capture.training_only())
     batch = make_batch(images, 1, ["cam1", "cam2"], torch.tensor([0.2, 0.4, 0.6]))
-    avatar = AshAvatar(config(), capture)
+    avatar = AshAvatar.from_capture(config(), capture)
     background = torch.tensor([0.2, 0.4, 0.6])
     cropped = training_views(avatar, 1, batch.cameras, background, 0)
     for view, (name, camera) in enumerate(zip(["cam1", "cam2"], batch.cameras, strict=True)):

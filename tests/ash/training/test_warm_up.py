@@ -10,11 +10,11 @@ import torch
 from helpers.captures import tiny_preset, write_tube_capture
 
 import ash.avatar
-from ash.avatar import FITTED_GAIN, FITTED_LOOK, AshAvatar
+from ash.avatar import FITTED_EVERY, FITTED_GAIN, FITTED_LOOK, AshAvatar
 from ash.capture.dataset import Capture
 from ash.training.batches import Batch, draw_batch
 from ash.training.images import load_training_images
-from ash.training.loop import view_loss
+from ash.training.losses import view_loss
 
 LOOK = 5  # in place of a hundred steps
 
@@ -27,15 +27,16 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 def avatar(capture: Capture, **training: Any) -> AshAvatar:
     config = tiny_preset(steps=2, warmup_steps=2)
     settings = {"warmup": "fitted", **training}
-    return AshAvatar(replace(config, training=replace(config.training, **settings)), capture)
+    return AshAvatar.from_capture(replace(config, training=replace(config.training, **settings)), capture)
 
 
-@pytest.mark.parametrize(("every", "fitted"), [(1, (0, 1, 2, 3)), (2, (0, 2)), (3, (0, 3)), (10, (0,))])
+@pytest.mark.parametrize(("every", "fitted"), [(1, (0, 1, 2, 3)), (2, (0, 2)), (3, (0, 3)), (FITTED_EVERY, (0,))])
 def test_every_so_manyth_frame_is_fitted_and_no_other(
     every: int, fitted: tuple[int, ...], capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To its own views, before the first step; decoders are then regressed to these frames, each to its own fit."""
-    made = avatar(capture, fitted_every=every, fitted_steps=2)
+    monkeypatch.setattr(ash.avatar, "FITTED_EVERY", every)
+    made = avatar(capture, fitted_steps=2)
     shown: list[int] = []
     taught: dict[int, torch.Tensor] = {}
 
@@ -106,9 +107,7 @@ def test_a_fit_is_like_its_frame_and_stays_on_the_template(capture: Capture) -> 
     batch = draw_batch(images, made.config.training, 0, 0)
 
     def loss(raw: torch.Tensor) -> float:
-        drawn = made.draw_training_views(
-            batch.frame, batch.cameras, batch.background, 0, (raw, made._inputs_of(batch.frame))
-        )
+        drawn = made._draw(raw, made._inputs_of(batch.frame), batch.cameras, batch.background, 0)
         return float(view_loss([drawn], [batch], made.config.training).detach())
 
     fitted = made._fit_frame(images, batch.frame)
@@ -116,16 +115,19 @@ def test_a_fit_is_like_its_frame_and_stays_on_the_template(capture: Capture) -> 
     assert loss(fitted) < 0.7 * loss(made.analytic)
 
 
-def test_decoders_are_regressed_to_the_fits_for_the_steps_of_the_warm_up(capture: Capture) -> None:
+def test_decoders_are_regressed_to_the_fits_for_the_steps_of_the_warm_up(
+    capture: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each frame's decoded Gaussians come near to its own fit; without steps they stay where they start."""
     far = {}
     for steps in (0, 40):
-        made = avatar(capture, fitted_every=2, steps=40, warmup_steps=steps)
+        monkeypatch.setattr(ash.avatar, "FITTED_EVERY", 2)
+        made = avatar(capture, steps=40, warmup_steps=steps)
         fits = {frame: made.analytic + 0.3 + 0.1 * frame for frame in (0, 2)}
         made._fit_frame = lambda images, frame, fits=fits: fits[frame]  # type: ignore[method-assign]
         made._warm_up(load_training_images(capture))
         with torch.no_grad():
-            apart = {frame: made.module.decode(made._inputs_of(frame)) - fit for frame, fit in fits.items()}
+            apart = {frame: made.module.decode([made._inputs_of(frame)])[0] - fit for frame, fit in fits.items()}
         far[steps] = {frame: float(difference.square().mean().sqrt()) for frame, difference in apart.items()}
     assert far[0] == pytest.approx({0: 0.3, 2: 0.5})
     assert all(far[40][frame] < 0.25 * far[0][frame] for frame in fits)

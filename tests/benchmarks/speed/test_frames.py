@@ -176,7 +176,7 @@ def test_an_agreement_has_the_least_weight_of_the_decoders(trained: Trained, mon
 
 def test_an_avatar_without_decoders_agrees_too(capture: Capture) -> None:
     config = named("ci")
-    avatar = AshAvatar(replace(config, model=replace(config.model, motion=False)), capture)
+    avatar = AshAvatar.from_capture(replace(config, model=replace(config.model, motion=False)), capture)
     for agreement in agreements(avatar, with_near_motion(capture)).values():
         assert agreement.least_decoder_weight == 1.0 and agreement.least_db > AGREES_DB
 
@@ -215,7 +215,7 @@ def test_the_parts_of_a_step_are_timed_and_make_up_the_whole(capture, tmp_path, 
 
 
 def test_a_part_that_takes_longer_is_seen(capture, tmp_path):
-    avatar = AshAvatar(named("ci"), capture)
+    avatar = AshAvatar.from_capture(named("ci"), capture)
     decode, images = avatar._decode, load_training_images(capture)
 
     def slow(*arguments):

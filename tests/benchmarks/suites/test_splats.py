@@ -47,7 +47,7 @@ def test_the_known_gaussians_lose_nothing_but_the_quantisation(capture):
 
 
 def test_the_truth_is_none_of_the_methods_gaussians(capture):
-    avatar = AshAvatar(named("ci"), capture.training_only())
+    avatar = AshAvatar.from_capture(named("ci"), capture.training_only())
     known = known_avatar(avatar.template, count=CI_COUNT, seed=0)
     assert len(known.base_texels) > 1.5 * len(avatar.module.base_texels)
     rest = torch.from_numpy(capture.template.vertices).float()
@@ -62,7 +62,9 @@ def test_the_truth_is_none_of_the_methods_gaussians(capture):
 
 
 def test_ash_recovers_them_by_training(capture, tmp_path):
-    avatar = AshAvatar(replace(named("ci"), model=replace(named("ci").model, motion=False, novelty_scale=0.0)), capture)
+    avatar = AshAvatar.from_capture(
+        replace(named("ci"), model=replace(named("ci").model, motion=False, novelty_scale=0.0)), capture
+    )
     seen = capture.training_only()
     camera, frame = capture.splits["novel_pose"].views[0]
     before = foreground_psnr(avatar, capture, [(camera, frame)])
