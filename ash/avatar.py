@@ -21,8 +21,8 @@ from ash.protocol import StageClock
 from ash.template.template import Template
 from ash.template_learning.refining import refined_template
 from ash.textures import FrameInputs, TexelLattice, build_lattice
+from ash.trained_avatar import TrainedAvatar
 from ash.training.adam import Adam
-from ash.training.avatar import TrainedAvatar
 from ash.training.batches import draw_batch, over
 from ash.training.images import TrainingImages
 from ash.training.losses import view_loss

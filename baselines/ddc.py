@@ -32,7 +32,7 @@ from ash.rotations import RigidTransforms
 from ash.template.template import PosedTemplate, Template
 from ash.template_learning.refining import MotionRefinement, Refinement
 from ash.textures import DecoderInputs, TextureDrawer, build_lattice
-from ash.training.avatar import TrainedAvatar
+from ash.trained_avatar import TrainedAvatar
 from ash.training.batches import over
 from ash.training.images import TrainingImages
 from baselines.display import MeshDisplay, texture_gain

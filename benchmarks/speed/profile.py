@@ -21,7 +21,7 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-import ash.training.avatar
+import ash.trained_avatar
 from ash import presets
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture
@@ -142,7 +142,7 @@ def _extra_work(learner: AshAvatar | DdcAvatar, step: int) -> str:
     """What a step does besides; empty: nothing."""
     if isinstance(learner, DdcAvatar) and step % learner.config.vertices_every == 0:
         return VERTICES
-    return STATIC if step % ash.training.avatar.FALLBACK_EVERY == 0 else ""
+    return STATIC if step % ash.trained_avatar.FALLBACK_EVERY == 0 else ""
 
 
 @contextmanager
@@ -155,7 +155,7 @@ def _timed_parts(parts: _Parts, learner: AshAvatar | DdcAvatar, trainer: Trainer
         (learner, "_decode", "decode"),
         *((learner.module, name, part) for name, part in parts_of.items()),
     ]
-    timed += [(ash.training.avatar, "view_loss", "loss"), (trainer.optimiser, "step", "adam")]
+    timed += [(ash.trained_avatar, "view_loss", "loss"), (trainer.optimiser, "step", "adam")]
     with ExitStack() as stack:
         for owner, name, part in timed:
             stack.enter_context(patch.object(owner, name, parts.timed(part, getattr(owner, name))))

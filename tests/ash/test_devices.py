@@ -11,7 +11,7 @@ import torch
 from helpers.captures import write_tube_capture
 from helpers.devices import META, as_if_averaged, learning_without_numbers, step_of, tiny, without_numbers
 
-import ash.training.avatar
+import ash.trained_avatar
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture, Pose
 from ash.config import AshConfig, TemplateConfig
@@ -128,8 +128,8 @@ def test_an_avatar_learns_its_template_on_its_own_device(
     def ask(*_: object, device: torch.device, **__: object) -> None:
         raise Asked(device)
 
-    monkeypatch.setattr(ash.training.avatar, "device_named", lambda name: META)
-    monkeypatch.setattr(ash.training.avatar, "template_of", ask)
+    monkeypatch.setattr(ash.trained_avatar, "device_named", lambda name: META)
+    monkeypatch.setattr(ash.trained_avatar, "template_of", ask)
     config = named("ci") if kind is AshAvatar else ddc.config("ci")
     with pytest.raises(Asked, match="meta"):
         kind.from_capture(config, tube)

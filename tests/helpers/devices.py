@@ -20,8 +20,8 @@ import ash.template_learning.image_tracking
 import ash.template_learning.learning
 import ash.template_learning.regressing
 import ash.textures
+import ash.trained_avatar
 import ash.training.adam
-import ash.training.avatar
 from ash.capture.dataset import Camera, Capture
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted
@@ -61,7 +61,7 @@ def step_of(avatar: Any, capture: Capture, device: torch.device) -> list[Tensor]
 
 def without_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Avatars are made for `meta`, and what needs numbers is replaced."""
-    monkeypatch.setattr(ash.training.avatar, "device_named", lambda name: META)
+    monkeypatch.setattr(ash.trained_avatar, "device_named", lambda name: META)
     monkeypatch.setattr(ash.template.graph.NeighbourMean, "__call__", as_if_averaged)
     monkeypatch.setattr(ash.model, "splat", _shapes_of_images)
     monkeypatch.setattr(ash.mesh.drawing, "_view_of", _some_samples)

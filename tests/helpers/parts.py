@@ -15,7 +15,7 @@ from helpers.fake_learner import STEPS, FakeLearner
 from torch import Tensor
 
 import ash.native.library
-import ash.training.avatar
+import ash.trained_avatar
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Camera, Capture, Pose
 from ash.gaussians.gaussians import Gaussians
@@ -85,7 +85,7 @@ class Subject:
         """The avatar's own `fit`, with somebody else in its place."""
         made = FakeLearner()
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(ash.training.avatar, "Trainer", made.trainer)
+            patch.setattr(ash.trained_avatar, "Trainer", made.trainer)
             patch.setattr(loop, "time", SimpleNamespace(process_time=made.clock, monotonic=made.clock))
             patch.setattr(loop, "draw_step", made.draw_step)
             patch.setattr(loop, "write_atomic", made.write)
@@ -313,7 +313,7 @@ def turns(s: Subject) -> str:
         patch.setattr(s.avatar, "_decode", lambda inputs: [s.static] * len(inputs))
         for name in ("_draw", "_draw_fallback"):
             patch.setattr(s.avatar, name, lambda *_: torch.zeros(0))
-        patch.setattr(ash.training.avatar, "view_loss", lambda *_: torch.zeros(()))
+        patch.setattr(ash.trained_avatar, "view_loss", lambda *_: torch.zeros(()))
         for step in range(STEPS):
             if fallback is not None:
                 fallback.data.fill_(7.0)

@@ -8,7 +8,7 @@ import torch
 from helpers.captures import tiny_preset, write_tube_capture
 from helpers.numerics import relative_error
 
-import ash.training.avatar
+import ash.trained_avatar
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture
 from ash.config import AshConfig, TemplateConfig
@@ -85,7 +85,7 @@ def test_the_gradient_of_a_step_is_the_mean_of_its_frames(
 ) -> None:
     if not natively:  # As on a GPU: the frames are one batch of the U-Nets.
         monkeypatch.setattr(UNet, "_can_use_native", lambda net, texture: False)
-    monkeypatch.setattr(ash.training.avatar, "FALLBACK_EVERY", 1)
+    monkeypatch.setattr(ash.trained_avatar, "FALLBACK_EVERY", 1)
     avatar = LEARNERS[learner](capture)
     for net in avatar.module.modules():
         if isinstance(net, UNet):

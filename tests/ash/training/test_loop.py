@@ -12,7 +12,7 @@ import torch
 from helpers.captures import tube_model_config, write_tube_capture
 from helpers.learning import training_views
 
-import ash.training.avatar
+import ash.trained_avatar
 from ash import presets
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Pose
@@ -158,7 +158,7 @@ def test_without_decoders_there_is_nothing_to_carry(capture, tmp_path):
 
 
 def test_the_static_avatar_learns_in_every_so_many_steps_after_the_warm_up(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(ash.training.avatar, "FALLBACK_EVERY", 3)
+    monkeypatch.setattr(ash.trained_avatar, "FALLBACK_EVERY", 3)
     settings = config(steps=12, warmup_steps=4)
     avatar = AshAvatar.from_capture(
         replace(settings, model=replace(settings.model, standardise=True, novelty_scale=0.5)), capture
