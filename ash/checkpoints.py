@@ -14,6 +14,7 @@ OLD_NAMES = {  # in checkpoints of version 0.2
     "static": "fallback_texels",
     "texture": "base_texture",
     "static_texture": "fallback_texture",
+    "textures.seen": "textures.training_poses",
 }
 
 

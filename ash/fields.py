@@ -22,10 +22,12 @@ WRITTEN: dict[Any, str] = {int: "a whole number", float: "a number", bool: "true
 
 def flat(config: Any) -> dict[str, Any]:
     """Every field of a dataclass, and of those within it, by its dotted key."""
-    found: dict[str, Any] = {}
+    values_by_key: dict[str, Any] = {}
     for name, value in _parts(config):
-        found |= {f"{name}.{key}": inner for key, inner in flat(value).items()} if _has_parts(value) else {name: value}
-    return found
+        values_by_key |= (
+            {f"{name}.{key}": inner for key, inner in flat(value).items()} if _has_parts(value) else {name: value}
+        )
+    return values_by_key
 
 
 def changed(before: Any, after: Any) -> Changes:

@@ -79,10 +79,10 @@ def write_atomic(path: Path, content: bytes) -> None:
 
 def source_files(*roots: Path, without: tuple[Path, ...] = ()) -> list[Path]:
     """Every file of source below the roots, but for those below `without`. A root may be a file."""
-    found = {path for root in roots for path in (root.rglob("*") if root.is_dir() else (root,))}
+    paths = {path for root in roots for path in (root.rglob("*") if root.is_dir() else (root,))}
     return sorted(
         path
-        for path in found
+        for path in paths
         if path.suffix in SOURCE_SUFFIXES and not any(path.is_relative_to(folder) for folder in without)
     )
 
@@ -143,12 +143,12 @@ def open_regular(path: Path, *, most: int) -> BinaryIO:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', error)})") from error
-    found = os.fstat(descriptor)
-    if stat.S_ISREG(found.st_mode) and found.st_size <= most:
+    status = os.fstat(descriptor)
+    if stat.S_ISREG(status.st_mode) and status.st_size <= most:
         return os.fdopen(descriptor, "rb")
     os.close(descriptor)
-    if stat.S_ISREG(found.st_mode):
-        raise InputError(f"{path}: {found.st_size} bytes, expected at most {most}")
+    if stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path}: {status.st_size} bytes, expected at most {most}")
     raise InputError(f"{path}: expected a regular file")
 
 

@@ -96,7 +96,7 @@ class FrameInputs(DecoderInputs):
     transforms: RigidTransforms  # texel-wise T of Eq. 5
 
 
-Seen = TypeVar("Seen", bound=DecoderInputs)
+Inputs = TypeVar("Inputs", bound=DecoderInputs)
 
 
 @torch.no_grad()
@@ -147,12 +147,12 @@ def add_texture_noise(
     return textures + sigma * smooth_noise(textures.shape, (seed, 3, step)).to(textures.device)
 
 
-def add_texture_noise_to_frames(frames: Sequence[Seen], sigma: float, *, seed: int, step: int) -> list[Seen]:
+def add_texture_noise_to_frames(frames: Sequence[Inputs], sigma: float, *, seed: int, step: int) -> list[Inputs]:
     """`add_texture_noise` for the frames of a step, each with the noise that it would have in a step of its own."""
     own_steps = range(step * len(frames), (step + 1) * len(frames))
     return [
-        replace(seen, textures=add_texture_noise(seen.textures, sigma, seed=seed, step=own))
-        for seen, own in zip(frames, own_steps, strict=True)
+        replace(frame, textures=add_texture_noise(frame.textures, sigma, seed=seed, step=own))
+        for frame, own in zip(frames, own_steps, strict=True)
     ]
 
 
@@ -187,12 +187,12 @@ class TextureDrawer(MovingModule):
         self.bound, self.novelty_scale = bound, novelty_scale
         self.mean: Tensor
         self.spread: Tensor
-        self.seen: Tensor  # [t, d]: the newest frame's textures of training frames, coarse
+        self.training_poses: Tensor  # [t, d]: the newest frame's textures of training frames, coarse
         if standardise:
             self.register_buffer("mean", torch.zeros(6 * window, lattice.resolution, lattice.resolution))
             self.register_buffer("spread", torch.ones(6 * window, 1, 1))
         if novelty_scale:
-            self.register_buffer("seen", torch.zeros(0, 6 * (lattice.resolution // POOL) ** 2))
+            self.register_buffer("training_poses", torch.zeros(0, 6 * (lattice.resolution // POOL) ** 2))
 
     def fit_normalization(self, template: Template, motion: Motion, frames: tuple[int, ...]) -> None:
         """Take mean and spread from the frames of a training motion."""
@@ -200,7 +200,7 @@ class TextureDrawer(MovingModule):
             self.mean, self.spread = texture_statistics(self._draw(template, Pose(motion, frame)) for frame in frames)
         if self.novelty_scale:
             some = frames[:: -(-len(frames) // COMPARED_FRAMES)]
-            self.seen = torch.stack([self._coarse(self(template, Pose(motion, frame))) for frame in some])
+            self.training_poses = torch.stack([self._coarse(self(template, Pose(motion, frame))) for frame in some])
 
     def forward(self, template: Template, pose: Pose) -> Float[Tensor, "c r r"]:
         """The textures of a frame, `c = 6 window` channels."""
@@ -213,7 +213,7 @@ class TextureDrawer(MovingModule):
     def novelty(self, textures: Float[Tensor, "c r r"]) -> float:
         """How far a frame lies from the nearest training frame: root mean square over the body, in spreads."""
         covered = self.lattice.texels.numel() / self.lattice.resolution**2
-        nearest = (self.seen - self._coarse(textures)).square().mean(1).min()
+        nearest = (self.training_poses - self._coarse(textures)).square().mean(1).min()
         return float((nearest / covered).sqrt())
 
     def decoder_weight(self, textures: Float[Tensor, "c r r"]) -> float:

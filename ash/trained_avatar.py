@@ -168,7 +168,7 @@ class TrainedAvatar(ABC):
         """How training ended; None before it did."""
         if self._outcome is None or self.template.learned is None:
             return self._outcome
-        return replace(self._outcome, template=self.template.learned.found)
+        return replace(self._outcome, template=self.template.learned.summary)
 
     def template_seconds(self) -> float | None:
         """What learning the template took, once for all methods that stand on it; None where it was not learned."""

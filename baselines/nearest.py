@@ -20,7 +20,7 @@ from ash.rotations import root_yaw, rotvec_to_unitquat
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Sighting:
+class RootView:
     """How a camera sees the root joint."""
 
     pixel: Float[np.ndarray, " 2"]
@@ -48,13 +48,13 @@ class NearestImage:
             wanted = see_root(skeleton, pose, camera)
             distances = pose_distances(pose.dofs, self.capture.motion.dofs[list(self.train.frames)])
             near = self.train.frames[int(distances.argmin())]
-            seen = {
+            views = {
                 name: see_root(skeleton, Pose(self.capture.motion, near), self.capture.cameras[name])
                 for name in self.train.seeing(near)
             }
-            name = max(seen, key=lambda candidate: float(seen[candidate].direction @ wanted.direction))
+            name = max(views, key=lambda candidate: float(views[candidate].direction @ wanted.direction))
         with clock.stage("stg4"):
-            return move_image(self.capture.image(name, near), seen[name], wanted, camera)
+            return move_image(self.capture.image(name, near), views[name], wanted, camera)
 
     def parameter_count(self) -> int:
         """Nothing is learned."""
@@ -87,29 +87,29 @@ def central_frame(motion: Motion, frames: tuple[int, ...]) -> int:
     return frames[int(np.argmin([pose_distances(pose, poses).sum() for pose in poses]))]
 
 
-def see_root(skeleton: Skeleton, pose: Pose, camera: Camera) -> Sighting:
+def see_root(skeleton: Skeleton, pose: Pose, camera: Camera) -> RootView:
     """Where and how large a camera sees the root, and from which side."""
     root = skeleton.heads[0] + pose.dofs[:3]
     pixel, depth = camera.project(root)
     yaw = float(root_yaw(torch.from_numpy(pose.dofs)))
     unturn = np.array([[np.cos(yaw), 0, -np.sin(yaw)], [0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)]])
     towards = unturn @ (camera.position - root)
-    return Sighting(
+    return RootView(
         pixel=pixel,
         pixels_per_metre=float(camera.K[0, 0] / depth),
         direction=towards / np.linalg.norm(towards),
     )
 
 
-def move_image(image: np.ndarray, seen: Sighting, wanted: Sighting, camera: Camera) -> Float[np.ndarray, "h w 4"]:
+def move_image(image: np.ndarray, view: RootView, wanted: RootView, camera: Camera) -> Float[np.ndarray, "h w 4"]:
     """Resample a straight uint8 RGBA image for another camera; premultiplied float32, empty beyond its border."""
     straight = torch.from_numpy(image).float() / 255
     premultiplied = torch.cat([straight[..., :3] * straight[..., 3:], straight[..., 3:]], -1)
     y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-    scale = seen.pixels_per_metre / wanted.pixels_per_metre
+    scale = view.pixels_per_metre / wanted.pixels_per_metre
     source = [
         (grid - float(to)) * scale + float(start)
-        for grid, to, start in zip((x, y), wanted.pixel, seen.pixel, strict=True)
+        for grid, to, start in zip((x, y), wanted.pixel, view.pixel, strict=True)
     ]
     size = image.shape[1], image.shape[0]
     grid = torch.stack([2 * place / side - 1 for place, side in zip(source, size, strict=True)], -1)[None]

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ash.capture.dataset import Camera, image_path, pixels_path, plate_path, scan_path, surface_path
+from ash.capture.dataset import Camera, background_path, image_path, pixels_path, scan_path, surface_path
 from ash.capture.formats import read_cameras
 from ash.files import read_arrays, read_image, write_arrays, write_image
 from synth.camera.render import Picture, Renderer, Studio, shoot_plates
@@ -50,10 +50,10 @@ def render_views(scene: Scene, folder: Path, renderer: Renderer, views: list[Wan
 def render_plates(scene: Scene, folder: Path, renderer: Renderer) -> None:
     """Write the empty studio as every camera sees it."""
     cameras = list(read_cameras(folder / "cameras.json").values())
-    if all(plate_path(folder, camera.name).is_file() for camera in cameras):
+    if all(background_path(folder, camera.name).is_file() for camera in cameras):
         return
     for camera, plate in zip(cameras, shoot_plates(renderer, cameras, seed=stream(scene, "plates")), strict=True):
-        write_image(plate_path(folder, camera.name), plate)
+        write_image(background_path(folder, camera.name), plate)
 
 
 def _scan(scene: Scene, folder: Path, studio: Studio, cameras: dict[str, Camera], pose: np.ndarray, frame: int) -> None:

@@ -158,10 +158,10 @@ class Capture:
         """SHA-256 over the manifest: two captures with equal identity hold equal bytes."""
         return sha256_of(self.folder / NAME)
 
-    def plate(self, camera: str) -> np.ndarray | None:
+    def background(self, camera: str) -> np.ndarray | None:
         """The camera's picture of the empty studio, sRGB uint8 `[h, w, 3]`; None where the capture has none."""
-        path, known = plate_path(self.folder, camera), self.cameras[camera]
-        return read_image(path, shape=(known.height, known.width, 3)) if path.is_file() else None
+        path, by = background_path(self.folder, camera), self.cameras[camera]
+        return read_image(path, shape=(by.height, by.width, 3)) if path.is_file() else None
 
     def image(self, camera: str, frame: int) -> np.ndarray:
         """RGBA of a view, uint8 `[h, w, 4]`, sRGB, straight alpha."""
@@ -243,7 +243,7 @@ def image_path(folder: Path, camera: str, frame: int) -> Path:
     return folder / "frames" / camera / f"{frame:06d}.png"
 
 
-def plate_path(folder: Path, camera: str) -> Path:
+def background_path(folder: Path, camera: str) -> Path:
     """Where the picture of the empty studio lies that a camera took."""
     return folder / "plates" / f"{camera}.png"
 

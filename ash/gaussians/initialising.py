@@ -94,7 +94,7 @@ def initial_texture(capture: Capture, template: Template, lattice: TexelLattice)
 def mean_colours(capture: Capture, template: Template, lattice: TexelLattice) -> Float[Tensor, "n 3"]:
     """Mean training pixel of every texel, over a few frames and all training cameras that saw them.
 
-    Views count by how squarely they see the texel. Unseen texels take the mean colour of the seen.
+    Views count by how squarely they see the texel. Texels that no camera sees take the mean colour of the others.
     """
     train = capture.splits["train"]
     frames = train.frames
@@ -109,9 +109,9 @@ def mean_colours(capture: Capture, template: Template, lattice: TexelLattice) ->
             camera = capture.cameras[name]
             image = torch.from_numpy(capture.image(name, frame)).float() / 255
             pixels, facing = visible_pixels(camera, posed, template, positions, normals)
-            seen = facing[:, None] * image[pixels[:, 1], pixels[:, 0], 3:]
-            total += seen * image[pixels[:, 1], pixels[:, 0], :3]
-            weight += seen
+            weights = facing[:, None] * image[pixels[:, 1], pixels[:, 0], 3:]
+            total += weights * image[pixels[:, 1], pixels[:, 0], :3]
+            weight += weights
     fallback = total.sum(0) / weight.sum().clamp(min=1e-6)
     return torch.where(weight > 0.05, total / weight.clamp(min=1e-6), fallback)
 

@@ -55,7 +55,7 @@ class MeshView:
     corners: Float[Tensor, "v 3"]  # homogeneous samples
     drawn: Rasterized
     covered: Int[Tensor, " n"]  # samples that see a triangle, row-major
-    seen: Int[Tensor, " n"]  # theirs
+    triangles: Int[Tensor, " n"]  # theirs
 
 
 def draw_mesh(
@@ -105,9 +105,9 @@ def draw_seen(
     """The second half of `draw_mesh_views`: the same views may be drawn in several colours."""
     weights = torch.cat([_weights_in(view, topology) for view in views])
     # All at once: a texture's gradient is as large as the texture, however many samples it has.
-    colours = shade(torch.cat([view.seen for view in views]), weights)
+    colours = shade(torch.cat([view.triangles for view in views]), weights)
     images = []
-    for view, own in zip(views, colours.split([len(view.seen) for view in views]), strict=True):
+    for view, own in zip(views, colours.split([len(view.triangles) for view in views]), strict=True):
         image = _resolved(own, view.covered, background, view.camera)
         if outlines:
             samples = torch.cat([torch.cat([own, torch.ones_like(own[:, :1])], 1), _nothing(background)])
@@ -124,14 +124,14 @@ def _view_of(vertices: Float[Tensor, "v 3"], topology: Topology, camera: Camera)
     drawn = rasterize_mesh(corners, topology.faces, width=width, height=height)
     triangle = drawn.triangle.reshape(-1)
     covered = (triangle >= 0).nonzero().squeeze(1)
-    return MeshView(camera=camera, corners=corners, drawn=drawn, covered=covered, seen=triangle[covered].long())
+    return MeshView(camera=camera, corners=corners, drawn=drawn, covered=covered, triangles=triangle[covered].long())
 
 
 def _weights_in(view: MeshView, topology: Topology) -> Float[Tensor, "n 3"]:
     """Weights of the corners of the triangles seen: anew where they have a gradient, else the rasteriser's."""
     if view.corners.requires_grad:
         width = view.camera.width * SUPERSAMPLING
-        return _weights_of(view.corners, topology.faces, view.seen, view.covered, width)
+        return _weights_of(view.corners, topology.faces, view.triangles, view.covered, width)
     return view.drawn.barycentric.reshape(-1, 3)[view.covered].to(view.corners)
 
 
@@ -179,14 +179,14 @@ def blend(
 def _weights_of(
     corners: Float[Tensor, "v 3"],
     faces: Int[Tensor, "f 3"],
-    seen: Int[Tensor, " n"],
+    triangles: Int[Tensor, " n"],
     covered: Int[Tensor, " n"],
     width: int,
 ) -> Float[Tensor, "n 3"]:
     """`corner_weights` of the triangles seen at the covered samples."""
     if _native(corners):
-        return ash.native.shading.corner_weights(corners, faces, seen, covered, width)
-    a, b, c = (corners.index_select(0, rows) for rows in faces[seen].unbind(1))
+        return ash.native.shading.corner_weights(corners, faces, triangles, covered, width)
+    a, b, c = (corners.index_select(0, rows) for rows in faces[triangles].unbind(1))
     return corner_weights(a, b, c, covered % width, covered // width)
 
 
@@ -224,9 +224,13 @@ def _outlines(samples: Float[Tensor, "s d"], view: MeshView, topology: Topology)
     columns, pixels = width // SUPERSAMPLING, height * width // SUPERSAMPLING**2
     gained = samples.new_zeros(pixels, samples.shape[1])
     for axis in (0, 1):  # Neighbours in a row, then in a column.
-        found = _crossings(screen, corners[:, 2].detach(), ends, third, axis, (width, height))
-        kept = _visible(found, triangle, depth)
-        inner, outer, share = found.inner[kept], found.outer[kept], found.reach[kept][:, None] - 0.5
+        crossings = _crossings(screen, corners[:, 2].detach(), ends, third, axis, (width, height))
+        nearest = _visible(crossings, triangle, depth)
+        inner, outer, share = (
+            crossings.inner[nearest],
+            crossings.outer[nearest],
+            crossings.reach[nearest][:, None] - 0.5,
+        )
         # The surface reaches beyond the middle: the sample outside takes some of its colour; or it falls short of it.
         takes = torch.where(share[:, 0] > 0, outer, inner)
         pixel = takes // width // SUPERSAMPLING * columns + takes % width // SUPERSAMPLING
@@ -278,18 +282,18 @@ def _crossings(
     return _Crossings(inner=inner[fits], outer=outer[fits], reach=reach[fits], depth=edge_depth[fits])
 
 
-def _visible(found: _Crossings, triangle: Int[Tensor, " s"], depth: Float[Tensor, " s"]) -> Int[Tensor, " n"]:
+def _visible(crossings: _Crossings, triangle: Int[Tensor, " s"], depth: Float[Tensor, " s"]) -> Int[Tensor, " n"]:
     """Crossings that are seen, the nearest one where several lie between the same two samples."""
-    far = torch.where(triangle >= 0, depth, torch.inf).to(found.depth)
-    own = (far[found.inner] - found.depth).abs() < OWN_SURFACE_M
-    seen = own & (far[found.outer] > found.depth) & (triangle[found.inner] != triangle[found.outer])
-    kept = seen.nonzero().squeeze(1)
-    kept = kept[found.depth[kept].argsort(stable=True)]
-    pair = found.inner[kept] * len(triangle) + found.outer[kept]
+    far = torch.where(triangle >= 0, depth, torch.inf).to(crossings.depth)
+    own = (far[crossings.inner] - crossings.depth).abs() < OWN_SURFACE_M
+    visible = own & (far[crossings.outer] > crossings.depth) & (triangle[crossings.inner] != triangle[crossings.outer])
+    rows = visible.nonzero().squeeze(1)
+    rows = rows[crossings.depth[rows].argsort(stable=True)]
+    pair = crossings.inner[rows] * len(triangle) + crossings.outer[rows]
     order = pair.argsort(stable=True)
     first = torch.ones(len(pair), dtype=torch.bool, device=pair.device)
     first[1:] = pair[order][1:] != pair[order][:-1]
-    return kept[order[first]]
+    return rows[order[first]]
 
 
 def outline_edges(screen: Float[Tensor, "v 2"], topology: Topology) -> Bool[Tensor, "f 3"]:

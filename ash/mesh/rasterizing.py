@@ -113,10 +113,10 @@ def rasterize_mesh_naive(
             keeps_its_pixels = bool(edge[0] > 0 or (edge[0] == 0 and edge[1] > 0))
             inside &= (distance > 0) | ((distance == 0) & keeps_its_pixels)
         depth = volume.abs() / distances.sum(-1)
-        seen = inside & (depth >= near) & (depth < nearest)
-        nearest[seen] = depth[seen]
-        triangle[seen] = number
-        barycentric[seen] = distances[seen] / distances[seen].sum(-1, keepdim=True)
+        nearer = inside & (depth >= near) & (depth < nearest)
+        nearest[nearer] = depth[nearer]
+        triangle[nearer] = number
+        barycentric[nearer] = distances[nearer] / distances[nearer].sum(-1, keepdim=True)
     depth = torch.where(triangle >= 0, nearest, 0.0)
     return Rasterized(triangle=triangle, barycentric=barycentric.float(), depth=depth.float())
 

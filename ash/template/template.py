@@ -145,13 +145,13 @@ class Learned:
     """How a template was learned."""
 
     seconds: float  # what it took, whenever that was
-    found: str  # what it settled on, in words
+    summary: str  # what it was learned from, and the choices made
 
 
 class Template:
     """Poses the template mesh. The last few frames are kept: in playback, they are the next frame's history."""
 
-    KEPT_FRAMES = 4
+    CACHED_FRAMES = 4
 
     def __init__(
         self,
@@ -172,23 +172,23 @@ class Template:
             self.links = SkinWeights(joints=through.links, weights=through.weights)
         self.deformation = deformation
         self.learned: Learned | None = None
-        self._kept: OrderedDict[tuple[bytes, bytes], PosedTemplate] = OrderedDict()
+        self._cache: OrderedDict[tuple[bytes, bytes], PosedTemplate] = OrderedDict()
 
     def pose(self, pose: Pose) -> PosedTemplate:
         """The template in one frame of a motion."""
         require_pose(pose, self.skeleton)
         window = pose.window(MAX_WINDOW)
         key = (pose.motion.dofs[window].tobytes(), np.int64(pose.frame).tobytes())
-        if key not in self._kept:
+        if key not in self._cache:
             with torch.no_grad():
-                self._kept[key] = self.pose_uncached(pose)
-            if len(self._kept) > self.KEPT_FRAMES:
-                self._kept.popitem(last=False)
-        return self._kept[key]
+                self._cache[key] = self.pose_uncached(pose)
+            if len(self._cache) > self.CACHED_FRAMES:
+                self._cache.popitem(last=False)
+        return self._cache[key]
 
     def clear_cache(self) -> None:
         """Keep nothing of what was posed: the deformation has changed."""
-        self._kept.clear()
+        self._cache.clear()
 
     @property
     def device(self) -> torch.device:
@@ -205,7 +205,7 @@ class Template:
     def deformed_by(self, deformation: Deformation) -> "Template":
         """The same mesh and skinning with another deformation."""
         other = copy.copy(self)
-        other.deformation, other._kept = deformation, OrderedDict()
+        other.deformation, other._cache = deformation, OrderedDict()
         return other
 
     def pose_uncached(self, pose: Pose) -> PosedTemplate:

@@ -124,11 +124,11 @@ class GraphDeformation(MovingModule):
         for past in pose.window(self.config.window):
             joints = forward_kinematics(self.skeleton, torch.from_numpy(pose.motion.dofs[past]))
             turn = unturn.expand(len(joints.quats), 4)
-            seen = RigidTransforms(
+            relative = RigidTransforms(
                 quats=quat_multiply(turn, joints.quats).float(),
                 translations=rotate(turn, joints.translations - origin).float(),
             )
-            window.append(dual_quaternion_skinning(moved(seen, self.rest.device), self.skin))
+            window.append(dual_quaternion_skinning(moved(relative, self.rest.device), self.skin))
         return window
 
     @torch.no_grad()

@@ -89,14 +89,14 @@ class Painted:
 class _Paint:
     """Gathers the colours and the light of the next pass from what this one sees."""
 
-    def __init__(self, known: Painted) -> None:
-        self.known = known
-        self.total, self.weight = torch.zeros_like(known.colours), torch.zeros_like(known.colours)
-        self.normal, self.right = known.light.new_zeros(3, 9, 9), known.light.new_zeros(3, 9)
+    def __init__(self, painted: Painted) -> None:
+        self.painted = painted
+        self.total, self.weight = torch.zeros_like(painted.colours), torch.zeros_like(painted.colours)
+        self.normal, self.right = painted.light.new_zeros(3, 9, 9), painted.light.new_zeros(3, 9)
 
-    def see(self, points: Int[Tensor, " k"], weight: Tensor, shade: Tensor, seen: Tensor) -> None:
-        """`shade`: what light makes of white there; `seen`: its colour, `[k, 3]` both. No point twice."""
-        self.total[points] += weight[:, None] * shade * seen
+    def see(self, points: Int[Tensor, " k"], weight: Tensor, shade: Tensor, colour: Tensor) -> None:
+        """`shade`: what light makes of white there; `colour`: what the image has, `[k, 3]` both. No point twice."""
+        self.total[points] += weight[:, None] * shade * colour
         self.weight[points] += weight[:, None] * shade**2
 
     def correct_light(self, basis: Tensor, weight: Tensor, drawn: Tensor, error: Tensor) -> None:
@@ -115,7 +115,7 @@ class _Paint:
         damping = torch.where(damping > 0, damping, 1)
         eye = torch.eye(9, dtype=damping.dtype, device=damping.device)
         step = torch.linalg.solve(self.normal + damping[:, None, None] * eye, self.right)
-        return Painted(colours=colours, light=self.known.light + LIGHT_STEP * step.T)
+        return Painted(colours=colours, light=self.painted.light + LIGHT_STEP * step.T)
 
 
 class _Pull:
@@ -188,12 +188,12 @@ class _Subject:
     ) -> None:
         """One step of Gauss and Newton for a frame; what it sees goes into `paint`."""
         shown = self._show(index, transforms)
-        pull, seen = (_Pull(count, self.rest.device) for count in (len(self.rest), len(self.lattice.texels)))
+        pull, texel_pull = (_Pull(count, self.rest.device) for count in (len(self.rest), len(self.lattice.texels)))
         for view in views:
             drawn = _draw(shown.vertices, self.topology.faces, view)
-            _pull_by_colours(seen, shown, view, drawn, self.paint, paint)
+            _pull_by_colours(texel_pull, shown, view, drawn, self.paint, paint)
             _pull_by_outline(pull, shown, view, drawn, self.topology, reach)
-        pull.add(self.lattice.corners, self.lattice.barycentric.double(), seen.sums)
+        pull.add(self.lattice.corners, self.lattice.barycentric.double(), texel_pull.sums)
         rotations = unitquat_to_rotmat(transforms.quats).double()
         self.nodes[index] = self.solver.solve(self.nodes[index], pull.in_canonical(rotations))
 
@@ -262,7 +262,7 @@ def _pull_by_colours(
     shown: _Shown,
     view: ObservedView,
     drawn: _Drawn,
-    known: Painted,
+    reference: Painted,
     paint: _Paint,
 ) -> None:
     """Points that are seen want to go where the image has their colour."""
@@ -277,11 +277,11 @@ def _pull_by_colours(
     whole = (values[:, 9] > 0.99).nonzero().squeeze(1)
     chosen, values = chosen[whole], values[whole]
     paint.see(chosen, facing[chosen], shown.shade[chosen], values[:, :3])
-    painted = known.colours[chosen, 0].isfinite().nonzero().squeeze(1)
+    painted = reference.colours[chosen, 0].isfinite().nonzero().squeeze(1)
     chosen, values = chosen[painted], values[painted]
     if len(chosen) == 0:
         return
-    colours = known.colours[chosen] * shown.shade[chosen]
+    colours = reference.colours[chosen] * shown.shade[chosen]
     error = colours - values[:, :3]
     surprise = (error**2).mean(1).sqrt() / (OUTLIER * COLOUR_ERROR)
     weight = facing[chosen] / (1 + surprise**2) ** 2 / COLOUR_ERROR**2
@@ -308,10 +308,10 @@ def _pull_by_outline(
     points = _between(screen, ends, share)
     distance, nearest = NearestPoint(points).of(view.outline, reach)
     aligned = (outward[nearest] * view.outward).sum(1) > ALIGNED
-    found = (distance.isfinite() & aligned).nonzero().squeeze(1)
-    nearest, normal = nearest[found], view.outward[found]
+    matched = (distance.isfinite() & aligned).nonzero().squeeze(1)
+    nearest, normal = nearest[matched], view.outward[matched]
     ends, share = ends[nearest], share[nearest]
-    off = ((view.outline[found] - points[nearest]) * normal).sum(1)
+    off = ((view.outline[matched] - points[nearest]) * normal).sum(1)
     weight = OUTLINE_WEIGHT / (1 + (off / OUTLINE_OUTLIER) ** 2)
     places = _between(shown.vertices.double(), ends, share)
     slope = (normal[:, None] @ _slopes(view, places))[:, 0]

@@ -62,9 +62,9 @@ def learned_template(config: TemplateConfig, capture: Capture, *, seed: int, dev
                 write_atomic(path, safetensors.torch.save(_state(deformation), metadata=facts))
             tensors, facts = read_safetensors(path)
             load_module(deformation, tensors, path)
-            if not facts.keys() >= {"seconds", "found"}:
+            if not facts.keys() >= {"seconds", "summary"}:
                 raise InputError(f"{path}: expected a learned template with its facts; remove it")
-    template.learned = Learned(seconds=float(facts["seconds"]), found=facts["found"])
+    template.learned = Learned(seconds=float(facts["seconds"]), summary=facts["summary"])
     return template
 
 
@@ -98,12 +98,12 @@ def _learn(
     tracked = _track(config, capture, at_rest, deformation.graph)
     if isinstance(deformation, LinearDeformation):
         choice = fit_linear(deformation, capture.motion, tracked)
-        found = f"static displacement {'kept' if choice.static else 'refused'}, ridge {choice.ridge:g}"
+        choices = f"static displacement {'kept' if choice.static else 'refused'}, ridge {choice.ridge:g}"
     else:
         step = fit_graph(deformation, capture.motion, tracked, steps=config.steps, seed=seed)
-        found = f"step {step} of {config.steps}"
+        choices = f"step {step} of {config.steps}"
     deformation.to(CPU)
-    return {"seconds": repr(time.perf_counter() - start), "found": f"learned from {config.supervision}: {found}"}
+    return {"seconds": repr(time.perf_counter() - start), "summary": f"learned from {config.supervision}: {choices}"}
 
 
 def _track(config: TemplateConfig, capture: Capture, at_rest: Template, graph: EmbeddedGraph) -> Tracked:

@@ -26,8 +26,8 @@ class NearestPoint:
         """Distance and row of the point nearest to each place; infinite, and any row, where none lies `within`."""
         if self.tree is None:
             return nearest_naive(self.points, places, within)
-        found = self.tree.query(places.numpy(), distance_upper_bound=within)
-        distance, row = cast("tuple[np.ndarray, np.ndarray]", found)
+        neighbours = self.tree.query(places.numpy(), distance_upper_bound=within)
+        distance, row = cast("tuple[np.ndarray, np.ndarray]", neighbours)
         # Without a point in range the tree tells a number beyond the last.
         return torch.from_numpy(distance), torch.from_numpy(np.minimum(row, len(self.points) - 1))
 

@@ -40,7 +40,7 @@ def observe(cutout: ImageCrop, camera: Camera, *, blur: float) -> ObservedView:
     device, box = cutout.pixels.device, cutout.box
     x0, y0 = max(0, box[0] - MARGIN), max(0, box[1] - MARGIN)
     x1, y1 = min(camera.width, box[2] + MARGIN), min(camera.height, box[3] + MARGIN)
-    seen = crop_camera(camera, x0, y0, x1 - x0, y1 - y0)
+    cropped = crop_camera(camera, x0, y0, x1 - x0, y1 - y0)
     window = (cutout.window(x0, y0, x1 - x0, y1 - y0).float() / 255).permute(2, 0, 1).contiguous()
     alpha = window[3]
     premultiplied = torch.cat([window[:3] * alpha, window[3:]])
@@ -49,10 +49,10 @@ def observe(cutout: ImageCrop, camera: Camera, *, blur: float) -> ObservedView:
     counts = _least_around(alpha, 1 + int(np.ceil(blur))) > OPAQUE
     outline, outward = _outline(alpha)
     return ObservedView(
-        width=seen.width,
-        height=seen.height,
-        viewmat=torch.from_numpy(seen.viewmat).to(device),
-        K=torch.from_numpy(seen.K).to(device),
+        width=cropped.width,
+        height=cropped.height,
+        viewmat=torch.from_numpy(cropped.viewmat).to(device),
+        K=torch.from_numpy(cropped.K).to(device),
         colours=torch.cat([colours, _slope(colours, 2), _slope(colours, 1), counts[None]])
         .permute(1, 2, 0)
         .contiguous(),
@@ -101,14 +101,14 @@ def _slope(image: Float[Tensor, "c h w"], axis: int) -> Float[Tensor, "c h w"]:
 def _outline(alpha: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "o 2"], Float[Tensor, "o 2"]]:
     """Where alpha passes one half between two neighbouring pixels, and the way out of the subject there."""
     over = alpha.double() - 0.5
-    found = []
+    crossings = []
     for axis in (0, 1):
         a, b = over.narrow(axis, 0, over.shape[axis] - 1), over.narrow(axis, 1, over.shape[axis] - 1)
         row, column = (a * b < 0).nonzero(as_tuple=True)
         a, b = a[row, column], b[row, column]
         share = a / (a - b)
-        found.append(torch.stack([column + 0.5 + share * axis, row + 0.5 + share * (1 - axis)], 1))
-    points = torch.cat(found)
+        crossings.append(torch.stack([column + 0.5 + share * axis, row + 0.5 + share * (1 - axis)], 1))
+    points = torch.cat(crossings)
     soft = blurred(alpha[None], OUTLINE_BLUR)
     inward = sample(torch.cat([_slope(soft, 2), _slope(soft, 1)]).permute(1, 2, 0).contiguous(), points).double()
     return points, -inward / inward.norm(dim=1, keepdim=True).clamp(min=1e-6)

@@ -66,8 +66,8 @@ def _node_translations(graph: EmbeddedGraph, shift: Float[Tensor, "t v 3"]) -> F
     blend = scipy.sparse.csr_matrix(entries, shape=(count, len(graph.nodes)))
     normal = (blend.T @ blend + BLEND_RIDGE * scipy.sparse.eye(len(graph.nodes))).tocsc()
     solve = scipy.sparse.linalg.splu(normal).solve
-    found = np.stack([solve(blend.T @ frame) for frame in shift.double().cpu().numpy()])
-    return torch.from_numpy(found).to(shift.device)
+    solved = np.stack([solve(blend.T @ frame) for frame in shift.double().cpu().numpy()])
+    return torch.from_numpy(solved).to(shift.device)
 
 
 def _ridge(
@@ -96,10 +96,10 @@ def _choose(
     reach = deformation.reach.double()
     errors = np.zeros((len(folds), len(RIDGES) + 2))
     for index, fold in enumerate(folds):
-        seen = ~fold
-        static = true[seen].mean(0)
+        others = ~fold
+        static = true[others].mean(0)
         for column, ridge in enumerate(RIDGES):
-            mean, maps = _ridge(dofs[seen], targets[seen], reach, ridge)
+            mean, maps = _ridge(dofs[others], targets[others], reach, ridge)
             moved = torch.einsum("tf,gfo->tgo", dofs[fold] - mean, maps)
             errors[index, column] = _mean_square(true[fold] - static - moved)
         errors[index, -2] = _mean_square(true[fold] - static)
@@ -132,23 +132,23 @@ def fit_graph(deformation: GraphDeformation, motion: Motion, tracked: Tracked, *
     held = folds[seed % len(folds)] if folds else torch.zeros(len(tracked.frames), dtype=torch.bool, device=CPU)
     windows = [deformation.window_transforms(Pose(motion, frame)) for frame in tracked.frames]
     start = {name: value.clone() for name, value in deformation.state_dict().items()}
-    best, kept = float("inf"), 0
+    best, best_step = float("inf"), 0
     if held.any():
         for step in _train(deformation, windows, tracked, ~held, steps=steps, seed=seed):
             error = _held_out_error(deformation, windows, tracked, held.nonzero().squeeze(1).tolist())
             if error < best:
-                best, kept = error, step
+                best, best_step = error, step
         deformation.load_state_dict(start)
-    for _ in _train(deformation, windows, tracked, torch.ones_like(held), steps=kept, seed=seed):
+    for _ in _train(deformation, windows, tracked, torch.ones_like(held), steps=best_step, seed=seed):
         pass
-    return kept
+    return best_step
 
 
 def _train(
-    deformation: GraphDeformation, windows: list[Window], tracked: Tracked, seen: Tensor, *, steps: int, seed: int
+    deformation: GraphDeformation, windows: list[Window], tracked: Tracked, used: Tensor, *, steps: int, seed: int
 ) -> Iterator[int]:
-    """Learn from the frames that are `seen` `[t]`; stops at step 0, at every twentieth, and at the last."""
-    indices = seen.nonzero().squeeze(1).tolist()
+    """Learn from the frames that are `used` `[t]`; stops at step 0, at every twentieth, and at the last."""
+    indices = used.nonzero().squeeze(1).tolist()
     with torch.no_grad():
         deformation.static.copy_(tracked.canonical[indices].mean(0) - deformation.rest)
     optimiser = torch.optim.AdamW(deformation.networks(), lr=2e-3, weight_decay=0.1)

@@ -75,8 +75,8 @@ def _register(capture: Capture, template: Template, correction: Correction) -> T
     canonical = rest.expand(len(frames), -1, -1).clone()
     some = range(0, len(frames), -(-len(frames) // SHARED_FRAMES))
     for sweeps in SHARED_SWEEPS:
-        found = [_in_canonical(transforms[frames[i]], canonical[i], frames[i], correction) for i in some]
-        shift, weight = (torch.stack(parts) for parts in zip(*found, strict=True))
+        corrections = [_in_canonical(transforms[frames[i]], canonical[i], frames[i], correction) for i in some]
+        shift, weight = (torch.stack(parts) for parts in zip(*corrections, strict=True))
         total = weight.sum(0)
         mean = (shift * weight[..., None]).sum(0) / total.clamp(min=1)[:, None]
         canonical += smoothed(mean, total / len(some), neighbours, sweeps)
@@ -84,7 +84,7 @@ def _register(capture: Capture, template: Template, correction: Correction) -> T
         for index, frame in enumerate(frames):
             shift, weight = _in_canonical(transforms[frame], canonical[index], frame, correction)
             canonical[index] += smoothed(shift, weight, neighbours, sweeps)
-            canonical[index] = rest + (canonical[index] - rest) * _told(weight, neighbours)
+            canonical[index] = rest + (canonical[index] - rest) * _confidence(weight, neighbours)
     return Tracked(frames=frames, canonical=canonical)
 
 
@@ -106,8 +106,8 @@ def smoothed(
     return mean
 
 
-def _told(weight: Float[Tensor, " v"], neighbours: NeighbourMean) -> Float[Tensor, "v 1"]:
-    """1 where most vertices around were told where to go, down to 0 in the middle of a hole: nobody knows there."""
+def _confidence(weight: Float[Tensor, " v"], neighbours: NeighbourMean) -> Float[Tensor, "v 1"]:
+    """1 where most neighbours have a match, falling to 0 in the middle of a hole of the scan."""
     share = weight[:, None]
     for _ in range(OWN_SWEEPS[0]):
         share = 0.5 * (share + neighbours(share))
@@ -136,8 +136,8 @@ class _Mesh:
         for _ in range(TRIM_SWEEPS):
             around = 0.5 * (around + neighbours(around))
         surprise = (off - around[vertices]).abs().squeeze(1)
-        kept = (surprise <= TRIM * surprise.square().mean().sqrt()).nonzero().squeeze(1)
-        return _mean_of_matches((off * normal)[kept], vertices[kept], len(posed))
+        matched = (surprise <= TRIM * surprise.square().mean().sqrt()).nonzero().squeeze(1)
+        return _mean_of_matches((off * normal)[matched], vertices[matched], len(posed))
 
     def _matches(self, posed: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
         """Pairs of a vertex and a point that belong together."""
@@ -151,8 +151,8 @@ class _Mesh:
         few = self.few[(back[self.few] < RANGE_M).nonzero().squeeze(1)]
         vertices, points = torch.cat([own, vertex[few]]), torch.cat([forward[own], few])
         aligned = (self.normals[points] * normals[vertices]).sum(1) > ALIGNED
-        kept = (aligned & self.believed[points]).nonzero().squeeze(1)
-        return vertices[kept], points[kept]
+        matched = (aligned & self.believed[points]).nonzero().squeeze(1)
+        return vertices[matched], points[matched]
 
     def _apart(self, places: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
         """How far points lie from places along their normals, and how far beside them; metres."""

@@ -88,15 +88,15 @@ def in_studio(batch: Batch, images: TrainingImages) -> Batch:
     Raises:
         InputError: nobody took a picture of the empty studio.
     """
-    if not images.plates:
+    if not images.backgrounds:
         raise InputError("background='studio': expected plates/ in the capture, pictures of the empty studio")
     behind = torch.empty_like(batch.targets)
     for view, (camera, mask) in enumerate(zip(batch.cameras, batch.foreground, strict=True)):
         whole = images.cameras[camera.name]
         left, top = np.round(whole.K[:2, 2] - camera.K[:2, 2]).astype(int)
-        plate = images.plates[camera.name][top : top + camera.height, left : left + camera.width]
-        seen = torch.from_numpy(np.ascontiguousarray(plate)).to(images.device).float() / 255
-        behind[view] = torch.where(mask[..., None] > 0, seen, batch.background)
+        empty = images.backgrounds[camera.name][top : top + camera.height, left : left + camera.width]
+        pixels = torch.from_numpy(np.ascontiguousarray(empty)).to(images.device).float() / 255
+        behind[view] = torch.where(mask[..., None] > 0, pixels, batch.background)
     share = 1 - batch.foreground[..., None]
     return replace(batch, targets=batch.targets + share * (behind - batch.background), background=behind)
 

@@ -53,8 +53,8 @@ class ImageCrop:
         x0, y0, x1, y1 = self.box
         x0, y0, x1, y1 = max(left, x0), max(top, y0), min(left + width, x1), min(top + height, y1)
         if x0 < x1 and y0 < y1:
-            seen = self.pixels[y0 - self.top : y1 - self.top, x0 - self.left : x1 - self.left]
-            whole[y0 - top : y1 - top, x0 - left : x1 - left] = seen
+            visible = self.pixels[y0 - self.top : y1 - self.top, x0 - self.left : x1 - self.left]
+            whole[y0 - top : y1 - top, x0 - left : x1 - left] = visible
         return whole
 
 
@@ -76,7 +76,9 @@ class TrainingImages:
     reserved: tuple[View, ...] = ()  # views that no batch holds
     whole: bool = False  # batches show whole images, not the subject alone
     device: torch.device = CPU  # where cutouts lie and batches are made
-    plates: dict[str, UInt8[np.ndarray, "h w 3"]] = field(default_factory=dict)  # the empty studio, where it is known
+    backgrounds: dict[str, UInt8[np.ndarray, "h w 3"]] = field(
+        default_factory=dict
+    )  # the empty studio, where it is known
 
     @property
     def frames(self) -> tuple[int, ...]:
@@ -121,7 +123,7 @@ def load_training_images(
         cameras={name: capture.cameras[name] for name in train.cameras},
         split=train,
         reserved=reserved_views(train),
-        plates={name: plate for name in train.cameras if (plate := capture.plate(name)) is not None},
+        backgrounds={name: empty for name in train.cameras if (empty := capture.background(name)) is not None},
         device=device,
     )
 

@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ash.capture.dataset import Capture, image_path, plate_path, scan_path
+from ash.capture.dataset import Capture, background_path, image_path, scan_path
 from ash.capture.formats import load_capture, write_cameras, write_motion
 from ash.capture.manifest import Manifest, files_below
 from ash.files import sha256_of
@@ -52,8 +52,8 @@ def training_copy(capture: Capture, folder: Path) -> Capture:
     for camera, frame in seen.splits["train"].views:
         copy(image_path(capture.folder, camera, frame), image_path(folder, camera, frame))
     for camera in seen.cameras:
-        if plate_path(capture.folder, camera).exists():
-            copy(plate_path(capture.folder, camera), plate_path(folder, camera))
+        if background_path(capture.folder, camera).exists():
+            copy(background_path(capture.folder, camera), background_path(folder, camera))
     for frame in seen.splits["train"].frames:
         if scan_path(capture.folder, frame).exists():
             copy(scan_path(capture.folder, frame), scan_path(folder, frame))

@@ -20,7 +20,7 @@ class Finding:
     """One thing that was looked for. `good` is False where a run would fail, not where it would merely be slower."""
 
     what: str
-    found: str
+    value: str
     consequence: str
     good: bool = True
 
@@ -33,18 +33,18 @@ def examine(folder: Path) -> list[Finding]:
 
 def _renderer() -> Finding:
     if find_spec("mitsuba") is None:
-        return Finding(what="Mitsuba", found="not installed", consequence="no ground truth can be rendered", good=False)
+        return Finding(what="Mitsuba", value="not installed", consequence="no ground truth can be rendered", good=False)
     from synth.camera.render import probe
 
     try:
         renderer = probe()
     except InputError as error:
-        return Finding(what="Mitsuba", found=str(error), consequence="no ground truth can be rendered", good=False)
+        return Finding(what="Mitsuba", value=str(error), consequence="no ground truth can be rendered", good=False)
     slow = renderer.variant.startswith("scalar")
     consequence = (
         "rendering takes about 3x as long; LLVM 19 (apt: libllvm19) helps" if slow else "renders at full speed"
     )
-    return Finding(what="Mitsuba", found=renderer.note, consequence=consequence)
+    return Finding(what="Mitsuba", value=renderer.note, consequence=consequence)
 
 
 def _compiler() -> Finding:
@@ -53,8 +53,8 @@ def _compiler() -> Finding:
             version = subprocess.run([path, "--version"], capture_output=True, text=True, check=False).stdout.split(
                 "\n"
             )[0]
-            return Finding(what="compiler", found=version or path, consequence="native kernels can be built")
-    return Finding(what="compiler", found="none", consequence="native kernels cannot be rebuilt here (apt: g++)")
+            return Finding(what="compiler", value=version or path, consequence="native kernels can be built")
+    return Finding(what="compiler", value="none", consequence="native kernels cannot be rebuilt here (apt: g++)")
 
 
 def _kernels() -> Finding:
@@ -64,11 +64,11 @@ def _kernels() -> Finding:
         instructions = instruction_set()
     except (RuntimeError, OSError) as error:
         return Finding(
-            what="native kernels", found=f"not built ({error})", consequence="install again with a compiler", good=False
+            what="native kernels", value=f"not built ({error})", consequence="install again with a compiler", good=False
         )
     return Finding(
         what="native kernels",
-        found=instructions,
+        value=instructions,
         consequence="splatting, loss and rasterising run natively",
     )
 
@@ -78,7 +78,7 @@ def _gpu() -> Finding:
     if name is None:
         return Finding(
             what="GPU",
-            found="none",
+            value="none",
             consequence="everything runs on the processor; absolute ms are not comparable with the paper's",
         )
     from ash.devices import cuda_error, describe_gpu
@@ -86,10 +86,10 @@ def _gpu() -> Finding:
     if why := cuda_error():
         return Finding(
             what="GPU",
-            found=f"{name}, but {why}",
+            value=f"{name}, but {why}",
             consequence="everything runs on the processor (--device cuda is refused)",
         )
-    return Finding(what="GPU", found=f"{name}, {describe_gpu()}", consequence="--device cuda learns and draws there")
+    return Finding(what="GPU", value=f"{name}, {describe_gpu()}", consequence="--device cuda learns and draws there")
 
 
 def _lpips() -> Finding:
@@ -98,10 +98,10 @@ def _lpips() -> Finding:
     try:
         path = weights_file()
     except InputError as error:
-        return Finding(what="LPIPS weights", found=str(error), consequence="LPIPS cannot be computed", good=False)
+        return Finding(what="LPIPS weights", value=str(error), consequence="LPIPS cannot be computed", good=False)
     if path is not None:
-        return Finding(what="LPIPS weights", found=str(path), consequence="LPIPS is computed")
-    return Finding(what="LPIPS weights", found="none", consequence="LPIPS is n/a; FLIP is the perceptual metric")
+        return Finding(what="LPIPS weights", value=str(path), consequence="LPIPS is computed")
+    return Finding(what="LPIPS weights", value="none", consequence="LPIPS is n/a; FLIP is the perceptual metric")
 
 
 def _isolation() -> Finding:
@@ -109,15 +109,15 @@ def _isolation() -> Finding:
 
     if problem := sandbox.problem():
         consequence = "a method is only watched: its process could reach truth, and its row says so"
-        return Finding(what="isolation", found=problem, consequence=consequence)
-    return Finding(what="isolation", found="namespaces", consequence="a method's process sees training data alone")
+        return Finding(what="isolation", value=problem, consequence=consequence)
+    return Finding(what="isolation", value="namespaces", consequence="a method's process sees training data alone")
 
 
 def _threads() -> Finding:
     cores = provenance.cores()
     return Finding(
         what="cores",
-        found=f"{cores} ({provenance.processor_name()})",
+        value=f"{cores} ({provenance.processor_name()})",
         consequence=f"{cores} cells run side by side, one thread each",
     )
 
@@ -127,14 +127,14 @@ def _memory() -> Finding:
     total, free = memory.total / 2**30, memory.available / 2**30
     enough = free > 1.5 * provenance.cores()
     consequence = "enough for all cores" if enough else "use --workers to run fewer cells side by side"
-    return Finding(what="memory", found=f"{total:.0f} GB, {free:.0f} GB free", consequence=consequence)
+    return Finding(what="memory", value=f"{total:.0f} GB, {free:.0f} GB free", consequence=consequence)
 
 
 def _disk(folder: Path) -> Finding:
     free = shutil.disk_usage(folder).free / 2**30
     enough = free > QUICK_RUN_GB
     consequence = "enough for the quick suite" if enough else f"the quick suite needs about {QUICK_RUN_GB:.0f} GB"
-    return Finding(what="disk", found=f"{free:.1f} GB free in {folder.resolve()}", consequence=consequence, good=enough)
+    return Finding(what="disk", value=f"{free:.1f} GB free in {folder.resolve()}", consequence=consequence, good=enough)
 
 
 def table(findings: list[Finding]) -> str:
@@ -145,6 +145,6 @@ def table(findings: list[Finding]) -> str:
     ]
     for finding in findings:
         mark = " " if finding.good else "!"
-        lines.append(f"{mark} {finding.what:<{width}}  {finding.found}")
+        lines.append(f"{mark} {finding.what:<{width}}  {finding.value}")
         lines.append(f"  {'':<{width}}  -> {finding.consequence}")
     return "\n".join(lines)

@@ -39,8 +39,8 @@ class GateCommand:
 
         baseline = None if self.update_baseline else rules.read_baseline(self.baseline)
         if self.head is not None:
-            found = require_complete(read_run(self.head))
-            head = rules.summarise(found.suite, results_of(found))
+            run = require_complete(read_run(self.head))
+            head = rules.summarise(run.suite, results_of(run))
             checks = rules.judge(baseline, head) if baseline else []
         else:
             suite = self._suite(baseline).narrowed(seeds=self.seeds)

@@ -189,8 +189,8 @@ class ReportCommand:
             code = _report(run)
         else:  # The report says so; the run that --publish leaves is as it was.
             commands = dict.fromkeys(filter(None, (run.command, typed())))
-            told = replace(run, command="; ".join(commands))
-            code = _report(told, require_for_choosing(read_run(self.chosen_on)))
+            both = replace(run, command="; ".join(commands))
+            code = _report(both, require_for_choosing(read_run(self.chosen_on)))
         if self.publish is not None:
             from benchmarks.report.page import publish
 
@@ -351,10 +351,10 @@ def _report(run: "RunOnDisk", chosen_on: "RunOnDisk | None" = None) -> int:
 def _again(folder: Path, function: Callable[[Any], Any]) -> int:
     from benchmarks.suites.runs import read_run, results_of
 
-    found = read_run(folder)
-    results_of(found)
+    run = read_run(folder)
+    results_of(run)
     worst = DONE
-    for cell in found.cells:
+    for cell in run.cells:
         if (cell.folder / "result.json").exists():
             worst = max(worst, _tell(cell.folder, function(cell)))
     return worst

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter1d
 
-from ash.capture.dataset import Camera, Capture, Motion, image_path, pixels_path, plate_path, spread_cameras
+from ash.capture.dataset import Camera, Capture, Motion, background_path, image_path, pixels_path, spread_cameras
 from ash.capture.formats import load_capture, write_cameras, write_motion
 from ash.files import InputError, hash_of, link_or_copy, read_arrays, read_image, sha256_of, write_image
 from synth.posing import rotvec_to_rotmat
@@ -155,7 +155,7 @@ def _spoil(capture: Capture, camera: str, frame: int, perturbation: Perturbation
 
 
 def _plate(capture: Capture, name: str) -> np.ndarray:
-    path, camera = plate_path(capture.folder, name), capture.cameras[name]
+    path, camera = background_path(capture.folder, name), capture.cameras[name]
     if not path.is_file():
         raise InputError(f"{path}: masks that are too large show the studio, expected a picture of it")
     return read_image(path, shape=(camera.height, camera.width, 3)).astype(np.float64) / 255

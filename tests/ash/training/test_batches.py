@@ -30,7 +30,7 @@ def test_where_a_mask_is_too_large_the_studio_explains_what_it_shows(capture):
     training = replace(presets.ci().training, background="studio", views_per_step=1)
     with pytest.raises(InputError, match="pictures of the empty studio"):
         draw_batch(images, training, 0, 0)
-    images = replace(images, plates=dict.fromkeys(images.cameras, plate))
+    images = replace(images, backgrounds=dict.fromkeys(images.cameras, plate))
     plain = draw_batch(images, replace(training, background="random"), 0, 0)
     batch = draw_batch(images, training, 0, 0)
     mask, camera = plain.foreground, plain.cameras[0]

@@ -61,11 +61,11 @@ def test_rows_that_have_a_device_are_moved_and_others_stay() -> None:
 
 def test_doctor_says_why_a_gpu_cannot_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
     if gpu_name() is None:
-        assert doctor._gpu().found == "none"
+        assert doctor._gpu().value == "none"
     monkeypatch.setattr(doctor.provenance, "gpu_name", lambda: "a GPU")
     monkeypatch.setattr(ash.devices, "cuda_error", lambda name="cuda": "torch is built without CUDA")
     finding = doctor._gpu()
-    assert finding.found == "a GPU, but torch is built without CUDA" and "processor" in finding.consequence
+    assert finding.value == "a GPU, but torch is built without CUDA" and "processor" in finding.consequence
 
 
 def learned_on_cuda(method: str) -> CellConfig:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ash.capture.dataset import Capture, farthest_points, pixels_path, plate_path
+from ash.capture.dataset import Capture, background_path, farthest_points, pixels_path
 from ash.capture.formats import load_capture, read_cameras, write_cameras
 from ash.capture.manifest import verify_capture
 from ash.files import InputError, read_image, write_arrays
@@ -115,7 +115,7 @@ def test_a_mask_that_is_too_large_shows_the_studio(capture: Capture, tmp_path: P
     spoilt = load_capture(perturb(capture.folder, tmp_path / "grown", Perturbation(mask_px=3)))
     camera, frame = capture.splits["train"].views[0]
     before, after = capture.image(camera, frame), spoilt.image(camera, frame)
-    plate = read_image(plate_path(capture.folder, camera), shape=before[..., :3].shape)
+    plate = read_image(background_path(capture.folder, camera), shape=before[..., :3].shape)
     ring = (before[..., 3] == 0) & (after[..., 3] == 255)
     assert ring.sum() > 50
     np.testing.assert_array_equal(after[ring, :3], plate[ring])
@@ -130,7 +130,7 @@ def test_a_mask_that_is_too_large_shows_the_studio(capture: Capture, tmp_path: P
 
 def test_the_studio_is_textured_and_every_camera_sees_another_part_of_it(capture: Capture):
     plates = [
-        read_image(plate_path(capture.folder, name), shape=(camera.height, camera.width, 3)).astype(float)
+        read_image(background_path(capture.folder, name), shape=(camera.height, camera.width, 3)).astype(float)
         for name, camera in capture.cameras.items()
     ]
     assert all(plate.std() > 10 and 20 < plate.mean() < 200 for plate in plates)
