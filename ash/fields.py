@@ -5,8 +5,8 @@ A scene, a preset and a user's configuration are varied in one way: a mapping of
 """
 
 import math
-from collections.abc import Mapping
-from dataclasses import fields, is_dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
 from typing import Any, TypeVar, get_type_hints
 
@@ -20,14 +20,29 @@ INFINITE = ("inf", "-inf")  # JSON has no number for them.
 WRITTEN: dict[Any, str] = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
 
 
-def flat(config: Any) -> dict[str, Any]:
-    """Every field of a dataclass, and of those within it, by its dotted key."""
-    values_by_key: dict[str, Any] = {}
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Leaf:
+    """A field that holds no fields itself."""
+
+    key: str  # dotted
+    value: Any
+    kind: Any  # its annotation
+    owner: type  # the dataclass that has it
+    name: str  # there
+
+
+def leaves(config: Any, prefix: str = "") -> Iterator[Leaf]:
+    """Every field of a dataclass, and of those within it."""
     for name, value in _parts(config):
-        values_by_key |= (
-            {f"{name}.{key}": inner for key, inner in flat(value).items()} if _has_parts(value) else {name: value}
-        )
-    return values_by_key
+        if _has_parts(value):
+            yield from leaves(value, f"{prefix}{name}.")
+        else:
+            yield Leaf(key=prefix + name, value=value, kind=_hint(config, name), owner=type(config), name=name)
+
+
+def flat(config: Any) -> dict[str, Any]:
+    """The values of all leaves by their keys."""
+    return {leaf.key: leaf.value for leaf in leaves(config)}
 
 
 def changed(before: Any, after: Any) -> Changes:

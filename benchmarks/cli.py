@@ -31,7 +31,7 @@ from ash.fields import suggest
 from ash.files import InputError, disk_problem
 from benchmarks.aliases import OLD_COMMANDS
 from benchmarks.cell.children import METHOD_PATH, add_method_paths
-from benchmarks.commands.arguments import DONE, INTERRUPTED, WRONG_INPUT, Command, completion, own_name, read_command
+from benchmarks.commands.arguments import DONE, INTERRUPTED, WRONG_INPUT, Command, own_name, read_command
 
 METHOD_PATH_FLAG = "--method-path"
 
@@ -135,8 +135,6 @@ def _parse(tokens: Sequence[str]) -> Command | None:
     if first == "--version":
         print(f"ash-bench {version('ash-bench')}")
         return None
-    if first.startswith("--tyro-"):
-        completion({name: _command(name) for name in COMMANDS}, tokens)
     if first not in COMMANDS:
         raise InputError(f"unknown command {first!r}, {suggest(first, tuple(COMMANDS))}")
     return read_command(_command(first), first, tokens[1:])

@@ -1,80 +1,91 @@
-"""How a command line becomes a command: frozen dataclasses whose fields are arguments, read by tyro.
+"""How a command line becomes a command: frozen dataclasses whose fields are arguments, read by argparse.
 
-A command is a frozen dataclass that is called to do its work and returns an exit code. A command about a scene's or a
-method's configuration has the method `settings`, which returns that: then each of its fields is a flag as well.
+A command is a frozen dataclass that is called to do its work and returns an exit code. The comment beside a field is
+its help. A command about a scene's or a method's configuration has the method `settings`, which returns that, and a
+field `changes`: then each field of the configuration is a flag as well (`--model.texels 128`).
 """
 
+import argparse
+import inspect
 import re
 import shlex
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import field, fields, is_dataclass, make_dataclass
+import types
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
-import tyro
-from tyro import _docstrings, _errors
-from tyro.conf import (
-    DisallowNone,
-    FlagConversionOff,
-    FlagCreatePairsOff,
-    Positional,
-    PositionalMetavarFromFieldName,
-    arg,
-)
-from tyro.constructors import PrimitiveConstructorSpec
-
-from ash.fields import Changes, changed, flat, suggest
+from ash.fields import Leaf, apply_overrides, changed, leaves, suggest
 from ash.files import InputError
 from benchmarks.aliases import OLD_FIELDS, OLD_SIZES
 
 Command = Callable[[], int]  # Does its work, and returns the exit code.
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
-SHELLS = ("bash", "zsh", "fish", "tcsh")
-MARKERS = (PositionalMetavarFromFieldName, DisallowNone)
-POSITIONAL = Positional[str].__metadata__[0]  # type: ignore[attr-defined]
-SETTINGS = "settings_"  # The field of a command that holds a configuration.
+HELP = ("-h", "--help")
+T = TypeVar("T")
 
 _typed: list[str] = []
 
 
-def _whole(least: int, most: int | None = None) -> PrimitiveConstructorSpec[Any]:
-    def read(texts: list[str]) -> int:
-        if not re.fullmatch(r"[+-]?\d+", texts[0]):
-            raise ValueError(f"expected a whole number, got {texts[0]!r}")
-        if int(texts[0]) < least:
-            raise ValueError(f"expected at least {least}, got {texts[0]}")
-        if most is not None and int(texts[0]) > most:
-            raise ValueError(f"expected at most {most}, got {texts[0]}")
-        return int(texts[0])
+@dataclass(frozen=True, slots=True)
+class Argument:
+    """How a field is read and shown, where its type does not say it; a part of `Annotated`."""
 
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="N",
-        instance_from_str=read,
-        is_instance=lambda value: value is None or isinstance(value, int),
-        str_from_instance=lambda value: [str(value)],
-    )
+    metavar: str = ""
+    name: str = ""  # of the flag, where it is not the field's
+    read: Callable[[str], Any] | None = None
+    positional: bool = False
+    repeated: bool = False  # each time that the flag is given adds a value
 
 
-def _names() -> PrimitiveConstructorSpec[tuple[str, ...]]:
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="A,B",
-        instance_from_str=lambda texts: tuple(name.strip() for name in texts[0].split(",") if name.strip()),
-        is_instance=lambda value: isinstance(value, tuple),
-        str_from_instance=lambda value: [",".join(value)],
-    )
+def whole(least: int, most: int | None = None) -> Argument:
+    """A whole number in a range."""
+
+    def read(text: str) -> int:
+        number = _whole_number(text)
+        if number < least:
+            raise ValueError(f"expected at least {least}, got {text}")
+        if most is not None and number > most:
+            raise ValueError(f"expected at most {most}, got {text}")
+        return number
+
+    return Argument(metavar="N", read=read)
 
 
-Natural = Annotated[int, _whole(0)]
-Seed = Annotated[int, _whole(0, 2**31 - 1)]
-Count = Annotated[int, _whole(1)]
-CountIfAny = Annotated[int | None, _whole(1)]
-Names = Annotated[tuple[str, ...], _names()]  # Separated by commas.
-Trust = FlagCreatePairsOff[bool]  # Whether code of others is loaded into this process.
-Folder = Annotated[Path, arg(metavar="DIR")]
-File = Annotated[Path, arg(metavar="FILE")]
+def _whole_number(text: str) -> int:
+    if not re.fullmatch(r"[+-]?\d+", text):
+        raise ValueError(f"expected a whole number, got {text!r}")
+    return int(text)
+
+
+def _real_number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"expected a number, got {text!r}") from None
+
+
+def _truth(text: str) -> bool:
+    if text.lower() not in ("true", "false"):
+        raise ValueError(f"expected True or False, got {text!r}")
+    return text.lower() == "true"
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+READ: dict[Any, Callable[[str], Any]] = {int: _whole_number, float: _real_number, bool: _truth, str: str, Path: Path}
+Positional = Annotated[T, Argument(positional=True)]
+Repeated = Annotated[T, Argument(repeated=True)]
+Natural = Annotated[int, whole(0)]
+Seed = Annotated[int, whole(0, 2**31 - 1)]
+Count = Annotated[int, whole(1)]
+CountIfAny = Annotated[int | None, whole(1)]
+Names = Annotated[tuple[str, ...], Argument(metavar="A,B", read=_names)]
+Folder = Annotated[Path, Argument(metavar="DIR")]
+File = Annotated[Path, Argument(metavar="FILE")]
 
 
 def own_name() -> str:
@@ -88,6 +99,58 @@ def typed() -> str:
     return shlex.join([own_name(), *_typed])
 
 
+@dataclass(frozen=True, slots=True)
+class _Flag:
+    """An argument as argparse is to have it."""
+
+    key: str  # of its value: dotted, of a field of the configuration
+    kind: Any  # its type; of several values, that of one
+    about: str
+    default: Any
+    argument: Argument
+    several: bool = False  # all values that follow the flag
+    switch: bool = False  # given or not; takes no value
+
+    @property
+    def name(self) -> str:
+        """As it is typed."""
+        name = self.argument.name or self.key
+        return name.upper() if self.argument.positional else f"--{name.replace('_', '-')}"
+
+    def add_to(self, parser: argparse.ArgumentParser) -> None:
+        """Give it to the parser."""
+        options: dict[str, Any] = {"help": self.help().replace("%", "%%"), "default": argparse.SUPPRESS}
+        if self.switch:
+            parser.add_argument(self.name, dest=self.key, action="store_true", **options)
+            return
+        options |= {"type": self.read, "metavar": self.argument.metavar or _metavar(self.kind)}
+        if self.argument.positional:
+            many = "*" if self.several else "?"
+            parser.add_argument(self.key, **options | {"default": None, "metavar": self.name, "nargs": many})
+            return
+        if self.argument.repeated:
+            options["action"] = "append"
+        elif self.several:
+            options["nargs"] = "*"
+        parser.add_argument(self.name, dest=self.key, **options)
+
+    def read(self, text: str) -> Any:
+        """A value from what was typed."""
+        try:
+            if get_origin(self.kind) is Literal and text not in get_args(self.kind):
+                raise ValueError(f"expected one of {', '.join(get_args(self.kind))}, got {text!r}")
+            return (self.argument.read or READ.get(self.kind, str))(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(" ".join(str(error).split())) from error
+
+    def help(self) -> str:
+        """What the comment says, and the default."""
+        if self.default is MISSING:
+            return f"{self.about} (required)".strip()
+        plain = self.default in (None, (), "") or self.switch
+        return self.about if plain else f"{self.about} (default: {self.default})".strip()
+
+
 def read_command(command: type[Any], name: str, tokens: Sequence[str]) -> Command:
     """The command with the arguments of a command line. Asked for help, it prints that and ends the process.
 
@@ -95,143 +158,187 @@ def read_command(command: type[Any], name: str, tokens: Sequence[str]) -> Comman
         InputError: an argument is missing, unknown or wrong; one line, with the nearest names.
     """
     _typed[:] = [name, *tokens]
-    wanted, config = command, None
-    if hasattr(command, "settings"):
-        known = _as_far_as_known(command, name, tokens)
-        config = None if known is None else known.settings()
-        wanted = command if config is None else _with_settings(command, config)
-    flags = _flags(command, config)
-    return cast(Command, _read(wanted, f"{own_name()} {name}", _current_tokens(tokens, flags), flags))
+    own = list(_flags_of(command))
+    config = _config_of(command, name, own, tokens) if hasattr(command, "settings") else None
+    further = [] if config is None else _flags_of_config(config, {flag.key for flag in own})
+    values = _parse(command, name, [*own, *further], _current_tokens(tokens, [*own, *further]))
+    made = _made(command, values)
+    if config is None:
+        return cast(Command, made)
+    keys = {flag.key for flag in further}
+    given = {key: value for key, value in values.items() if key in keys}
+    try:
+        varied = apply_overrides(config, given, of=name)
+    except ValueError as error:  # Of a method's own configuration.
+        raise InputError(str(error)) from error
+    return cast(Command, _made(command, values | {"changes": changed(config, varied)}))
 
 
-def _current_tokens(tokens: Sequence[str], flags: tuple[str, ...]) -> list[str]:
-    current = [_current_flag(token, flags) for token in tokens]
-    return [
-        OLD_SIZES.get(t, t) if before == "--size" else t for before, t in zip(["", *current], current, strict=False)
-    ]
-
-
-def _current_flag(token: str, flags: tuple[str, ...]) -> str:
-    """The token, by today's name where it is an old flag of a configuration (`benchmarks.aliases`)."""
-    flag, equals, value = token.partition("=")
-    new = "--" + OLD_FIELDS.get(flag[2:].replace("-", "_"), "").replace("_", "-")
-    return f"{new}{equals}{value}" if flag.startswith("--") and new in flags else token
-
-
-def changes_of(command: Any) -> Changes:
-    """What the command line changed in the configuration that the command is about."""
-    settings = getattr(command, SETTINGS, None)
-    return () if settings is None else changed(type(settings)(), settings)
-
-
-def completion(commands: dict[str, type[Any]], tokens: Sequence[str]) -> None:
-    """Print a script that completes commands and flags in a shell (`--tyro-print-completion bash`), and end."""
-    if len(tokens) < 2 or tokens[1] not in SHELLS:
-        raise InputError(f"{tokens[0]}: expected one of {', '.join(SHELLS)}")
-    tyro.extras.subcommand_cli_from_dict(cast(Any, commands), prog="ash-bench", args=list(tokens), config=MARKERS)
-
-
-def _with_settings(command: type[Any], config: Any) -> type[Any]:
-    """The command with the configuration's fields as further flags; those that the command has itself stay its own."""
-    own = {f.name for f in fields(command)}
-    flags: list[Any] = []
-    for f in fields(config):
-        if f.init and f.name not in own:
-            about = _docstrings.get_field_docstring(type(config), f.name, ())
-            flags.append((f.name, Annotated[f.type, arg(help=about or "")], field(default=getattr(config, f.name))))
-    settings = make_dataclass(type(config).__name__, flags, frozen=True, kw_only=True)
-    settings.__doc__ = (type(config).__doc__ or "").splitlines()[0] or None
-    where = FlagConversionOff[Annotated[settings, arg(name="", prefix_name=False)]]  # type: ignore[valid-type]
-    return make_dataclass(
-        command.__name__,
-        [(SETTINGS, where, field(default=settings()))],
-        bases=(command,),
-        frozen=True,
-        kw_only=True,
-        namespace={"__doc__": command.__doc__},
+def _parse(command: type[Any], name: str, flags: Sequence[_Flag], tokens: Sequence[str]) -> dict[str, Any]:
+    names = tuple(flag.name for flag in flags if not flag.argument.positional)
+    end = tokens.index("--") if "--" in tokens else len(tokens)
+    joined, after = _joined(tokens[:end], flags), tokens[end + 1 :]
+    for token in joined:
+        head = token.partition("=")[0]
+        if token.startswith("--") and head not in (*names, *HELP):
+            raise InputError(f"unknown option {head!r}, {suggest(head, names)}")
+    positional = [flag.name for flag in flags if flag.argument.positional]
+    parser = argparse.ArgumentParser(
+        prog=f"{own_name()} {name}",
+        usage=" ".join(["%(prog)s [OPTIONS]", *positional]),
+        description=inspect.cleandoc(command.__doc__ or ""),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+        exit_on_error=False,
     )
+    for flag in flags:
+        flag.add_to(parser)
+    try:
+        values, rest = parser.parse_known_intermixed_args(joined)
+    except argparse.ArgumentError as error:
+        of = next((flag.name for flag in flags if error.argument_name in (flag.name, flag.key)), error.argument_name)
+        expected = "expected a value" if error.message.startswith("expected") and "argument" in error.message else ""
+        raise InputError(f"{of}: {expected or error.message}") from error
+    given = {key: value for key, value in vars(values).items() if value is not None}
+    missing = [flag.name for flag in flags if flag.default is MISSING and not given.get(flag.key)]
+    if missing and not after:
+        raise InputError(f"expected {' and '.join(missing)} (--help says more)")
+    if rest:
+        raise InputError(f"unexpected {rest[0]!r}")
+    several = [flag.key for flag in flags if flag.several or flag.argument.repeated]
+    taker = next((flag.key for flag in flags if flag.argument.positional and flag.several), None)
+    if after and taker is None:
+        raise InputError(f"unexpected {after[0]!r}")
+    if after and taker is not None:
+        given[taker] = [*given.get(taker, ()), *after]
+    return {key: tuple(value) if key in several else value for key, value in given.items()}
 
 
-def _as_far_as_known(command: type[Any], name: str, tokens: Sequence[str]) -> Any:
-    """The command without what belongs to a configuration, or None where even its own arguments are incomplete."""
-    known = _flags(command, None)
-    kept: list[str] = []
+def _joined(tokens: Sequence[str], flags: Sequence[_Flag]) -> list[str]:
+    """Flags by their names, each with its value in one token: a value may then begin with a minus."""
+    single = {flag.name for flag in flags if not (flag.switch or flag.several or flag.argument.positional)}
+    joined: list[str] = []
+    for token in tokens:
+        head, equals, value = token.partition("=")
+        if joined and joined[-1] in single and not token.startswith("--"):
+            joined[-1] = f"{joined[-1]}={token}"
+        elif token.startswith("--"):
+            joined.append(f"{head.replace('_', '-')}{equals}{value}")
+        else:
+            joined.append(token)
+    return joined
+
+
+def _made(command: type[Any], values: dict[str, Any]) -> Any:
+    """The dataclass from the values of its fields, and of those within it."""
+    hints, given = get_type_hints(command), {}
+    for field in fields(command):
+        if is_dataclass(hints[field.name]):
+            given[field.name] = _made(cast(type[Any], hints[field.name]), values)
+        elif field.name in values:
+            given[field.name] = values[field.name]
+    return command(**given)
+
+
+def _flags_of(command: type[Any]) -> Iterator[_Flag]:
+    """The command's own arguments."""
+    comments = field_comments(command)
+    for name, hint in get_type_hints(command, include_extras=True).items():
+        kind, argument, several = _described(hint)
+        if is_dataclass(kind):
+            yield from _flags_of(cast(type[Any], kind))
+        elif name != "changes":
+            default = next(field.default for field in fields(command) if field.name == name)
+            switch = kind is bool
+            yield _Flag(name, kind, comments.get(name, ""), default, argument, several, switch)
+
+
+def _flags_of_config(config: Any, taken: set[str]) -> list[_Flag]:
+    """The fields of a configuration; those that the command has itself stay its own."""
+
+    def flag(leaf: Leaf) -> _Flag:
+        kind, argument, several = _described(leaf.kind)
+        about = field_comments(leaf.owner).get(leaf.name, "")
+        return _Flag(leaf.key, kind, about, leaf.value, argument, several)
+
+    flags = [flag(leaf) for leaf in leaves(config) if leaf.key not in taken]
+    return [flag for flag in flags if flag.kind in READ or get_origin(flag.kind) is Literal]
+
+
+def _described(hint: Any) -> tuple[Any, Argument, bool]:
+    """The type of a value, how it is read, and whether there are several."""
+    argument = Argument()
+    while get_origin(hint) in (Annotated, Union, types.UnionType):
+        if get_origin(hint) is Annotated:
+            hint, *marks = get_args(hint)
+            for mark in marks:
+                argument = _both(argument, mark)
+        else:
+            hint = next(kind for kind in get_args(hint) if kind is not type(None))
+    if get_origin(hint) is not tuple or argument.read is not None:
+        return hint, argument, False
+    return get_args(hint)[0], argument, not argument.repeated
+
+
+def _both(one: Argument, other: Argument) -> Argument:
+    plain = Argument()
+    given = {f.name: getattr(other, f.name) for f in fields(other) if getattr(other, f.name) != getattr(plain, f.name)}
+    return replace(one, **given)
+
+
+def _metavar(kind: Any) -> str:
+    if get_origin(kind) is Literal:
+        return "{" + ",".join(get_args(kind)) + "}"
+    return str(getattr(kind, "__name__", "VALUE")).upper()
+
+
+def field_comments(kind: type[Any]) -> dict[str, str]:
+    """The comment of every field of a dataclass: behind it, or in the lines above."""
+    comments: dict[str, str] = {}
+    for part in reversed(kind.__mro__):
+        try:
+            source = inspect.getsource(part) if is_dataclass(part) else ""
+        except (OSError, TypeError):  # Made without a file.
+            continue
+        above: list[str] = []
+        for line in map(str.strip, source.splitlines()):
+            field = re.match(r"(\w+): .*?(?:  # (.*))?$", line)
+            if field is not None:
+                comments[field[1]] = field[2] or " ".join(above)
+            above = [*above, line.lstrip("# ")] if line.startswith("#") else []
+    return comments
+
+
+def _current_tokens(tokens: Sequence[str], flags: Sequence[_Flag]) -> list[str]:
+    """Tokens by today's names where they are old flags or sizes (`benchmarks.aliases`)."""
+    names, current = {flag.name for flag in flags}, []
+    for token in tokens:
+        flag, equals, value = token.partition("=")
+        new = "--" + OLD_FIELDS.get(flag[2:].replace("-", "_"), "").replace("_", "-")
+        known = flag.startswith("--") and new in names
+        current.append(f"{new}{equals}{value}" if known else token)
+    return [OLD_SIZES.get(t, t) if flag == "--size" else t for flag, t in zip(["", *current], current, strict=False)]
+
+
+def _config_of(command: type[Any], name: str, own: Sequence[_Flag], tokens: Sequence[str]) -> Any:
+    """The configuration that a command line means, without its flags; None where its own arguments are incomplete."""
+    names = {flag.name for flag in own}
+    known: list[str] = []
     waiting = iter(range(len(tokens)))
     for index in waiting:
         token = tokens[index]
-        flag = token.partition("=")[0].replace("_", "-")
-        if token in ("-h", "--help"):
+        if token in HELP:
             continue
-        if token.startswith("--") and flag not in known:
+        if token.startswith("--") and token.partition("=")[0].replace("_", "-") not in names:
             if "=" not in token and index + 1 < len(tokens) and not tokens[index + 1].startswith("--"):
                 next(waiting, None)
             continue
-        kept.append(token)
-    helped = any(token in ("-h", "--help") for token in tokens) and kept[:1] and not kept[0].startswith("-")
+        known.append(token)
+    helped = any(token in HELP for token in tokens) and known[:1] and not known[0].startswith("-")
     for missing in ([], ["."]) if helped else ([],):  # Help on a method needs no capture.
         try:
-            with _errors.on_parse_error(_stop):
-                return tyro.cli(command, prog=name, args=[*kept, *missing], config=MARKERS, return_unknown_args=True)[0]
-        except _StoppedError:
+            made = _made(command, _parse(command, name, own, _current_tokens([*known, *missing], own)))
+        except InputError:
             continue
+        return made.settings()
     return None
-
-
-class _StoppedError(Exception):
-    pass
-
-
-def _stop(event: Any) -> None:
-    raise _StoppedError
-
-
-def _read(command: type[Any], prog: str, tokens: Sequence[str], known: tuple[str, ...]) -> Any:
-    def refuse(event: _errors.ParseErrorEvent) -> None:
-        raise InputError(_problem(event, known))
-
-    with _errors.on_parse_error(refuse):
-        return tyro.cli(command, prog=prog, args=list(tokens), config=MARKERS)
-
-
-def _flags(command: type[Any], config: Any) -> tuple[str, ...]:
-    """Every flag that there is, as it is typed."""
-    names = []
-    for f in fields(command):
-        marks = getattr(f.type, "__metadata__", ())
-        if is_dataclass(f.default):
-            names += [key.name for key in fields(f.default)]
-        elif POSITIONAL not in marks:
-            names.append(next((mark.name for mark in marks if getattr(mark, "name", None)), f.name))
-    keys = () if config is None else tuple(key for key in flat(config) if key not in names)
-    return tuple(f"--{key.replace('_', '-')}" for key in (*names, *keys))
-
-
-def _problem(event: _errors.ParseErrorEvent, known: tuple[str, ...]) -> str:
-    """A parser's complaint in one line."""
-    if isinstance(event, _errors.UnrecognizedArgs):
-        return _unknown(event.tokens, known)
-    if isinstance(event, _errors.MissingArgs):
-        if event.unrecognized_tokens and event.unrecognized_tokens[0].startswith("-"):
-            return _unknown(event.unrecognized_tokens, known)
-        return f"expected {' and '.join(_name(each.arg) for each in event.missing_arguments)} (--help says more)"
-    if isinstance(event, _errors.InvalidChoice):
-        return f"{_name(event.argument)}: expected one of {', '.join(event.choices)}, got {event.value!r}"
-    if isinstance(event, _errors.BadValue):
-        return f"{_name(event.argument)}: expected a value"
-    if isinstance(event, _errors.InstantiationFailure):
-        about = _plain(event.message)
-        return about if event.argument is None else f"{_name(event.argument)}: {about}"
-    return f"wrong arguments ({type(event).__name__}); --help says more"
-
-
-def _unknown(tokens: Sequence[str], known: tuple[str, ...]) -> str:
-    flag = tokens[0].partition("=")[0].replace("_", "-")
-    return f"unknown option {flag!r}, {suggest(flag, known)}" if flag.startswith("-") else f"unexpected {tokens[0]!r}"
-
-
-def _name(argument: Any) -> str:
-    return str(argument.lowered.metavar if argument.is_positional() else argument.lowered.name_or_flags[-1])
-
-
-def _plain(message: Any) -> str:
-    return " ".join((message if isinstance(message, str) else str(message)).split())

@@ -7,18 +7,16 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
-
 from ash.capture.dataset import Pose
 from ash.files import InputError, write_atomic
-from benchmarks.commands.arguments import DONE, Count, CountIfAny, File, Names, Natural, Trust
+from benchmarks.commands.arguments import DONE, Argument, Count, CountIfAny, File, Names, Natural, Positional, Repeated
 from benchmarks.commands.devices import CPU, DeviceName, chosen_device
 
 if TYPE_CHECKING:
     from benchmarks.play.avatars import AvatarSet
     from benchmarks.play.motions import MotionClip
 
-Stretch = Annotated[str | None, arg(metavar="A:B")]
+Stretch = Annotated[str | None, Argument(metavar="A:B")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,16 +24,16 @@ class PlayCommand:
     """Play a run's avatars in the browser, beside the truth."""
 
     run: Positional[Path]  # a run's folder or a cell's
-    motion: UseAppendAction[tuple[str, ...]] = ()  # besides the capture's: walk, dance, a BVH or AMASS file; repeatable
+    motion: Repeated[tuple[str, ...]] = ()  # besides the capture's: walk, dance, a BVH or AMASS file; repeatable
     methods: Names = ()  # only these; default: all of the run
     scene: str | None = None  # of a run with several; default: its first
     device: DeviceName = CPU  # where avatars draw that have a choice: cpu, cuda, cuda:1, or auto
     host: str = "127.0.0.1"  # address to listen on
     port: Natural = 0  # default: a free one
     clients: Count = 8  # browsers at a time
-    allow_origin: UseAppendAction[tuple[str, ...]] = ()  # where a forwarded port is seen: http://localhost:9000
-    trust: Trust = False  # load methods that are not ours too: their code runs here, without isolation
-    expose: FlagCreatePairsOff[bool] = False  # let --host be open to other machines; nothing is encrypted
+    allow_origin: Repeated[tuple[str, ...]] = ()  # where a forwarded port is seen: http://localhost:9000
+    trust: bool = False  # load methods that are not ours too: their code runs here, without isolation
+    expose: bool = False  # let --host be open to other machines; nothing is encrypted
 
     def __call__(self) -> int:
         """Serve until Ctrl-C."""
@@ -79,7 +77,7 @@ class ExportCommand:
     """
 
     source: Positional[Path]  # the folder of a capture, a cell or a run
-    form: Annotated[str, arg(name="format", metavar="FORMAT")]  # see above: captures and avatars have different ones
+    form: Annotated[str, Argument(name="format", metavar="FORMAT")]  # one of those above
     out: File | None = None  # default: SOURCE-FORMAT beside a capture, SOURCE.SUFFIX here of an avatar
     split: str | None = None  # nerfstudio, colmap: train (default), novel_view, near_pose, novel_pose or far_pose
     frame: int | None = None  # nerfstudio, colmap: only this frame of the split
@@ -87,9 +85,9 @@ class ExportCommand:
     frames: Stretch = None  # avatars: of the motion, B not included; default: all, of ply, spz and gltf the first
     methods: Names = ()  # avatars: only these of a run
     scene: str | None = None  # avatars: of a run with several; default: its first
-    trust: Trust = False  # avatars: load methods that are not ours too: their code runs here, without isolation
+    trust: bool = False  # avatars: load methods that are not ours too: their code runs here, without isolation
     camera: str = "spiral"  # mp4: spiral, rig, or a camera of the capture
-    truth: FlagCreatePairsOff[bool] = False  # mp4: the truth beside them; rendered where it never was
+    truth: bool = False  # mp4: the truth beside them; rendered where it never was
     height: Count = 256  # mp4: of a picture, pixels
     fps: CountIfAny = None  # mp4: frames per second; default: the motion's
 

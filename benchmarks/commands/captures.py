@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
-
-from benchmarks.commands.arguments import DONE, WRONG_INPUT, Count, CountIfAny, File, Folder, Seed, changes_of
+from ash.fields import Changes
+from benchmarks.commands.arguments import DONE, WRONG_INPUT, Argument, Count, CountIfAny, File, Folder, Positional, Seed
 
 if TYPE_CHECKING:
     from synth.scene import Scene, Take
@@ -44,9 +43,6 @@ class Excerpt:
         )
 
 
-Excerpts = Annotated[Excerpt, arg(name="", prefix_name=False)]
-
-
 @dataclass(frozen=True, kw_only=True)
 class SynthCommand:
     """Render the ground truth of a scene into a capture folder.
@@ -66,11 +62,13 @@ class SynthCommand:
     subject: Seed = 0  # who it is: body, skin, hair, clothes and prints follow from the number
     motion: File | None = None  # train on this motion (BVH or AMASS .npz)
     test_motion: File | None = None  # test on this motion
-    excerpt: Excerpts = Excerpt()
-    rig_file: Annotated[Path | None, arg(name="rig", metavar="FILE")] = None  # see the scene by its cameras
+    excerpt: Excerpt = Excerpt()
+    rig_file: Annotated[Path | None, Argument(name="rig", metavar="FILE")] = None  # see the scene by its cameras
     workers: CountIfAny = None  # processes; default: all cores
     executor: str = "local"  # or dask://HOST:PORT, for a cluster
-    shard: Annotated[str | None, arg(metavar="i/n")] = None  # every n-th frame only, from the i-th; for job arrays
+    shard: Annotated[str | None, Argument(metavar="i/n")] = None  # every n-th frame only, from the i-th; for job arrays
+
+    changes: Changes = ()  # of the scene
 
     def settings(self) -> "Scene":
         """The scene, before flags change it."""
@@ -78,8 +76,7 @@ class SynthCommand:
         from synth.presets import with_rig
 
         plain = scene_of(self.scene, size=self.size, seed=self.seed, subject=self.subject)
-        seen = plain if self.rig_file is None else with_rig(plain, self.rig_file)
-        return seen
+        return plain if self.rig_file is None else with_rig(plain, self.rig_file)
 
     def __call__(self) -> int:
         """Render what is missing of it."""
@@ -117,7 +114,7 @@ class SynthCommand:
         from benchmarks.suites.scenes import scene_of
         from benchmarks.suites.suites import capture_name, varied_name
 
-        changes = dict(changes_of(self))
+        changes = dict(self.changes)
         wanted = apply_overrides(self.settings(), changes, of=self.scene)
         if changes and "name" not in changes:
             wanted = replace(wanted, name=varied_name(self.scene, tuple(changes.items())))
@@ -189,9 +186,9 @@ class MotionsCommand:
     """Draw what a motion file becomes on our skeleton, in seconds: nothing is rendered."""
 
     file: Positional[Path]  # BVH or AMASS .npz
-    out: Annotated[Path | None, arg(metavar="PNG")] = None  # default: FILE's name with .png, here
+    out: Annotated[Path | None, Argument(metavar="PNG")] = None  # default: FILE's name with .png, here
     fps: float = 12.0  # frames per second
-    excerpt: Excerpts = Excerpt()
+    excerpt: Excerpt = Excerpt()
 
     def __call__(self) -> int:
         """Draw it, and refuse a person who stands on the head."""

@@ -10,10 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from tyro.conf import FlagCreatePairsOff, Positional
-
 from ash.files import InputError
-from benchmarks.commands.arguments import DONE, FAILED, File, Folder, Trust
+from benchmarks.commands.arguments import DONE, FAILED, File, Folder, Positional
 from benchmarks.commands.devices import CPU, DeviceName, chosen_device
 
 
@@ -22,10 +20,10 @@ class SpeedCommand:
     """Time the kernels, or whole frames by stage, beside their definitions."""
 
     what: Positional[Literal["kernels", "frame"]]  # kernels or frame
-    profile: FlagCreatePairsOff[bool] = False  # frame: the parts of a training step, of ASH and the mesh
+    profile: bool = False  # frame: the parts of a training step, of ASH and the mesh
     capture: Folder | None = None  # frame: on this capture; default: the mannequin of the suite ci
     avatar: Folder | None = None  # frame: this trained avatar in its held-out motion; a cell, or a run with one avatar
-    trust: Trust = False  # --avatar may be of a method that is not ours: its code runs here, without isolation
+    trust: bool = False  # --avatar may be of a method that is not ours: its code runs here, without isolation
     device: DeviceName = CPU  # what is timed: cpu, cuda, cuda:1, or auto
     json: File | None = None  # write the rows there as well
 

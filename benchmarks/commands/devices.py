@@ -4,14 +4,14 @@ import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import arg
+from benchmarks.commands.arguments import Argument
 
 if TYPE_CHECKING:
     from benchmarks.suites.suites import MethodSpec, Suite
 
 CPU = "cpu"
-DeviceName = Annotated[str, arg(metavar="DEVICE")]
-DeviceNameIfAny = Annotated[str | None, arg(metavar="DEVICE")]
+DeviceName = Annotated[str, Argument(metavar="DEVICE")]
+DeviceNameIfAny = Annotated[str | None, Argument(metavar="DEVICE")]
 
 
 def chosen_device(wanted: str, *, here: bool = True) -> str:

@@ -4,8 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tyro.conf import FlagCreatePairsOff
-
 from ash.files import InputError
 from benchmarks.commands.arguments import DONE, FAILED, Count, File, Folder
 from benchmarks.commands.runs import run_and_report
@@ -26,7 +24,7 @@ class GateCommand:
     data: Folder = Path("data")  # where captures are kept
     markdown: File | None = None  # write the summary there, for a pull request
     junit: File | None = None  # write the checks there as JUnit
-    update_baseline: FlagCreatePairsOff[bool] = False  # make the run the new baseline
+    update_baseline: bool = False  # make the run the new baseline
 
     def __call__(self) -> int:
         """Judge the run, or make it the baseline."""

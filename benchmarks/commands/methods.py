@@ -4,10 +4,8 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from tyro.conf import Positional
-
 from ash.files import InputError
-from benchmarks.commands.arguments import DONE, FAILED, Count, CountIfAny, Folder
+from benchmarks.commands.arguments import DONE, FAILED, Count, CountIfAny, Folder, Positional
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,20 +8,21 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
-
+from ash.fields import Changes
 from ash.files import InputError
 from benchmarks.commands.arguments import (
     DONE,
     FAILED,
     INTERRUPTED,
+    Argument,
     Count,
     CountIfAny,
     File,
     Folder,
     Names,
+    Positional,
+    Repeated,
     Seed,
-    changes_of,
     typed,
 )
 from benchmarks.commands.devices import CPU, DeviceName, DeviceNameIfAny, chosen_device, gpus_for, on_device
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from benchmarks.suites.suites import SceneSpec, Suite
 
 LOCAL = "local"
-LpipsWeights = Annotated[Path | None, arg(metavar="FILE")]
+LpipsWeights = Annotated[Path | None, Argument(metavar="FILE")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,22 +53,22 @@ class RunCommand:
     suite: Positional[str] = ""  # quick (the default), ci, table, ... or FILE.toml
     methods: Names = ()  # only these rows, or installed methods besides
     scenes: Names = ()  # only these rows, or other scenes
-    capture: UseAppendAction[tuple[Path, ...]] = ()  # in place of the scenes: a finished capture; may be repeated
+    capture: Repeated[tuple[Path, ...]] = ()  # in place of the scenes: a finished capture; may be repeated
     size: str | None = None  # of scenes: ci, factor, quick, long, table or paper
     preset: str | None = None  # budget of the methods
     device: DeviceName = CPU  # where methods learn and draw that can choose: cpu, cuda, cuda:1, or auto
     seeds: CountIfAny = None  # train every method with so many seeds
     subjects: CountIfAny = None  # on captures of so many people, from subject 0 on
-    validation: FlagCreatePairsOff[bool] = False  # on the people from 100 on: to choose by, not to report
+    validation: bool = False  # on the people from 100 on: to choose by, not to report
     out: Folder | None = None  # where results go; default: runs/SUITE
     data: Folder = Path("data")  # where captures are kept
     workers: CountIfAny = None  # cells side by side; default: all cores, on CUDA all GPUs
     executor: str = LOCAL  # or dask://HOST:PORT, for a cluster
-    shard: Annotated[str | None, arg(metavar="i/n")] = None  # do every n-th cell only, from the i-th; for job arrays
+    shard: Annotated[str | None, Argument(metavar="i/n")] = None  # every n-th cell only, from the i-th; for job arrays
     lpips_weights: LpipsWeights = None  # AlexNet's, of torchvision; default: torch's cache; without them LPIPS is n/a
-    retry_failed: FlagCreatePairsOff[bool] = False  # run cells again that failed before
-    dry_run: FlagCreatePairsOff[bool] = False  # print cells, hours and gigabytes, and do nothing
-    list: FlagCreatePairsOff[bool] = False  # print the suites as TOML, or only SUITE: a copy is a start for your own
+    retry_failed: bool = False  # run cells again that failed before
+    dry_run: bool = False  # print cells, hours and gigabytes, and do nothing
+    list: bool = False  # print the suites as TOML, or only SUITE: a copy is a start for your own
 
     def __call__(self) -> int:
         """Captures, cells, report."""
@@ -233,6 +234,8 @@ class TrainCommand:
     out: Folder = Path("runs/train")  # where cells go
     row: str = ""  # what it is called in tables; default: the method's name and what is changed
 
+    changes: Changes = ()  # of the method's configuration
+
     def settings(self) -> Any:
         """The configuration that the preset means, if the method offers one."""
         from benchmarks.cell.registry import offered
@@ -250,7 +253,7 @@ class TrainCommand:
         from benchmarks.suites.runs import cell_for
         from benchmarks.suites.suites import CaptureSpec, CellSpec, varied_name
 
-        changes, device = changes_of(self), chosen_device(self.device)
+        changes, device = self.changes, chosen_device(self.device)
         if device != CPU:
             changes = tuple(sorted({**dict(changes), "device": device}.items()))
         if changes:
@@ -287,7 +290,7 @@ class EvalCommand:
     """
 
     run: Positional[Path]  # a run's folder or a cell's
-    scores_only: FlagCreatePairsOff[bool] = False  # score the stored predictions: nothing is loaded or rendered
+    scores_only: bool = False  # score the stored predictions: nothing is loaded or rendered
     device: DeviceNameIfAny = None  # where avatars draw that have a choice: cpu, cuda, ...; default: as they learned
     motion: File | None = None  # BVH or AMASS .npz: drive the avatars by it
     frames: Count = 12  # of that motion

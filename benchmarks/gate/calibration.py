@@ -6,13 +6,12 @@ Baseline: three seeds of ASH on the suite `ci`. A rerun of unchanged code is thr
 seeds of a method of `planted_defects.py` under ASH's name.
 """
 
+import argparse
 import importlib
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-
-import tyro
 
 from ash.files import InputError, write_atomic, write_json
 from benchmarks.analysis.statistics import wilson
@@ -49,9 +48,7 @@ class GateCalibration:
     defects: tuple[GateTrial, ...]
 
 
-def calibrate(
-    reruns: int = 20, out: Path = Path("runs/gate-calibration"), data: Path = Path("data"), workers: int = cores()
-) -> GateCalibration:
+def calibrate(*, reruns: int, out: Path, data: Path, workers: int) -> GateCalibration:
     """Train and judge `reruns` unchanged runs and every planted defect; write calibration.md and .json into `out`.
 
     Raises:
@@ -138,4 +135,9 @@ def _renamed(result: CellResult) -> CellResult:
 
 
 if __name__ == "__main__":
-    print(markdown(tyro.cli(calibrate)))
+    parser = argparse.ArgumentParser(description=calibrate.__doc__)
+    parser.add_argument("--reruns", type=int, default=20, help="runs of unchanged code")
+    parser.add_argument("--out", type=Path, default=Path("runs/gate-calibration"))
+    parser.add_argument("--data", type=Path, default=Path("data"), help="where captures are stored")
+    parser.add_argument("--workers", type=int, default=cores(), help="cells side by side")
+    print(markdown(calibrate(**vars(parser.parse_args()))))

@@ -6,7 +6,7 @@ from ash.presets import named
 from benchmarks import cli
 from benchmarks.aliases import OLD_COMMANDS, OLD_FIELDS
 from benchmarks.cell.registry import configured
-from benchmarks.commands.arguments import changes_of, read_command
+from benchmarks.commands.arguments import read_command
 from benchmarks.commands.runs import TrainCommand
 
 
@@ -25,4 +25,4 @@ def test_an_old_field_is_read_as_a_flag_and_in_a_suite(old: str, new: str) -> No
     value = getattr(getattr(named("ci"), part), field) / 2
     assert getattr(getattr(configured("ash", "ci", {old: value}), part), field) == value
     command = read_command(TrainCommand, "train", ["ash", "data/x", "--preset", "ci", f"--{old}", str(value)])
-    assert changes_of(command) == ((new, value),)
+    assert command.changes == ((new, value),)

@@ -1,10 +1,9 @@
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-from helpers.commands import ash_bench, refused
+from helpers.commands import refused
 
 from benchmarks import cli
 from benchmarks.commands import arguments
@@ -16,8 +15,8 @@ def test_help_tells_a_methods_configuration(capsys) -> None:
     with pytest.raises(SystemExit) as end:
         cli.main(["train", "fake_tuned", "--help"])
     assert end.value.code == 0
-    told = " ".join(re.sub("[│╭╮╰╯─]", " ", capsys.readouterr().out).split())
-    assert "--detail FLOAT" in told and "(default: 0.9)" in told and "--shift-m" in told
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "--detail FLOAT" in printed and "(default: 0.9)" in printed and "--shift-m" in printed
 
 
 def test_help_lists_every_command_and_how_to_go_on(capsys) -> None:
@@ -69,7 +68,7 @@ for command in COMMANDS:
         ("run qiuck --list", "unknown suite 'qiuck', did you mean quick"),
         ("synth tihgt", "unknown scene 'tihgt', did you mean tight"),
         ("synth mannequin --rig.camers 24", "unknown option '--rig.camers', did you mean --rig.cameras"),
-        ("synth mannequin --rig.cameras many", "--rig.cameras: invalid literal"),
+        ("synth mannequin --rig.cameras many", "--rig.cameras: expected a whole number, got 'many'"),
         ("synth mannequin --size ci --rig.cameras 2000", "held out, expected 1 to all but one"),
         ("train ash nowhere --model.texel 3", "unknown option '--model.texel', did you mean --model.texels"),
         ("train ash nowhere --model.texels 3", "texels: expected a multiple of shuffle"),
@@ -79,20 +78,6 @@ for command in COMMANDS:
 )
 def test_wrong_use_is_one_line_and_exits_with_2(command: str, message: str, capsys) -> None:
     assert message in refused(capsys, *command.split())
-
-
-def test_a_shell_can_complete_commands_and_flags(tmp_path: Path) -> None:
-    script = ash_bench("--tyro-print-completion", "bash").stdout
-    (tmp_path / "completion").write_text(script)
-    asked = (
-        f"source {tmp_path}/completion; COMP_WORDS=(ash-bench {{}}); COMP_CWORD={{}}; "
-        "$(complete -p ash-bench | sed -E 's/.*-F ([^ ]+) .*/\\1/'); echo ${{COMPREPLY[@]}}"
-    )
-    for words, wanted in (("sy", "synth"), ("run --see", "--seeds")):
-        done = subprocess.run(
-            ["bash", "-c", asked.format(words, len(words.split()))], capture_output=True, text=True, check=True
-        )
-        assert wanted in done.stdout.split(), done
 
 
 def test_help_on_a_scene_and_on_a_method_lists_their_fields(capsys) -> None:

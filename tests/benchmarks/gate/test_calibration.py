@@ -100,7 +100,7 @@ def test_unchanged_code_and_defects_are_judged_and_written_down(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(planted_defects, "DEFECTS", (fake_bad,))
-    found = calibration.calibrate(2, tmp_path / "out", tmp_path, workers=2)
+    found = calibration.calibrate(reruns=2, out=tmp_path / "out", data=tmp_path, workers=2)
     assert [trial.name for trial in found.unchanged] == ["rerun 1", "rerun 2"]
     (defect,) = found.defects
     assert any("psnr" in check.what for check in defect.flagged)
@@ -117,7 +117,7 @@ def fake_bad() -> None:
 def test_a_defect_that_fails_is_none_that_was_caught(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(planted_defects, "DEFECTS", (fake_raising,))
     with pytest.raises(InputError, match="fake_raising, seed 3: expected a result to judge"):
-        calibration.calibrate(0, tmp_path / "out", tmp_path, workers=2)
+        calibration.calibrate(reruns=0, out=tmp_path / "out", data=tmp_path, workers=2)
 
 
 def fake_raising() -> None:
