@@ -30,7 +30,7 @@ _set_threads()  # Read as NumPy, torch and FLIP are loaded, the first of them by
 from ash.fields import suggest
 from ash.files import InputError, disk_problem
 from benchmarks.aliases import OLD_COMMANDS
-from benchmarks.cell.children import METHOD_PATH, add_method_paths
+from benchmarks.cell.sandbox import METHOD_PATH, add_method_paths
 from benchmarks.commands.arguments import DONE, INTERRUPTED, WRONG_INPUT, Command, own_name, read_command
 
 METHOD_PATH_FLAG = "--method-path"

@@ -18,8 +18,7 @@ from ash.capture.formats import load_capture
 from ash.capture.novelty import novelty_deg
 from ash.files import read_arrays
 from benchmarks.cell import metrics
-from benchmarks.cell.schema import Cell, CellResult, ViewScore, stored_prediction
-from benchmarks.cell.views import View
+from benchmarks.cell.schema import Cell, CellResult, View, ViewScore, stored_prediction
 from synth.truth.pixels import depth, normals, pixel_truth, points, surface_truth
 
 REGION_COLOURS = ("#2f6fde", "#dd6b20", "#c2415c", "#b8860b", "#c9ced6")

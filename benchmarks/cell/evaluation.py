@@ -1,43 +1,57 @@
 """A trained method on held-out views and motion: drawn, stored, scored, its cost measured."""
 
+import json
+import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from hashlib import sha256
+from itertools import islice
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ash.capture.dataset import Capture, pixels_path, surface_path
 from ash.capture.formats import read_template_truth
 from ash.capture.novelty import novelty_deg
-from ash.files import read_arrays, write_image
+from ash.files import open_regular, read_arrays, write_image
 from ash.protocol import TrainingOutcome
 from benchmarks.cell import metrics
-from benchmarks.cell.client import TEST_VIEWS, WORK, MethodClient, MethodInfo, Timed, frame_times_ms
-from benchmarks.cell.curves import read_curve, seconds_to_settle
-from benchmarks.cell.errors import MethodFailed
-from benchmarks.cell.metrics import IMAGE_SPLITS, NOVELTY, VIEW_SCORES
+from benchmarks.cell.metrics import IMAGE_SPLITS, NOVELTY, VIEW_SCORES, weights_file
+from benchmarks.cell.sandbox import TEST_VIEWS, WORK
 from benchmarks.cell.schema import (
     Cell,
     CellResult,
     CurvePoint,
+    MethodFailed,
     Snapshot,
     Summary,
     Timing,
+    TrainingTime,
+    View,
     ViewScore,
     prediction_path,
     stored_prediction,
 )
-from benchmarks.cell.timing import TIMED_FRAMES, WARM_UP_FRAMES, TrainingTime, reference_workload_ms
-from benchmarks.cell.views import View, evaluated_views, playback
-from benchmarks.cell.weights import weights_file
+from benchmarks.cell.worker import MethodClient, MethodInfo, Timed, frame_times_ms
 
+TRAIN_VIEWS = 12
+VIEW_FRAMES = 12
+POSE_FRAMES = 24
+WARM_UP_FRAMES = 3
+TIMED_FRAMES = 15
 GEOMETRY_FRAMES = 4
 MOST_SNAPSHOTS = 100
 LEAST_AGREEMENT_DB = 20.0  # Of a timed picture with the scored one: a display may sample outlines otherwise.
-
-
 GEOMETRY_POINTS = 4096  # Gaussians whose distance to the surface is measured, evenly taken; the mean wants no more.
+
+MAX_POINTS = 200
+SETTLED_DB = 0.3
+
+LARGEST_LOG, LONGEST_LINE, MOST_LINES = 1 << 28, 1 << 16, 1_000_000
+LARGEST_VALUE = 1e12
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -342,3 +356,101 @@ def _cost_summary(drawn: MethodOutputs, spent: TrainingTime, *, before_s: float)
     return tuple(
         Summary(split=split, region="", metric=metric, value=value) for (split, metric), value in costs.items()
     )
+
+
+def evaluated_views(capture: Capture) -> tuple[View, ...]:
+    """The images that are scored, in a fixed order.
+
+    - train_view: 12 training images, spread evenly over all.
+    - novel_view: held-out cameras in at most 12 training frames, spread evenly.
+    - novel_pose: held-out cameras in the first 24 test frames, which follow each other, so that flicker can be seen.
+    - near_pose, far_pose: held-out cameras in at most 24 frames each, spread evenly over all clips.
+    """
+    pairs: dict[str, list[tuple[str, int]]] = {split: [] for split in IMAGE_SPLITS}
+    train = capture.splits["train"].views
+    pairs["train_view"] = [train[i] for i in spread(len(train), TRAIN_VIEWS)]
+    if "novel_view" in capture.splits:
+        split = capture.splits["novel_view"]
+        frames = [split.frames[i] for i in spread(len(split.frames), VIEW_FRAMES)]
+        pairs["novel_view"] = [(camera, frame) for camera in split.cameras for frame in frames]
+    if "novel_pose" in capture.splits:
+        split = capture.splits["novel_pose"]
+        pairs["novel_pose"] = [(camera, frame) for camera in split.cameras for frame in split.frames[:POSE_FRAMES]]
+    for name in ("near_pose", "far_pose"):
+        if name in capture.splits:
+            split = capture.splits[name]
+            frames = [split.frames[i] for i in spread(len(split.frames), POSE_FRAMES)]
+            pairs[name] = [(camera, frame) for camera in split.cameras for frame in frames]
+    return tuple(View(split=s, camera=camera, frame=frame) for s in IMAGE_SPLITS for camera, frame in pairs[s])
+
+
+def playback(views: tuple[View, ...]) -> list[View]:
+    """The views in the order in which they are timed: first motion that is not training's, as near to it as there is.
+
+    A method that does less in poses far from training's, because it trusts what it learned less there, is timed where
+    it does all. Camera by camera, frames follow each other.
+    """
+    order = ("near_pose", "novel_pose", "far_pose", "novel_view", "train_view")
+    return sorted(views, key=lambda view: order.index(view.split))
+
+
+def spread(count: int, at_most: int) -> list[int]:
+    """At most `at_most` different indices below `count`, evenly spread, ends included."""
+    return sorted({round(x) for x in np.linspace(0, count - 1, min(count, at_most))})
+
+
+def reference_workload_ms() -> float:
+    """Milliseconds of a fixed mixture of arithmetic and memory traffic (a product and a sort), a few ms on one core."""
+    grid = np.sin(np.arange(192 * 192, dtype=np.float32)).reshape(192, 192)
+    start = time.perf_counter()
+    product = grid
+    for _ in range(8):
+        product = np.tanh(product @ grid)
+        np.sort(product, axis=None)
+    return (time.perf_counter() - start) * 1e3
+
+
+def read_curve(path: Path) -> tuple[CurvePoint, ...]:
+    """Points of `log.jsonl` that carry `seconds` and a `loss` or `train_psnr`, in order of time, thinned to some 200.
+
+    Lines of other kinds, and the half line that an interrupted process leaves, are passed over.
+    """
+    if not path.exists():
+        return ()
+    with open_regular(path, most=LARGEST_LOG) as file:
+        lines = iter(lambda: file.readline(LONGEST_LINE), b"")
+        points = [point for line in islice(lines, MOST_LINES) if (point := _point(line)) is not None]
+    points.sort(key=lambda point: point.seconds)
+    return tuple(points[i] for i in _thin(points))
+
+
+def seconds_to_settle(curve: tuple[CurvePoint, ...]) -> float | None:
+    """Seconds after which every score of the reserved views lies within 0.3 dB of the last; None without scores."""
+    scored = [(point.seconds, point.psnr) for point in curve if point.psnr is not None]
+    below = [i for i, (_, psnr) in enumerate(scored) if psnr < scored[-1][1] - SETTLED_DB]
+    return scored[below[-1] + 1 if below else 0][0] if scored else None
+
+
+def _point(line: bytes) -> CurvePoint | None:
+    try:
+        row = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(row, dict):
+        return None
+    seconds, loss, psnr = (_finite(row.get(name)) for name in ("seconds", "loss", "train_psnr"))
+    if seconds is None or (loss is None and psnr is None):
+        return None
+    return CurvePoint(seconds=seconds, loss=loss, psnr=psnr)
+
+
+def _finite(value: Any) -> float | None:
+    known = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST_VALUE
+    return float(value) if known else None
+
+
+def _thin(points: list[CurvePoint]) -> list[int]:
+    """Every point with a score, the last, and as many of the others as there is room for."""
+    step = max(1, math.ceil(len(points) / MAX_POINTS))
+    scored = [i for i, point in enumerate(points) if point.psnr is not None]
+    return sorted({*range(0, len(points), step), *scored[-MAX_POINTS:], *([len(points) - 1] if points else [])})

@@ -13,19 +13,26 @@ Regions, ours first, then those of others' conventions:
   composited by its own alpha; SSIM with the 7x7 box.
 """
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from scipy import ndimage
 from skimage.metrics import structural_similarity
 
+from ash.files import InputError
+
 PROTOCOL = "2"
 PSNR_CAP_DB = 100.0  # Identical images would be infinite, and JSON and means know no infinity.
 FLIP_MARGIN = 24  # Pixels around the subject that FLIP's widest filter (radius 16 at 67 pixels per degree) can reach.
 SSIM_MARGIN = 11  # Pixels, beyond which windows of 11x11 or 7x7, mirrored at the margin's edge, see nothing.
 RELEASE_WINDOW = (600 / 940, 496 / 1285)  # of the rows, of the columns
+
+LPIPS_WEIGHTS = "ASH_BENCH_LPIPS_WEIGHTS"
+HUB_FILE = "alexnet-owt-7be5be79.pth"  # AlexNet's backbone, of torchvision
 
 Direction = Literal["up", "down", "none"]
 
@@ -331,3 +338,19 @@ def _point_segment(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np
     along = end - start
     t = np.clip(((points - start) * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-24), 0, 1)
     return np.linalg.norm(points - start - along * t[:, None], axis=-1)
+
+
+def weights_file() -> Path | None:
+    """The backbone's weights: named by the user, or in torch's own cache; None where there are none.
+
+    Raises:
+        InputError: the user named a file that is not there.
+    """
+    named = os.environ.get(LPIPS_WEIGHTS)
+    if named:
+        if not Path(named).is_file():
+            raise InputError(f"{named}: expected AlexNet's weights ({HUB_FILE} of torchvision)")
+        return Path(named)
+    home = Path(os.environ.get("TORCH_HOME", Path.home() / ".cache" / "torch"))
+    cached = home / "hub" / "checkpoints" / HUB_FILE
+    return cached if cached.is_file() else None

@@ -1,6 +1,6 @@
 """One cell, in a process of its own: train, render, score, time; `python -m benchmarks.cell.run FOLDER`.
 
-No code of the method runs in this process: it learns and draws in another (`benchmarks.cell.client`), and ends before
+No code of the method runs in this process: it learns and draws in another (`benchmarks.cell.worker`), and ends before
 anything is scored. So these exit codes are the harness's own word: 0 a result was written (also that of a method that
 failed), 2 wrong input (on stderr), 75 the disk is full, 130 interrupted, 76 the method's process was killed by somebody
 else; the last three without a result.
@@ -25,10 +25,6 @@ from ash.capture.manifest import verify_capture
 from ash.files import InputError, disk_problem
 from ash.protocol import Avatar
 from benchmarks import provenance
-from benchmarks.cell.access_guard import seen_by_method, watched
-from benchmarks.cell.children import add_method_paths, adopt_orphans
-from benchmarks.cell.client import WORK, MethodClient, open_client, stage_in, stage_out
-from benchmarks.cell.errors import CaptureModifiedError, HarnessFailed, Killed, MethodFailed
 from benchmarks.cell.evaluation import (
     MethodOutputs,
     _flicker_summary,
@@ -39,20 +35,26 @@ from benchmarks.cell.evaluation import (
     scored_views,
 )
 from benchmarks.cell.registry import ORACLES, code_version, configured, find_method, offered
+from benchmarks.cell.sandbox import WORK, add_method_paths, adopt_orphans, seen_by_method, watched
 from benchmarks.cell.schema import (
     CHECKPOINT,
+    CaptureModifiedError,
     Cell,
     CellConfig,
     CellResult,
+    HarnessFailed,
+    Killed,
+    MethodFailed,
     Provenance,
+    TrainingTime,
+    View,
     failed_result,
     prediction_path,
     read_cell,
     result_of,
     write_result,
 )
-from benchmarks.cell.timing import TrainingTime
-from benchmarks.cell.views import View
+from benchmarks.cell.worker import MethodClient, open_client, stage_in, stage_out
 
 DISK_FULL, KILLED = 75, 76  # exit codes
 FULL = 1 << 20  # bytes; a disk with less free space is full

@@ -24,16 +24,59 @@ from ash.capture.dataset import Capture
 from ash.capture.manifest import NAME as MANIFEST
 from ash.capture.typed import from_json
 from ash.fields import suggest
-from ash.files import InputError, hash_of, read_image, read_json, require_plain, sha256_of, write_json
+from ash.files import InputError, hash_of, one_line, read_image, read_json, require_plain, sha256_of, write_json
 from ash.protocol import TrainingOutcome
 from benchmarks.cell.metrics import IMAGE_SPLITS, METRICS, PROTOCOL, VIEW_SCORES
-from benchmarks.cell.views import View
 
 DrawnBy = Literal["method", "display", "trainer"]  # a timed frame; "trainer": the display did not open there
 Status = Literal["done", "crashed", "diverged", "timeout", "out of memory"]
 VARIED = ("factory", "changes", "subject")
 PRINTED = ("reason", "training", "provenance", "drawn_on", "evaluated_code")  # texts of a result, for people to read
+CHECKPOINT = "model.safetensors"
 RETIRED = ("choice", "search_seconds")
+
+
+class MethodFailed(Exception):
+    """The method did not come through; `status` says how."""
+
+    def __init__(self, status: Status, reason: str) -> None:
+        super().__init__(one_line(reason))
+        self.status: Status = status
+
+
+class CaptureModifiedError(MethodFailed):
+    """The capture is no longer what it was when a method that could reach it began."""
+
+    def __init__(self, damage: str) -> None:
+        super().__init__("crashed", f"while it ran without isolation the capture was changed: {damage}")
+
+
+class HarnessFailed(Exception):
+    """Something of ours failed before the method began, so that the method has no result from it."""
+
+
+class Killed(Exception):
+    """The method's process was killed by somebody else, such as the kernel for want of memory."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class View:
+    """One image to score."""
+
+    split: str
+    camera: str
+    frame: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TrainingTime:
+    """Seconds of a training, seen from outside: by the clock, and of CPU time of all the method's processes.
+
+    A process that was stopped, or shared its core, has less of the latter; one that used several cores has more.
+    """
+
+    wall_s: float
+    cpu_s: float | None  # None: a result from before it was measured
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -330,9 +373,6 @@ def _by_region(scores: dict[str, float]) -> dict[tuple[str, str], float]:
     """Scores by region and metric, from names such as `foreground/psnr`."""
     pairs = [(name.split("/"), value) for name, value in scores.items()]
     return {(region, metric): value for (region, metric), value in pairs}
-
-
-CHECKPOINT = "model.safetensors"
 
 
 def is_trained(cell: Cell) -> bool:

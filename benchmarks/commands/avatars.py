@@ -128,7 +128,7 @@ class ExportCommand:
 
     def _export_capture(self, folder: Path) -> int:
         from ash.capture.formats import load_capture
-        from benchmarks.cell.views import evaluated_views
+        from benchmarks.cell.evaluation import evaluated_views
         from synth.export.formats import export
 
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

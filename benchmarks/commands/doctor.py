@@ -93,7 +93,7 @@ def _gpu() -> Finding:
 
 
 def _lpips() -> Finding:
-    from benchmarks.cell.weights import weights_file
+    from benchmarks.cell.metrics import weights_file
 
     try:
         path = weights_file()

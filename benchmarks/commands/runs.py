@@ -333,9 +333,9 @@ def _use_lpips(weights: Path | None) -> None:
     if weights is None:
         return
     from benchmarks.cell.lpips import Lpips
-    from benchmarks.cell.weights import ENVIRONMENT
+    from benchmarks.cell.metrics import LPIPS_WEIGHTS
 
-    os.environ[ENVIRONMENT] = str(weights.resolve())
+    os.environ[LPIPS_WEIGHTS] = str(weights.resolve())
     Lpips(weights)
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from ash.files import InputError, write_atomic, write_json
 from benchmarks.analysis.statistics import wilson
-from benchmarks.cell.children import METHOD_PATH, add_method_paths
+from benchmarks.cell.sandbox import METHOD_PATH, add_method_paths
 from benchmarks.cell.schema import CellResult
 from benchmarks.gate.gate import FINE, TIMED_AGAIN, Baseline, Check, judge_with_retries, summarise
 from benchmarks.gate.remeasure import remeasure

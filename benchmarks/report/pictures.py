@@ -19,8 +19,8 @@ from benchmarks.analysis.error_attribution import REGION_COLOURS, psnr_of, worst
 from benchmarks.analysis.results import RANKED_SPLITS
 from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell import metrics
-from benchmarks.cell.schema import Cell, CellResult, ViewScore, stored_prediction
-from benchmarks.cell.views import View, spread
+from benchmarks.cell.evaluation import spread
+from benchmarks.cell.schema import Cell, CellResult, View, ViewScore, stored_prediction
 from benchmarks.report.content import Strip
 
 PAPER = 236  # grey behind the subject: dark hair and light cloth are both visible

@@ -4,6 +4,7 @@ The subject is a person made of capsules, as Gaussians on its surface and as a m
 """
 
 import math
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -22,7 +23,7 @@ from ash.mesh.rasterizing import project_vertices, rasterize_mesh, rasterize_mes
 from ash.native.library import fma_peak, instruction_set, stage_ms
 from ash.rotations import rotmat_to_unitquat
 from ash.training.losses import l1_ssim_loss, l1_ssim_loss_naive, ssim_target
-from benchmarks.cell.timing import peak_memory_mb
+from benchmarks.cell.sandbox import peak_memory_mb
 from benchmarks.speed.timing import Candidate, SpeedRow, as_json, print_head, print_rows, rows_of, time_interleaved
 
 # Floating point operations of one splat at one pixel, counted in native/blend.inc: the exponent and its power of two,
@@ -307,7 +308,7 @@ def main(json_path: Path | None, device: torch.device = CPU) -> int:
         else:
             rows += result
             print_rows(result)
-    peak_mb = peak_memory_mb()
+    peak_mb = peak_memory_mb(os.getpid())
     print(f"peak memory of this process, torch and the definitions included: {peak_mb:.0f} MB")
     if json_path is not None:
         write_json(

@@ -5,19 +5,27 @@ weights loaded afresh.
 """
 
 import os
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from ash.capture.dataset import Capture
-from ash.capture.formats import load_capture, write_cameras, write_motion
+from ash.capture.formats import load_capture
 from ash.files import InputError, write_json
-from benchmarks.cell.access_guard import copy, seen_by_method
-from benchmarks.cell.client import BASE, TEST_VIEWS, WORK, sandbox_for
 from benchmarks.cell.registry import ORACLES, find_method
-from benchmarks.cell.sandbox import ISOLATION, SANDBOX_UNAVAILABLE
+from benchmarks.cell.sandbox import (
+    BASE,
+    ISOLATION,
+    SANDBOX_UNAVAILABLE,
+    TEST_VIEWS,
+    WORK,
+    SandboxSpec,
+    copy,
+    sandbox_for,
+    sandboxed,
+    seen_by_method,
+)
+from benchmarks.cell.worker import write_test_views
 from benchmarks.studies.conformance_worker import Outcome, Trial, few_views, read_outcome
 from benchmarks.suites.engine import Limits, last_line, watched_process
 
@@ -113,8 +121,7 @@ class _Bench:
         oracle, whole = self.name in ORACLES, self.capture
         for name in (WORK, TEST_VIEWS, BASE):
             (place / name).mkdir(parents=True, exist_ok=True)
-        write_cameras(place / TEST_VIEWS / "cameras.json", list(whole.cameras.values()))
-        write_motion(place / TEST_VIEWS / "motion.npz", whole.motion)
+        write_test_views(place / TEST_VIEWS, whole)
         if weights is not None:
             copy(weights, place / WORK / "given.safetensors")
         with seen_by_method(whole, place / "input", oracle=oracle) as seen:
@@ -133,17 +140,15 @@ class _Bench:
             write_json(place / WORK / "trial.json", asdict(trial))
             spec = None
             if not oracle and os.environ.get(ISOLATION) != "off":
-                spec = asdict(sandbox_for(place, whole, seen, find_method(self.name), None))
+                spec = sandbox_for(place, whole, seen, find_method(self.name), None)
             ran, refused = self._attempt(place, trial, spec)
             return self._attempt(place, trial, None)[0] if refused else ran
 
-    def _attempt(self, place: Path, trial: Trial, spec: dict[str, Any] | None) -> tuple[TrialRun, bool]:
+    def _attempt(self, place: Path, trial: Trial, spec: SandboxSpec | None) -> tuple[TrialRun, bool]:
         """How a trial ended, and whether that was for want of a sandbox."""
         work, log = place / WORK, place / "output.log"
-        write_json(work / "sandbox.json", spec)
-        ending = watched_process(
-            [sys.executable, "-P", "-m", "benchmarks.studies.conformance_entry", str(work)], log, self.limits
-        )
+        command = sandboxed(spec, "benchmarks.studies.conformance_worker", str(work))
+        ending = watched_process(command, log, self.limits)
         isolated = spec is not None
         if isolated and ending.exit_code == SANDBOX_UNAVAILABLE:
             return TrialRun(outcome=None), True

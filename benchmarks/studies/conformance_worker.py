@@ -1,4 +1,4 @@
-"""One trial of a method for `ash-bench check-method`, in a process of its own (`benchmarks.studies.conformance_entry`).
+"""One trial of a method for `ash-bench check-method`, in a process of its own, which `benchmarks.cell.sandbox` starts.
 
 Its folder holds `trial.json` (what to do); `outcome.json` is left there. Nothing is scored: pictures are hashed and
 compared by `benchmarks.studies.conformance`. What an outcome says of arrays and bad poses is told by the process in
@@ -6,6 +6,7 @@ which the method runs: a check for authors, no defence.
 """
 
 import hashlib
+import os
 import sys
 import time
 import traceback
@@ -24,10 +25,14 @@ from ash.capture.manifest import verify_capture
 from ash.capture.typed import from_json
 from ash.files import InputError, read_json, write_json
 from ash.protocol import Avatar, StageClock
-from benchmarks.cell.access_guard import InputModifiedError, TruthAccessError, watched_folders
-from benchmarks.cell.children import add_method_paths
 from benchmarks.cell.registry import find_method, located
-from benchmarks.cell.timing import peak_memory_mb
+from benchmarks.cell.sandbox import (
+    InputModifiedError,
+    TruthAccessError,
+    add_method_paths,
+    peak_memory_mb,
+    watched_folders,
+)
 
 SLACK = 1e-3  # By how much values may leave 0..1, and the alpha that counts as none: rounding, not light.
 
@@ -65,8 +70,10 @@ class Outcome:
     peak_mb: float = 0.0
 
 
-def main(folder: Path) -> int:
+def main(arguments: list[str]) -> int:
     """Do the trial whose folder is given."""
+    folder = Path(arguments[0])
+    os.chdir(folder)
     add_method_paths()
     try:
         trial: Trial = from_json(Trial, read_json(folder / "trial.json"))
@@ -117,7 +124,7 @@ def perform(trial: Trial, folder: Path) -> Outcome:
         found = replace(found, held_out=str(error))
     if not found.input and (problems := verify_capture(seen.folder)):
         found = replace(found, input=f"a file of the capture: {problems[0]}")
-    return replace(found, seconds=time.perf_counter() - start, peak_mb=peak_memory_mb())
+    return replace(found, seconds=time.perf_counter() - start, peak_mb=peak_memory_mb(os.getpid()))
 
 
 def few_views(capture: Capture) -> list[tuple[str, int]]:

@@ -15,12 +15,11 @@ from ash.capture.dataset import Capture, Motion
 from ash.capture.formats import load_capture, read_template_truth
 from ash.files import InputError, sha256_of, write_image, write_json
 from benchmarks.cell import metrics
-from benchmarks.cell.client import TEST_VIEWS
-from benchmarks.cell.errors import Killed, MethodFailed
+from benchmarks.cell.evaluation import spread
 from benchmarks.cell.registry import ORACLES
 from benchmarks.cell.run import trained_client
-from benchmarks.cell.schema import Cell, is_trained, result_of
-from benchmarks.cell.views import View, spread
+from benchmarks.cell.schema import Cell, Killed, MethodFailed, View, is_trained, result_of
+from benchmarks.cell.worker import TEST_VIEWS
 from benchmarks.report.pictures import on_paper
 from benchmarks.suites.progress import Progress
 from synth.capture import make_body, make_capture

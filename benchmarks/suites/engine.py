@@ -20,8 +20,8 @@ import psutil
 
 from ash.capture.manifest import read_manifest
 from ash.files import InputError, one_line, read_json, sha256_of
-from benchmarks.cell.children import clean_environment, kill_process_tree
 from benchmarks.cell.run import DISK_FULL, KILLED
+from benchmarks.cell.sandbox import clean_environment, kill_process_tree
 from benchmarks.cell.schema import (
     Cell,
     CellResult,

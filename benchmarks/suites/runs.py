@@ -14,9 +14,9 @@ from ash.capture.typed import from_json
 from ash.fields import for_json
 from ash.files import InputError, read_json, require_plain, run_lock, write_json
 from benchmarks.cell import sandbox
-from benchmarks.cell.children import clean_environment
 from benchmarks.cell.metrics import PROTOCOL
 from benchmarks.cell.registry import code_version, configured, find_method, offered
+from benchmarks.cell.sandbox import clean_environment
 from benchmarks.cell.schema import Cell, CellConfig, CellResult, printable, read_cell, result_of
 from benchmarks.suites.captures import (
     make_capture,
@@ -134,7 +134,7 @@ def require_runnable(suite: Suite, options: RunOptions) -> list[str]:
 def _require_importable(method: str, preset: str) -> None:
     """Import a method in a process of its own; only what that process refuses counts, not how it ends otherwise."""
     code = (
-        "import sys; from ash.files import InputError; from benchmarks.cell.children import add_method_paths\n"
+        "import sys; from ash.files import InputError; from benchmarks.cell.sandbox import add_method_paths\n"
         "from benchmarks.cell.registry import offered; add_method_paths()\n"
         "try: offered(*sys.argv[1:])\nexcept InputError as error: sys.exit(f'refused: {error}')"
     )

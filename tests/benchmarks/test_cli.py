@@ -16,7 +16,7 @@ from helpers.waiting import wait_for
 from ash.capture.manifest import read_manifest
 from benchmarks import cli
 from benchmarks.cell import registry
-from benchmarks.cell.children import METHOD_PATH
+from benchmarks.cell.sandbox import METHOD_PATH
 from benchmarks.commands import arguments
 from benchmarks.commands.captures import SynthCommand
 from benchmarks.suites import captures

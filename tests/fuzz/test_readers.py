@@ -29,7 +29,7 @@ from ash.capture.formats import load_capture, read_cameras, read_motion, read_sk
 from ash.capture.manifest import read_manifest, verify_capture
 from ash.checkpoints import load_module, read_safetensors
 from ash.files import InputError, read_arrays, read_image, read_json, write_image, write_json
-from benchmarks.cell.curves import read_curve
+from benchmarks.cell.evaluation import read_curve
 from benchmarks.cell.lpips import _load as read_tensors
 from benchmarks.cell.schema import Cell, CellConfig, failed_result, read_cell, read_result, write_config, write_result
 from benchmarks.gate.gate import read_baseline

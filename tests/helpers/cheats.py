@@ -11,7 +11,7 @@ from PIL import Image
 
 from ash.capture.dataset import Camera, Capture, Pose
 from ash.protocol import StageClock
-from benchmarks.cell.children import METHOD_PATH
+from benchmarks.cell.sandbox import METHOD_PATH
 
 
 class Honest(FakeAvatar):

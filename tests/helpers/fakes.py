@@ -26,7 +26,7 @@ from ash.capture.formats import write_cameras, write_motion, write_skeleton, wri
 from ash.capture.manifest import SCHEMA
 from ash.files import sha256_of, write_arrays, write_image, write_json
 from ash.protocol import StageClock
-from benchmarks.cell.children import METHOD_PATH
+from benchmarks.cell.sandbox import METHOD_PATH
 
 SIZE = 64
 TRAIN_FRAMES, TEST_FRAMES = 4, 3

@@ -3,7 +3,6 @@
 import ctypes
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -253,8 +252,9 @@ class Ends(FakeAvatar):
             case "works":
                 program = "import time\nwhile time.process_time() < 1: pass"
                 subprocess.run([sys.executable, "-c", program], check=True)
-            case "killed":
-                os.kill(os.getpid(), signal.SIGKILL)
+            case "waits":
+                (folder / "waits").touch()
+                time.sleep(600)
 
     def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
         image = super().render(pose, camera, clock=clock)
@@ -265,7 +265,7 @@ class Ends(FakeAvatar):
 
 
 HOW = (
-    "exit_2", "exit_0", "exit_130", "os_error", "input_error", "keyboard", "leaves", "loud", "killed", "bytes",
+    "exit_2", "exit_0", "exit_130", "os_error", "input_error", "keyboard", "leaves", "loud", "waits", "bytes",
     "units", "negative", "resumes", "sleeps", "spoils", "works", "overwrites", "fills", "forks",
 )  # fmt: skip
 

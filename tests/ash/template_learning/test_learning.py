@@ -24,7 +24,7 @@ from ash.template_learning.graph_nets import GraphDeformation
 from ash.template_learning.learning import learned_template, template_key, template_of
 from ash.template_learning.regressing import fit_graph, fit_linear, held_out_folds
 from ash.template_learning.tracking import Tracked, template_error_mm, track_scans
-from benchmarks.cell.access_guard import seen_by_method, watched
+from benchmarks.cell.sandbox import seen_by_method, watched
 
 SMALL = {"kind": "learned", "nodes": 30, "supervision": "scans"}
 BULGE_M = 0.012

@@ -9,7 +9,7 @@ from helpers.cells import cell, config
 from ash.protocol import TrainingOutcome
 from benchmarks.analysis import curves, stability
 from benchmarks.analysis.results import RunTables, load, load_images, load_snapshots
-from benchmarks.cell.curves import seconds_to_settle
+from benchmarks.cell.evaluation import seconds_to_settle
 from benchmarks.cell.schema import CellResult, CurvePoint, Snapshot, Summary, ViewScore, failed_result
 from benchmarks.report import sections, tables
 from benchmarks.report.content import Bullets

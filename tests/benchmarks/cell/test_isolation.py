@@ -4,6 +4,7 @@ import io
 import json
 import shutil
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,11 +15,10 @@ from helpers import fakes, thieves
 from ash.capture.formats import load_capture
 from ash.capture.manifest import verify_capture
 from ash.files import InputError, sha256_of
-from benchmarks.cell import client, kernels, sandbox
-from benchmarks.cell.access_guard import seen_by_method
-from benchmarks.cell.errors import MethodFailed
+from benchmarks.cell import sandbox, worker
 from benchmarks.cell.registry import find_method
-from benchmarks.cell.schema import Cell, failed_result, read_result, result_of, write_result
+from benchmarks.cell.sandbox import seen_by_method
+from benchmarks.cell.schema import Cell, MethodFailed, failed_result, read_result, result_of, write_result
 from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells
 from benchmarks.suites.progress import Progress
 from benchmarks.suites.runs import cell_for
@@ -87,7 +87,7 @@ def test_a_thief_finds_nothing_and_scores_what_it_draws(
     run([honest, cheat])
     result, expected = read_result(cheat.folder), read_result(honest.folder)
     assert result is not None and expected is not None and result.status == "done", result.reason
-    loot = json.loads((cheat.folder / client.WORK / "loot.json").read_text())
+    loot = json.loads((cheat.folder / sandbox.WORK / "loot.json").read_text())
     assert len(loot["fit"]) == len(loot["import"]) == 10
     assert not [name for attempts in loot.values() for name, found in attempts.items() if found not in ("", "''")]
     assert {path: sha256_of(path) for path in before} == before
@@ -110,8 +110,8 @@ def test_the_processor_s_time_stands_beside_the_clock_s(capture: Path, tmp_path:
 
 def test_what_an_earlier_attempt_left_damaged_is_not_the_method_s_fault(capture: Path, tmp_path: Path) -> None:
     target = cell("resumes", capture, tmp_path)
-    (target.folder / client.WORK).mkdir(parents=True)
-    (target.folder / client.WORK / "checkpoint.safetensors").write_bytes(b"half of it")
+    (target.folder / sandbox.WORK).mkdir(parents=True)
+    (target.folder / sandbox.WORK / "checkpoint.safetensors").write_bytes(b"half of it")
     run([target])
     result = read_result(target.folder)
     assert result is not None and result.status == "done", result and result.reason
@@ -126,14 +126,14 @@ def test_a_clock_that_contradicts_ours_is_told(capture: Path, tmp_path: Path) ->
 
 
 def test_a_slow_clock_gains_nothing_and_a_busy_machine_ends_no_cell() -> None:
-    def frames(way: float) -> list[client.Timed]:
-        return [client.Timed(inside_ms=ms, stage_ms={}, outside_ms=ms + way + ms / 50) for ms in (5.0, 6.0, 9.0)]
+    def frames(way: float) -> list[worker.Timed]:
+        return [worker.Timed(inside_ms=ms, stage_ms={}, outside_ms=ms + way + ms / 50) for ms in (5.0, 6.0, 9.0)]
 
-    assert client.frame_times_ms(frames(0.5)) == (5.0, 6.0, 9.0)
-    assert client.frame_times_ms(frames(6.0)) == pytest.approx((11.1, 12.12, 15.18))
+    assert worker.frame_times_ms(frames(0.5)) == (5.0, 6.0, 9.0)
+    assert worker.frame_times_ms(frames(6.0)) == pytest.approx((11.1, 12.12, 15.18))
     for way in (30.0, -1.0):
         with pytest.raises(MethodFailed, match="its clock says"):
-            client.frame_times_ms(frames(way))
+            worker.frame_times_ms(frames(way))
 
 
 def test_a_picture_that_was_drawn_before_is_not_timed(capture: Path, tmp_path: Path) -> None:
@@ -232,7 +232,7 @@ def test_a_display_that_shows_something_else_fails_its_cell(capture: Path, tmp_p
         ("exit_2", "crashed", "exit code 2"), ("exit_0", "crashed", "exit code 0"),
         ("os_error", "crashed", "No space left"), ("input_error", "crashed", "own refusal"),
         ("keyboard", "crashed", "KeyboardInterrupt"), ("exit_130", "crashed", "SystemExit"),
-        ("killed", "crashed", "killed from outside in each of 2"), ("bytes", "crashed", "expected an image float32"),
+        ("bytes", "crashed", "expected an image float32"),
         ("units", "crashed", "expected 0 to 1"), ("negative", "crashed", "expected a whole number"),
     ],
 )  # fmt: skip
@@ -243,6 +243,35 @@ def test_however_a_method_ends_its_cell_has_a_result(
     run([bad])
     result = result_of(bad)
     assert result is not None and result.status == status and reason in result.reason, result.reason
+
+
+@pytest.mark.parametrize("way", ["on", "off"])
+def test_a_method_that_is_killed_from_outside_is_tried_again_and_then_crashed(
+    way: str, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the kernel kills for want of memory."""
+    monkeypatch.setenv(sandbox.ISOLATION, way)
+    waits = cell("waits", capture, tmp_path)
+    with ThreadPoolExecutor(1) as pool:
+        killed = pool.submit(_kill_when_it_waits, waits.folder / sandbox.WORK / "waits", times=2)
+        run([waits])
+        assert killed.result() == 2
+    result = result_of(waits)
+    assert result.status == "crashed" and "killed from outside in each of 2" in result.reason
+
+
+def _kill_when_it_waits(sign: Path, *, times: int) -> int:
+    """Kill the innermost process of a method that has said by a file that it waits."""
+    killed, deadline = 0, time.monotonic() + 120
+    while killed < times and time.monotonic() < deadline:
+        time.sleep(0.1)
+        if not sign.exists():
+            continue
+        sign.unlink()
+        named = [p for p in psutil.Process().children(recursive=True) if "benchmarks.cell.worker" in p.cmdline()]
+        named[-1].kill()
+        killed += 1
+    return killed
 
 
 def test_printing_is_bounded_and_processes_end_with_their_cell(capture: Path, tmp_path: Path) -> None:
@@ -278,7 +307,7 @@ def test_isolation_costs_a_cell_at_most_half_a_second(
         monkeypatch.setenv(sandbox.ISOLATION, way)
         start = time.perf_counter()
         with seen_by_method(whole, tmp_path / "input", oracle=way == "off") as seen:
-            with client.open_client(target, whole, seen, method, oracle=False) as opened:
+            with worker.open_client(target, whole, seen, method, oracle=False) as opened:
                 if opened.isolated != (way == "on"):
                     pytest.skip("this kernel gives no namespaces")
             return time.perf_counter() - start
@@ -294,29 +323,29 @@ def test_kernels_are_compiled_once_and_every_cell_has_its_own_copy(
     seeded: bool, way: str, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On Warp's CPU device, as if it were a GPU."""
-    monkeypatch.setattr(kernels, "runs_kernels", lambda device: seeded)
+    monkeypatch.setattr(worker, "runs_kernels", lambda device: seeded)
     monkeypatch.setenv(sandbox.ISOLATION, way)
     target, whole = cell("warps", capture, tmp_path), load_capture(capture)
     method = find_method("warps")
     with (
         seen_by_method(whole, tmp_path / "input", oracle=False) as seen,
-        client.open_client(target, whole, seen, method, oracle=False) as opened,
+        worker.open_client(target, whole, seen, method, oracle=False) as opened,
     ):
         opened.make()
         opened.fit()
-    told = json.loads((target.folder / client.WORK / "compiled.json").read_text())
+    told = json.loads((target.folder / sandbox.WORK / "compiled.json").read_text())
     assert told["seen"] == 16, "the triangle covers the whole picture"
     assert bool(told["before"]) == seeded and bool(told["after"])
     assert (told["after"] == told["before"]) == seeded, "what lies there is not compiled again"
-    assert not (target.folder / kernels.KERNELS).exists()
+    assert not (target.folder / worker.KERNELS).exists()
     if seeded:
-        again = kernels.copy_kernel_cache("cpu", tmp_path / "again")
+        again = worker.copy_kernel_cache("cpu", tmp_path / "again")
         assert not [path for path in again.rglob("*") if path.is_file() and path.read_bytes() == b"spoilt"]
 
 
 def test_without_a_gpu_there_is_nothing_to_compile(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert not any(kernels.copy_kernel_cache("cpu", tmp_path).iterdir()) and capfd.readouterr().err == ""
-    assert not any(kernels.copy_kernel_cache("cuda:99", tmp_path).iterdir())
+    assert not any(worker.copy_kernel_cache("cpu", tmp_path).iterdir()) and capfd.readouterr().err == ""
+    assert not any(worker.copy_kernel_cache("cuda:99", tmp_path).iterdir())
     assert "device cuda:99: no kernels are compiled, Warp" in capfd.readouterr().err
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from ash.files import InputError
-from benchmarks.cell import evaluation, lpips, weights
+from benchmarks.cell import evaluation, lpips, metrics
 
 
 def alexnet() -> nn.Sequential:
@@ -22,7 +22,7 @@ def alexnet() -> nn.Sequential:
 def backbone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Random weights in the form of torchvision's file, its classifier included."""
     torch.manual_seed(0)
-    path = tmp_path_factory.mktemp("weights") / weights.HUB_FILE
+    path = tmp_path_factory.mktemp("weights") / metrics.HUB_FILE
     tensors = {f"features.{name}": tensor for name, tensor in alexnet().state_dict().items()}
     torch.save({**tensors, "classifier.1.bias": torch.zeros(4096)}, path)
     return path
@@ -73,7 +73,7 @@ def test_it_is_computed_on_its_device(backbone: Path, pair) -> None:
 def test_a_machine_without_the_device_of_the_pictures_computes_it_on_its_cpu(
     backbone: Path, pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(weights.ENVIRONMENT, str(backbone))
+    monkeypatch.setenv(metrics.LPIPS_WEIGHTS, str(backbone))
     evaluation._perceptual.cache_clear()
     distances = [evaluation._perceptual(device)(*pair) for device in ("cpu", "cuda:99")]
     evaluation._perceptual.cache_clear()
@@ -81,14 +81,14 @@ def test_a_machine_without_the_device_of_the_pictures_computes_it_on_its_cpu(
 
 
 def test_without_weights_there_is_none(tmp_path: Path, backbone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(weights.ENVIRONMENT, raising=False)
+    monkeypatch.delenv(metrics.LPIPS_WEIGHTS, raising=False)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    assert weights.weights_file() is None
-    monkeypatch.setenv(weights.ENVIRONMENT, str(backbone))
-    assert weights.weights_file() == backbone
-    monkeypatch.setenv(weights.ENVIRONMENT, str(tmp_path / "none"))
+    assert metrics.weights_file() is None
+    monkeypatch.setenv(metrics.LPIPS_WEIGHTS, str(backbone))
+    assert metrics.weights_file() == backbone
+    monkeypatch.setenv(metrics.LPIPS_WEIGHTS, str(tmp_path / "none"))
     with pytest.raises(InputError, match="expected AlexNet's weights"):
-        weights.weights_file()
+        metrics.weights_file()
 
 
 def test_files_that_are_no_alexnet(tmp_path: Path) -> None:

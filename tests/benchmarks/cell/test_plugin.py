@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from helpers import fakes
 
-from benchmarks.cell.children import METHOD_PATH
+from benchmarks.cell.sandbox import METHOD_PATH
 from benchmarks.cell.schema import read_result
 
 PACKAGE = Path(__file__).parents[2] / "helpers" / "plugin"

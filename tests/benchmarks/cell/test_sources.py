@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.cell.registry import code_version
-from benchmarks.cell.sources import imported_from, sources_below
+from benchmarks.cell.registry import code_version, imported_from, sources_below
 
 PROJECT = """
 [build-system]

@@ -6,11 +6,12 @@ import sys
 import numpy as np
 
 ASK = """
+import os
 import numpy as np
-from benchmarks.cell.timing import peak_memory_mb
-before = peak_memory_mb()
+from benchmarks.cell.sandbox import peak_memory_mb
+before = peak_memory_mb(os.getpid())
 np.ones(1 << 25).sum()
-print(before, peak_memory_mb())
+print(before, peak_memory_mb(os.getpid()))
 """
 
 

@@ -4,7 +4,8 @@ import pytest
 from helpers.captures import write_tube_capture
 
 from ash.capture.manifest import Split
-from benchmarks.cell.views import View, evaluated_views, playback
+from benchmarks.cell.evaluation import evaluated_views, playback
+from benchmarks.cell.schema import View
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 from ash.files import InputError
 from benchmarks.analysis.results import COLUMNS, RunTables, csv_of, foreground, load, read_csv, samples_of
 from benchmarks.analysis.statistics import independent
-from benchmarks.cell.curves import read_curve
+from benchmarks.cell.evaluation import read_curve
 from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.schema import (
     Cell,

@@ -10,7 +10,7 @@ from ash.capture.formats import load_capture
 from ash.capture.manifest import verify_capture
 from ash.files import sha256_of
 from benchmarks import cli
-from benchmarks.cell.access_guard import InputModifiedError, TruthAccessError, seen_by_method, training_copy, watched
+from benchmarks.cell.sandbox import InputModifiedError, TruthAccessError, seen_by_method, training_copy, watched
 from benchmarks.cell.schema import Cell, CellConfig, read_result
 from benchmarks.commands import arguments
 from benchmarks.studies.conformance import check_method
