@@ -545,7 +545,7 @@ def _peak_mb(process: psutil.Process) -> float:
 
 
 def sandboxed(spec: SandboxSpec | None, *call: str) -> list[str]:
-    """The command that enters a sandbox and runs `call`: module, arguments. None: no sandbox; it ends with its parent."""
+    """The command that runs `call` (a module, its arguments) in a sandbox; None: in none, but ended with its parent."""
     described = json.dumps(None if spec is None else asdict(spec))
     return [sys.executable, "-P", "-m", "benchmarks.cell.sandbox", described, *call]
 
