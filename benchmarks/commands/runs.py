@@ -306,6 +306,9 @@ class EvalCommand:
             return self._on_motion(self.motion)
         if self.scores_only and self.device is not None:
             raise InputError("--scores-only renders nothing: expected no --device")
+        for name in ("frames", "out", "workers"):
+            if getattr(self, name) != getattr(type(self), name):
+                raise InputError(f"--{name}: goes with --motion")
         _use_lpips(self.lpips_weights)
         if self.scores_only:
             return _again(self.run, rescore_cell)
