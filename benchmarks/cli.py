@@ -142,8 +142,8 @@ def _parse(tokens: Sequence[str]) -> Command | None:
 
 def _command(name: str) -> type[Any]:
     module, _, command = COMMANDS[name].partition(":")
-    found: type[Any] = getattr(import_module(f"benchmarks.commands.{module}"), command)
-    return found
+    kind: type[Any] = getattr(import_module(f"benchmarks.commands.{module}"), command)
+    return kind
 
 
 def _refuse(line: str) -> int:

@@ -49,7 +49,7 @@ def changed_since(revision: str) -> tuple[str, ...] | None:
 
 def machine() -> dict[str, str]:
     """Processor, cores, memory, operating system, GPU."""
-    found = {
+    facts = {
         "processor": processor_name(),
         "cores": str(cores()),
         "memory_gb": f"{psutil.virtual_memory().total / 2**30:.0f}",
@@ -57,18 +57,18 @@ def machine() -> dict[str, str]:
         "python": platform.python_version(),
         "gpu": gpu_name() or "none",
     }
-    return found
+    return facts
 
 
 def versions() -> dict[str, str]:
     """Versions of the packages that numbers depend on."""
-    found = {}
+    facts = {}
     for package in PACKAGES:
         try:
-            found[package] = version(package)
+            facts[package] = version(package)
         except PackageNotFoundError:
             continue
-    return found
+    return facts
 
 
 def cores() -> int:

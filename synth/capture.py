@@ -256,7 +256,7 @@ def drape(scene: Scene, folder: Path, motion: Motion, clip: np.ndarray) -> Drape
         write_arrays(surface_path(folder, int(frame)), vertices=stored)
         corners.append(hull_of(stored.astype(np.float64)))
     return Draped(
-        template=moved[:, body.kept],
+        template=moved[:, body.template_to_surface],
         poking=penetrations(body, moved),
         stretch=stretch(body, moved, "skirt" if scene.outfit.skirt else "shirt"),
         corners=hull_of(np.concatenate(corners)),

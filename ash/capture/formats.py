@@ -31,8 +31,8 @@ def read_cameras(path: Path) -> dict[str, Camera]:
     """
     cameras: dict[str, Camera] = {}
     try:
-        told = read_json(path)
-        for row in told if isinstance(told, list) else told["cameras"]:
+        content = read_json(path)
+        for row in content if isinstance(content, list) else content["cameras"]:
             camera = Camera(
                 name=_plain_name(path, row["name"]),
                 width=_whole(row["width"]),

@@ -15,7 +15,7 @@ SPLITS = ("train", "novel_view", "near_pose", "novel_pose", "far_pose")
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Split:
-    """Which cameras and frames belong together: where no parts are told, every camera saw every frame."""
+    """Which cameras and frames belong together: where no parts are given, every camera saw every frame."""
 
     cameras: tuple[str, ...]
     frames: tuple[int, ...]
@@ -49,17 +49,19 @@ class Split:
             InputError: none of its images is.
         """
         few_cameras, few_frames = set(self.cameras if cameras is None else cameras), set(frames or ())
-        kept = {
+        cameras_by_frame = {
             frame: tuple(name for name in part if name in few_cameras)
             for frame, part in zip(self.frames, self.cameras_per_frame, strict=True)
             if frames is None or frame in few_frames
         }
-        kept = {frame: part for frame, part in kept.items() if part}
-        if not kept:
+        cameras_by_frame = {frame: part for frame, part in cameras_by_frame.items() if part}
+        if not cameras_by_frame:
             raise InputError("expected images of the split, got cameras and frames that have none together")
-        used = {name for part in kept.values() for name in part}
+        used = {name for part in cameras_by_frame.values() for name in part}
         names = tuple(name for name in self.cameras if name in used)
-        return Split(cameras=names, frames=tuple(kept), parts=tuple(kept.values()) if self.parts else ())
+        return Split(
+            cameras=names, frames=tuple(cameras_by_frame), parts=tuple(cameras_by_frame.values()) if self.parts else ()
+        )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -83,16 +85,16 @@ class Manifest:
 
     def write(self, folder: Path) -> None:
         """Write it into a capture's folder, atomically."""
-        told = {f.name: getattr(self, f.name) for f in fields(self)}
-        told["splits"] = {name: _told(split) for name, split in self.splits.items()}
-        said = {name: value for name, value in told.items() if name == "files" or value not in ("", {}, None)}
-        write_json(folder / NAME, {"schema": SCHEMA} | said)
+        content = {f.name: getattr(self, f.name) for f in fields(self)}
+        content["splits"] = {name: _as_json(split) for name, split in self.splits.items()}
+        given = {name: value for name, value in content.items() if name == "files" or value not in ("", {}, None)}
+        write_json(folder / NAME, {"schema": SCHEMA} | given)
 
 
-def _told(split: Split) -> dict[str, Any]:
+def _as_json(split: Split) -> dict[str, Any]:
     """A split as JSON, which says nothing of parts where every camera saw every frame."""
-    told: dict[str, Any] = {"cameras": list(split.cameras), "frames": list(split.frames)}
-    return told | ({"parts": [list(part) for part in split.parts]} if split.parts else {})
+    content: dict[str, Any] = {"cameras": list(split.cameras), "frames": list(split.frames)}
+    return content | ({"parts": [list(part) for part in split.parts]} if split.parts else {})
 
 
 def is_capture(folder: Path) -> bool:
@@ -103,14 +105,14 @@ def is_capture(folder: Path) -> bool:
 def read_manifest(folder: Path) -> Manifest:
     """Read a manifest and check that this version of the package understands it."""
     path = folder / NAME
-    told = read_json(path)
-    if not isinstance(told, dict) or told.get("schema") != SCHEMA:
-        found = told.get("schema") if isinstance(told, dict) else None
+    content = read_json(path)
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
+        found = content.get("schema") if isinstance(content, dict) else None
         raise InputError(f"{path}: expected capture schema {SCHEMA}, got {found}")
     try:
-        if "complete" not in told:
+        if "complete" not in content:
             raise ValueError("the key 'complete' is missing")
-        manifest: Manifest = from_json(Manifest, {name: value for name, value in told.items() if name != "schema"})
+        manifest: Manifest = from_json(Manifest, {name: value for name, value in content.items() if name != "schema"})
         require_plain(manifest.scene, what="scene")
         require_plain(manifest.size, what="size", may_be_empty=True)
         _require_splits(manifest.splits)

@@ -91,8 +91,8 @@ def draw_all(cell: Cell, capture: Capture, client: MethodClient) -> MethodOutput
         )
     agreement_db = min(_agreement(image, stored_prediction(cell, capture, view)) for view, image in shown)
     if agreement_db < LEAST_AGREEMENT_DB:
-        told = f"{agreement_db:.1f} dB, expected {LEAST_AGREEMENT_DB:.0f} or more"
-        raise MethodFailed("crashed", f"a timed picture differs from the one that was scored by {told}")
+        measured = f"{agreement_db:.1f} dB, expected {LEAST_AGREEMENT_DB:.0f} or more"
+        raise MethodFailed("crashed", f"a timed picture differs from the one that was scored by {measured}")
     return MethodOutputs(
         views=views,
         timing=replace(timing, agreement_db=agreement_db),
@@ -139,7 +139,7 @@ def judge(
 
 def _snapshots(cell: Cell, capture: Capture, client: MethodClient, views: tuple[View, ...]) -> tuple[Snapshot, ...]:
     """What the avatar would have scored had training ended earlier, of a method that left its weights of then."""
-    found = []
+    snapshots = []
     for path in sorted((cell.folder / WORK / "snapshots").glob("*.safetensors"))[:MOST_SNAPSHOTS]:
         if not path.stem.isdecimal() or len(path.stem) > 9:
             continue
@@ -148,8 +148,8 @@ def _snapshots(cell: Cell, capture: Capture, client: MethodClient, views: tuple[
         for split in IMAGE_SPLITS:
             scores = [_psnr(capture, v, image) for v, image in zip(views, drawn, strict=True) if v.split == split]
             if scores:
-                found.append(Snapshot(seconds=float(path.stem), split=split, psnr=float(np.mean(scores))))
-    return tuple(found)
+                snapshots.append(Snapshot(seconds=float(path.stem), split=split, psnr=float(np.mean(scores))))
+    return tuple(snapshots)
 
 
 def _psnr(capture: Capture, view: View, prediction: np.ndarray) -> float:

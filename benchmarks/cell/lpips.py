@@ -25,9 +25,9 @@ class Lpips:
     def __init__(self, backbone: Path, device: str = "cpu") -> None:
         self.device = _there(device)
         self.trunk = _trunk(_load(backbone), backbone).to(self.device)
-        found = _load(_heads_file())
+        tensors = _load(_heads_file())
         try:
-            self.heads = [found[f"lin{i}.model.1.weight"].to(self.device) for i in range(len(TAPS))]
+            self.heads = [tensors[f"lin{i}.model.1.weight"].to(self.device) for i in range(len(TAPS))]
         except KeyError as error:
             raise InputError(f"{_heads_file()}: expected the heads of LPIPS, which has no {error}") from error
 
@@ -53,12 +53,12 @@ def _prepared(image: np.ndarray) -> Float[Tensor, "1 3 h w"]:
 
 def _activations(trunk: nn.Sequential, image: Float[Tensor, "1 3 h w"]) -> list[Tensor]:
     """Activations at the taps, each pixel's vector of channels scaled to unit length."""
-    found = []
+    tensors = []
     for index, layer in enumerate(trunk):
         image = layer(image)
         if index in TAPS:
-            found.append(image / (image.pow(2).sum(1, keepdim=True).sqrt() + 1e-10))
-    return found
+            tensors.append(image / (image.pow(2).sum(1, keepdim=True).sqrt() + 1e-10))
+    return tensors
 
 
 def _trunk(weights: dict[str, Tensor], path: Path) -> nn.Sequential:

@@ -76,17 +76,17 @@ def is_oracle(row: str) -> bool:
 
 def named_method(row: str) -> str:
     """The method whose name a row's name begins with; of `package.module:factory`, the factory."""
-    found = ROW_NAME.match(row)
-    return (found.group() if found else row).rpartition(":")[2]
+    matched = ROW_NAME.match(row)
+    return (matched.group() if matched else row).rpartition(":")[2]
 
 
 def methods() -> dict[str, Method]:
     """All installed methods, ours and anyone's."""
-    found = {}
+    installed = {}
     for entry in sorted(entry_points(group=METHOD_GROUP), key=lambda entry: entry.name):
         distribution = f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else ""
-        found[entry.name] = Method(name=entry.name, target=entry.value, distribution=distribution)
-    return found
+        installed[entry.name] = Method(name=entry.name, target=entry.value, distribution=distribution)
+    return installed
 
 
 def find_method(name: str) -> Method:
@@ -145,15 +145,15 @@ def current_fields(config: Any, changes: Mapping[str, Any] | Changes) -> dict[st
 
 def located(error: BaseException, target: str) -> str:
     """An error with file and line: the last of the method's own files on its way, or where it was raised."""
-    told = f"{type(error).__name__}: {error}"
+    message = f"{type(error).__name__}: {error}"
     reached = traceback.extract_tb(error.__traceback__)
     spec = find_spec_of(target)
     own = "" if spec is None or spec.origin is None else str(Path(spec.origin).parent)
     places = [place for place in reached if own and place.filename.startswith(own)] or reached
     if isinstance(error, SyntaxError) or not places:  # It says itself where it is.
-        return told
+        return message
     path = Path(places[-1].filename)
-    return f"{told} ({path.parent.name}/{path.name}:{places[-1].lineno})"
+    return f"{message} ({path.parent.name}/{path.name}:{places[-1].lineno})"
 
 
 def find_spec_of(target: str) -> ModuleSpec | None:
@@ -169,10 +169,10 @@ def code_version(method: str) -> str:
     """SHA-256 over everything of ours that decides a cell's outcome, and all sources of a third party's method."""
     roots = [*(_package_folder(package) for package in DECIDING_PACKAGES), Path(__file__).parent]
     digest = hashlib.sha256(hash_sources(*roots).encode())
-    found = find_method(method)
-    if not found.is_ours:
-        digest.update(f"{found.target} {found.distribution}".encode())
-        digest.update(_sources_of(found).encode())
+    source = find_method(method)
+    if not source.is_ours:
+        digest.update(f"{source.target} {source.distribution}".encode())
+        digest.update(_sources_of(source).encode())
     return digest.hexdigest()[:16]
 
 
@@ -207,19 +207,19 @@ def plugin_hash(target: str, distribution_name: str) -> str:
     return digest.hexdigest()
 
 
-def distribution_files(found: Distribution) -> set[Path]:
+def distribution_files(installed: Distribution) -> set[Path]:
     """The sources that a distribution installed, or of an editable one all below its project's folder."""
-    project = editable_folder(found)
+    project = editable_folder(installed)
     if project is not None:
         return sources_below(project)
-    listed = [Path(str(found.locate_file(name))) for name in found.files or ()]
+    listed = [Path(str(installed.locate_file(name))) for name in installed.files or ()]
     return {path for path in listed if path.suffix in SUFFIXES and path.is_file()}
 
 
-def editable_folder(found: Distribution) -> Path | None:
+def editable_folder(installed: Distribution) -> Path | None:
     """Where the project of an editable installation lies (PEP 610)."""
     try:
-        described = json.loads(found.read_text("direct_url.json") or "{}")
+        described = json.loads(installed.read_text("direct_url.json") or "{}")
         if described.get("dir_info", {}).get("editable"):
             return Path(unquote(urlsplit(described["url"]).path))
     except (AttributeError, KeyError, TypeError, ValueError):
@@ -241,7 +241,7 @@ def package_files(target: str) -> set[Path]:
 
 def sources_below(folder: Path) -> set[Path]:
     """Every file of source below a folder, without environments, caches and what a build left."""
-    found = set()
+    sources = set()
     for place, folders, names in os.walk(folder):
         here = Path(place)
         folders[:] = [
@@ -249,20 +249,20 @@ def sources_below(folder: Path) -> set[Path]:
             for name in folders
             if name not in NOT_SOURCES and name[0] != "." and not (here / name / "pyvenv.cfg").exists()
         ]
-        found |= {here / name for name in names if Path(name).suffix in SUFFIXES and (here / name).is_file()}
-    return found
+        sources |= {here / name for name in names if Path(name).suffix in SUFFIXES and (here / name).is_file()}
+    return sources
 
 
 def imported_from(module: Path) -> set[Path]:
     """A file, and the modules and packages in its folder that it imports, directly or through each other."""
-    found, todo = {module}, [module]
+    sources, todo = {module}, [module]
     while todo:
         for name in _imports(todo.pop()):
             single, package = module.parent / f"{name}.py", module.parent / name
             new = {single} if single.is_file() else sources_below(package) if package.is_dir() else set()
-            todo += [path for path in new - found if path.suffix == ".py"]
-            found |= new
-    return found
+            todo += [path for path in new - sources if path.suffix == ".py"]
+            sources |= new
+    return sources
 
 
 def _imports(path: Path) -> set[str]:

@@ -195,8 +195,8 @@ def rescore_cell(cell: Cell) -> CellResult:
             raise InputError(f"{name}: altered since it was scored (SHA-256 differs from result.json)")
     recomputed = _image_summary(scored) + _gap_summary(scored) + _flicker_summary(cell, capture, scored)
     names = {(row.split, row.region, row.metric) for row in recomputed}
-    kept = tuple(row for row in before.summary if (row.split, row.region, row.metric) not in names)
-    result = replace(before, views=tuple(scored), summary=recomputed + kept)
+    others = tuple(row for row in before.summary if (row.split, row.region, row.metric) not in names)
+    result = replace(before, views=tuple(scored), summary=recomputed + others)
     write_result(cell.folder, result)
     return result
 

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 CLONE_NEWNS, CLONE_NEWIPC, CLONE_NEWUSER, CLONE_NEWPID, CLONE_NEWNET = 1 << 17, 1 << 27, 1 << 28, 1 << 29, 1 << 30
 MS_RDONLY, MS_REMOUNT, MS_BIND, MS_REC, MS_PRIVATE = 1, 1 << 5, 1 << 12, 1 << 14, 1 << 18
-KEPT_FLAGS = 2 | 4 | 8 | 1024 | 2048  # nosuid, nodev, noexec, noatime, nodiratime: the kernel locks them
+LOCKED_FLAGS = 2 | 4 | 8 | 1024 | 2048  # nosuid, nodev, noexec, noatime, nodiratime: the kernel locks them
 MNT_DETACH = 2
 PR_SET_PDEATHSIG, PR_CAPBSET_DROP, PR_SET_NO_NEW_PRIVS, PR_CAP_AMBIENT, PR_CAP_AMBIENT_CLEAR_ALL = 1, 24, 38, 47, 4
 PIVOT_ROOT = {"x86_64": 155, "aarch64": 41}
@@ -194,11 +194,11 @@ def _mount_filesystem(spec: SandboxSpec) -> None:
 
 def _outermost(places: Iterable[str]) -> list[str]:
     """Those that lie in no other, and not in what the system gives."""
-    found: list[str] = []
+    outermost: list[str] = []
     for place in sorted(set(places)):
-        if not any(place == above or place.startswith(above + "/") for above in (*found, "/usr", "/lib", "/opt")):
-            found.append(place)
-    return found
+        if not any(place == above or place.startswith(above + "/") for above in (*outermost, "/usr", "/lib", "/opt")):
+            outermost.append(place)
+    return outermost
 
 
 def _bind(base: str, place: str, *, read_only: bool) -> None:
@@ -218,8 +218,8 @@ def _make_read_only(target: str) -> None:
     try:
         _syscall("mount_setattr", MOUNT_SETATTR, AT_FDCWD, target.encode(), AT_RECURSIVE, attributes, 32)
     except SandboxUnavailable:  # A kernel before 5.12: the folder itself, not what is mounted below.
-        kept = os.statvfs(target).f_flag & KEPT_FLAGS
-        _mount("none", target, None, MS_REMOUNT | MS_BIND | MS_RDONLY | kept)
+        flags = os.statvfs(target).f_flag & LOCKED_FLAGS
+        _mount("none", target, None, MS_REMOUNT | MS_BIND | MS_RDONLY | flags)
 
 
 def _empty(target: str) -> None:
@@ -448,11 +448,11 @@ def _refuse(error: TruthAccessError) -> None:
 
 def relay_output(output: IO[bytes]) -> None:
     """Print what the method prints: the first megabyte of it, and its last words."""
-    kept, left_out, last = 0, 0, b""
+    printed, left_out, last = 0, 0, b""
     while part := os.read(output.fileno(), 1 << 16):
-        now = part[: max(0, LOUDEST - kept)]
+        now = part[: max(0, LOUDEST - printed)]
         os.write(2, now)
-        kept += len(now)
+        printed += len(now)
         rest = part[len(now) :]
         left_out += len(rest)
         last = (last + rest)[-LAST_WORDS:]

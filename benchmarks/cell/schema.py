@@ -209,8 +209,8 @@ class CellResult:
 
     def value(self, split: str, region: str, metric: str) -> float | None:
         """One number of the summary."""
-        found = [row.value for row in self.summary if (row.split, row.region, row.metric) == (split, region, metric)]
-        return found[0] if found else None
+        values = [row.value for row in self.summary if (row.split, row.region, row.metric) == (split, region, metric)]
+        return values[0] if values else None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -137,10 +137,10 @@ class MethodClient:
 
     def open_display(self) -> DrawnBy:
         """Have what is timed from now on drawn by the method's display, where it has one that opens here."""
-        told: Any = self._ask("display")[0].get("drawn_by")
-        if told not in get_args(DrawnBy):
-            raise MethodFailed("crashed", f"expected who draws timed frames, got {told!r}")
-        return told  # type: ignore[no-any-return]
+        answer: Any = self._ask("display")[0].get("drawn_by")
+        if answer not in get_args(DrawnBy):
+            raise MethodFailed("crashed", f"expected who draws timed frames, got {answer!r}")
+        return answer  # type: ignore[no-any-return]
 
     def draw(self, view: View, camera: Camera, what: Literal["draw", "shown"] = "draw") -> np.ndarray:
         """One picture, float32 `[h, w, 4]`, finite; "shown": the one that was timed last."""
@@ -381,9 +381,9 @@ def _number(value: Any, what: str) -> float:
     return float(value)
 
 
-def _outcome(told: Any) -> TrainingOutcome | None:
+def _outcome(answer: Any) -> TrainingOutcome | None:
     try:
-        outcome: TrainingOutcome | None = from_json(TrainingOutcome | None, told, place="outcome")
+        outcome: TrainingOutcome | None = from_json(TrainingOutcome | None, answer, place="outcome")
         if outcome is not None:
             require_plain(outcome.ended_by, what="end of training")
     except ValueError as error:

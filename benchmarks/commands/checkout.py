@@ -107,8 +107,8 @@ class TestCommand:
         settings = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
         run = partial(subprocess.run, cwd=root, env={**settings, "OMP_NUM_THREADS": "1"}, check=False)
         with ThreadPoolExecutor() as beside:
-            told = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-            running = {name: beside.submit(run, ["nice", *command], **told) for name, command in brief.items()}
+            piped = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+            running = {name: beside.submit(run, ["nice", *command], **piped) for name, command in brief.items()}
             print("--- pytest", flush=True)
             failed = ["pytest"] if run([*module, "pytest", *spread, *self.pytest]).returncode else []
             for name, done in running.items():

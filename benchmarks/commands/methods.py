@@ -44,4 +44,4 @@ class CheckMethodCommand:
             folder = self.out or Path(scratch)
             checks = check(self.method, capture, folder, preset=self.preset, limits=limits, workers=workers)
         print(table(self.method, checks))
-        return DONE if all(check.kept for check in checks) else FAILED
+        return DONE if all(check.passed for check in checks) else FAILED

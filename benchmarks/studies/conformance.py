@@ -32,11 +32,11 @@ from benchmarks.suites.engine import Limits, last_line, watched_process
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RuleCheck:
-    """One rule, whether the method keeps it (None: it could not be told), and what was seen."""
+    """One rule, whether the method keeps it (None: undecided), and what was observed."""
 
     rule: str
-    kept: bool | None
-    seen: str
+    passed: bool | None
+    observed: str
     enforced: bool = True  # False: this system could only watch
 
 
@@ -77,7 +77,7 @@ def judge(ran: dict[str, TrialRun], limits: Limits) -> tuple[RuleCheck, ...]:
     loaded = ran["loaded"].outcome if "loaded" in ran else None
     slowest, largest = max((o.seconds for o in outcomes), default=0.0), max((o.peak_mb for o in outcomes), default=0.0)
     return (
-        RuleCheck(rule="comes through", kept=not crashes, seen=crashes[0] if crashes else f"{len(ran)} trials"),
+        RuleCheck(rule="comes through", passed=not crashes, observed=crashes[0] if crashes else f"{len(ran)} trials"),
         _first_problem("keeps the protocol", [o.protocol or o.weights for o in outcomes], "every function is there"),
         _first_problem("draws as the protocol says", [o.images for o in outcomes], "float32, finite, premultiplied"),
         _same("same seed, same bits", _pictures(first), _pictures(again)),
@@ -96,11 +96,11 @@ def judge(ran: dict[str, TrialRun], limits: Limits) -> tuple[RuleCheck, ...]:
 
 def table(method: str, checks: tuple[RuleCheck, ...]) -> str:
     """One line per rule."""
-    words = {True: "kept", False: "BROKEN", None: "untold"}
-    lines = [f"  {words[check.kept]:7} {check.rule:40} {check.seen}" for check in checks]
-    broken = sum(check.kept is False for check in checks)
-    untold = sum(check.kept is None for check in checks)
-    verdict = f"{broken} rules broken" if broken else f"{untold} rules untold" if untold else "all rules kept"
+    words = {True: "kept", False: "BROKEN", None: "undecided"}
+    lines = [f"  {words[check.passed]:7} {check.rule:40} {check.observed}" for check in checks]
+    broken = sum(check.passed is False for check in checks)
+    undecided = sum(check.passed is None for check in checks)
+    verdict = f"{broken} rules broken" if broken else f"{undecided} rules undecided" if undecided else "all rules kept"
     only = [check.rule for check in checks if not check.enforced]
     lines += [f"  not enforced on this system, only watched: {', '.join(only)}"] if only else []
     return "\n".join([f"{method}: {verdict}", *lines])
@@ -168,19 +168,19 @@ class _Bench:
 
 def _first_problem(rule: str, problems: list[str], fine: str) -> RuleCheck:
     if not problems:
-        return _untold(rule)
-    found = next((problem for problem in problems if problem), "")
-    return RuleCheck(rule=rule, kept=not found, seen=found or fine)
+        return _undecided(rule)
+    problem = next((each for each in problems if each), "")
+    return RuleCheck(rule=rule, passed=not problem, observed=problem or fine)
 
 
 def _held_out(outcomes: list[Outcome], *, isolated: bool) -> RuleCheck:
     fine = "they were out of reach" if isolated else "only the training copy was opened, as far as Python tells"
-    found = _first_problem("leaves held-out views alone", [o.held_out for o in outcomes], fine)
-    return replace(found, enforced=isolated)
+    check = _first_problem("leaves held-out views alone", [o.held_out for o in outcomes], fine)
+    return replace(check, enforced=isolated)
 
 
-def _untold(rule: str) -> RuleCheck:
-    return RuleCheck(rule=rule, kept=None, seen="no trial came so far")
+def _undecided(rule: str) -> RuleCheck:
+    return RuleCheck(rule=rule, passed=None, observed="no trial came so far")
 
 
 def _pictures(outcome: Outcome | None) -> tuple[str, ...]:
@@ -189,26 +189,26 @@ def _pictures(outcome: Outcome | None) -> tuple[str, ...]:
 
 def _same(rule: str, ones: tuple[str, ...], others: tuple[str, ...] | None) -> RuleCheck:
     if not ones or not others:
-        return _untold(rule)
+        return _undecided(rule)
     equal = sum(a == b for a, b in zip(ones, others, strict=True))
-    return RuleCheck(rule=rule, kept=equal == len(ones), seen=f"{equal} of {len(ones)} images are equal")
+    return RuleCheck(rule=rule, passed=equal == len(ones), observed=f"{equal} of {len(ones)} images are equal")
 
 
 def _seeds(one: Outcome | None, other: Outcome | None) -> RuleCheck:
     """Error bars are the spread over seeds: a method that always draws the same would have none, and look certain."""
     rule = "the seed is what is random"
     if one is None or not one.pictures or not _pictures(other):
-        return _untold(rule)
+        return _undecided(rule)
     same = one.pictures == _pictures(other)
-    seen = {
+    sentences = {
         (True, True): "seedless, as it says",
         (True, False): "says seedless, and seeds differ",
         (False, True): "two seeds draw the same bits; a method without randomness has `seedless = True`",
         (False, False): "another seed draws other bits",
     }
-    return RuleCheck(rule=rule, kept=same == one.seedless, seen=seen[one.seedless, same])
+    return RuleCheck(rule=rule, passed=same == one.seedless, observed=sentences[one.seedless, same])
 
 
 def _limit(rule: str, ran: dict[str, TrialRun], what: str, fine: str) -> RuleCheck:
     over = [r.problem for r in ran.values() if r.over == what]
-    return RuleCheck(rule=rule, kept=not over, seen=over[0] if over else fine)
+    return RuleCheck(rule=rule, passed=not over, observed=over[0] if over else fine)

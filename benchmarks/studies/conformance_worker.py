@@ -113,18 +113,18 @@ def perform(trial: Trial, folder: Path) -> Outcome:
     drawn = replace(seen, cameras=cameras, motion=motion)
     factory = find_method(trial.target).load()
     start = time.perf_counter()
-    found = Outcome()
+    outcome = Outcome()
     try:
         closed = [] if trial.oracle else [trial.capture]
         with watched_folders(closed, seen.folder), _untouched(seen, "capture"):
-            found = _performed(trial, folder, drawn, seen, factory)
+            outcome = _performed(trial, folder, drawn, seen, factory)
     except (Changed, InputModifiedError) as error:
-        found = replace(found, input=str(error))
+        outcome = replace(outcome, input=str(error))
     except TruthAccessError as error:
-        found = replace(found, held_out=str(error))
-    if not found.input and (problems := verify_capture(seen.folder)):
-        found = replace(found, input=f"a file of the capture: {problems[0]}")
-    return replace(found, seconds=time.perf_counter() - start, peak_mb=peak_memory_mb(os.getpid()))
+        outcome = replace(outcome, held_out=str(error))
+    if not outcome.input and (problems := verify_capture(seen.folder)):
+        outcome = replace(outcome, input=f"a file of the capture: {problems[0]}")
+    return replace(outcome, seconds=time.perf_counter() - start, peak_mb=peak_memory_mb(os.getpid()))
 
 
 def few_views(capture: Capture) -> list[tuple[str, int]]:

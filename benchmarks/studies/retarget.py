@@ -61,8 +61,8 @@ def retarget(cells: list[Cell], motion: Path, out: Path, *, frames: int, workers
         truth = render_truth(own, motion, out / f"truth-{own.scene}", frames=frames, workers=workers)
         far = novelty_deg(own, truth)
         here = [cell for cell in driven if cell.capture_folder == place]
-        found = [score(cell, own, truth, out) for cell in here]
-        rows += found
+        scored = [score(cell, own, truth, out) for cell in here]
+        rows += scored
         content = {
             "scene": own.scene,
             "capture": own.identity,
@@ -72,7 +72,7 @@ def retarget(cells: list[Cell], motion: Path, out: Path, *, frames: int, workers
             "fps": truth.motion.fps,
             "made_by_the_same_code": own.manifest.code == truth.manifest.code,
             "novelty_deg": far,
-            "avatars": [asdict(row) for row in found],
+            "avatars": [asdict(row) for row in scored],
         }
         write_json(out / f"result-{own.scene}.json", content)
     return rows
@@ -102,7 +102,7 @@ def score(cell: Cell, own: Capture, truth: Capture, out: Path) -> Retargeted:
     before = result_of(cell)
 
     def mean(region: str, metric: str) -> float:
-        return float(np.mean([found[region, metric] for found in scores.values()]))
+        return float(np.mean([scored[region, metric] for scored in scores.values()]))
 
     return Retargeted(
         title=cell.config.title,

@@ -30,7 +30,7 @@ def estimate(suite: Suite, options: RunOptions) -> str:
             lines.append(f"capture {spec.name}: splatted, under a minute")
             continue
         lines.append(f"capture {spec.name}: {estimate_capture(described(spec)).text}")
-    lines += ["", *_told(cells)]
+    lines += ["", *_described(cells)]
     hours = len(cells) * suite.cell_minutes / 60
     beside = options.side_by_side
     wall = hours / min(beside, max(1, len(cells)))
@@ -38,7 +38,7 @@ def estimate(suite: Suite, options: RunOptions) -> str:
     return "\n".join(lines)
 
 
-def _told(cells: Sequence[CellSpec]) -> Iterator[str]:
+def _described(cells: Sequence[CellSpec]) -> Iterator[str]:
     """A line per capture, preset and seed."""
     for (capture, preset, seed), alike in groupby(cells, key=lambda cell: (cell.capture.name, cell.preset, cell.seed)):
         methods = [cell.method for cell in alike]

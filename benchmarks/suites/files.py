@@ -153,12 +153,12 @@ class _Reader:
                 raise self.error(
                     place, "a finished capture is taken as it is: expected no key but capture, name and methods"
                 )
-            spec = self.told(place, lambda: given_capture(Path(known["capture"]), name=known.get("name", "")))
+            spec = self.located(place, lambda: given_capture(Path(known["capture"]), name=known.get("name", "")))
             return replace(spec, methods=methods)
         of = self.required(known, place)
         name, size_of_it = known.get("name") or varied_name(of, changes), known.get("size", "")
         spec = SceneSpec(name=name, of=of, size=size_of_it, changes=changes, methods=methods)
-        self.told(place, lambda: scene_of(of, size=spec.size or size))
+        self.located(place, lambda: scene_of(of, size=spec.size or size))
         self.each(place, changes, lambda some: scene_of(of, size=spec.size or size, changes=some))
         return spec
 
@@ -167,7 +167,7 @@ class _Reader:
         place: Place = ("methods", index)
         known, changes = self.split(row, place, METHOD_KEYS)
         of = self.required(known, place)
-        self.told((*place, "of"), lambda: find_method(of))
+        self.located((*place, "of"), lambda: find_method(of))
         own = known.get("preset", "")
         self.each(place, changes, lambda some: configured(of, own or preset, some))
         varied = changes + ((("preset", own),) if own else ())
@@ -176,7 +176,7 @@ class _Reader:
             raise self.error((*place, "title"), f"title: expected at most {LONGEST_TITLE} printable characters")
         if title and name == of and find_method(of).is_ours:
             raise self.error((*place, "title"), f"title: {of} has one; expected it beside a name of the row's own")
-        return self.told(place, lambda: MethodSpec(name=name, of=of, preset=own, changes=changes, title=title))  # type: ignore[no-any-return]
+        return self.located(place, lambda: MethodSpec(name=name, of=of, preset=own, changes=changes, title=title))  # type: ignore[no-any-return]
 
     def stresses(self, table: Any) -> Iterator[Stress]:
         """Every step of every axis."""
@@ -187,7 +187,7 @@ class _Reader:
             if not isinstance(severities, list) or not all(type(step) in (int, float) for step in severities):
                 raise self.error(place, f"stresses.{axis}: expected a list of numbers, got {severities!r}")
             for severity in severities:
-                yield self.told(place, lambda axis=axis, s=severity: Stress(axis=axis, severity=float(s)))
+                yield self.located(place, lambda axis=axis, s=severity: Stress(axis=axis, severity=float(s)))
 
     def split(self, row: dict[str, Any], place: Place, own: tuple[str, ...]) -> tuple[dict[str, str], Changes]:
         """What says which row it is, and what is replaced in it."""
@@ -234,7 +234,7 @@ class _Reader:
             raise self.error((key,), f"{key}: expected {WRITTEN[kind]}, got {value!r}")
         return kind(value)
 
-    def told(self, place: Place, make: Callable[[], Any]) -> Any:
+    def located(self, place: Place, make: Callable[[], Any]) -> Any:
         """What `make` makes; its errors say where in the file."""
         try:
             return make()

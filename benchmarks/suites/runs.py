@@ -237,18 +237,18 @@ def read_run(folder: Path) -> Run:
         return Run(folder=folder, suite="train", about="cells trained by hand", command="", cells=cells)
     content = read_json(path)
     try:
-        told: RunFile = from_json(RunFile, content)
-        keys = [require_plain(key, what="cell") for key in told.cells]
-        require_plain(told.suite, what="suite")
+        file: RunFile = from_json(RunFile, content)
+        keys = [require_plain(key, what="cell") for key in file.cells]
+        require_plain(file.suite, what="suite")
     except ValueError as error:
         raise InputError(f"{path}: expected the description of a run ({error})") from error
-    if told.protocol != PROTOCOL:
-        raise InputError(f"{path}: expected protocol {PROTOCOL}, got {told.protocol}; results do not mix")
-    names = {"suite": told.suite, "about": printable(told.about), "command": printable(told.command)}
-    titles = {name: printable(title) for name, title in told.titles.items()}
-    found = [key for key in keys if (folder / "cells" / key / "config.json").exists()]
-    cells = tuple(read_cell(folder / "cells" / key) for key in found)
-    absent = tuple(key for key in keys if key not in found)
+    if file.protocol != PROTOCOL:
+        raise InputError(f"{path}: expected protocol {PROTOCOL}, got {file.protocol}; results do not mix")
+    names = {"suite": file.suite, "about": printable(file.about), "command": printable(file.command)}
+    titles = {name: printable(title) for name, title in file.titles.items()}
+    present = [key for key in keys if (folder / "cells" / key / "config.json").exists()]
+    cells = tuple(read_cell(folder / "cells" / key) for key in present)
+    absent = tuple(key for key in keys if key not in present)
     return Run(folder=folder, cells=cells, absent=absent, titles=titles, **names)
 
 
@@ -319,8 +319,8 @@ def results_of(run: Run) -> list[CellResult]:
 
 def finished_results(run: Run) -> list[CellResult]:
     """The results that are there, in the suite's order; perhaps none."""
-    found = [(cell, result_of(cell)) for cell in run.cells]
-    return [replace(result, config=cell.config) for cell, result in found if result is not None]
+    present = [(cell, result_of(cell)) for cell in run.cells]
+    return [replace(result, config=cell.config) for cell, result in present if result is not None]
 
 
 def failures(results: Sequence[CellResult]) -> list[CellResult]:

@@ -61,10 +61,10 @@ def find_libllvm() -> list[str]:
     folders += [str(path) for root in ("/usr/lib", "/usr/lib64") for path in Path(root).glob("*-linux-gnu*")]
     folders += [str(path) for path in Path("/usr/lib").glob("llvm-*/lib")]
     folders += [str(Path(sys.prefix) / "lib"), *filter(None, os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep))]
-    found = {str(path.resolve()) for folder in folders for path in Path(folder).glob("libLLVM*.so*")}
-    found |= {str(path.resolve()) for folder in folders for path in Path(folder).glob("libLLVM*.dylib")}
+    libraries = {str(path.resolve()) for folder in folders for path in Path(folder).glob("libLLVM*.so*")}
+    libraries |= {str(path.resolve()) for folder in folders for path in Path(folder).glob("libLLVM*.dylib")}
     given = os.environ.get("DRJIT_LIBLLVM_PATH")
-    usable = sorted((path for path in found if llvm_version(path) >= OLDEST_LLVM), key=llvm_version, reverse=True)
+    usable = sorted((path for path in libraries if llvm_version(path) >= OLDEST_LLVM), key=llvm_version, reverse=True)
     if given and (llvm_version(given) == 0 or llvm_version(given) >= OLDEST_LLVM):
         usable = [given, *usable]
     return usable
@@ -259,9 +259,9 @@ class Studio:
             hit = self.bare.ray_intersect_preliminary(ray, False)
             triangle = np.where(np.array(hit.is_valid()), np.array(hit.prim_index).astype(np.int64), -1)
             return np.array(hit.t), triangle, np.array(hit.prim_uv).T
-        found = [self.bare.ray_intersect_preliminary(mi.Ray3f(origin, d), False) for d in directions]
-        triangle = np.array([h.prim_index if h.is_valid() else -1 for h in found], dtype=np.int64)
-        return np.array([h.t for h in found]), triangle, np.array([list(h.prim_uv) for h in found])
+        hits = [self.bare.ray_intersect_preliminary(mi.Ray3f(origin, d), False) for d in directions]
+        triangle = np.array([h.prim_index if h.is_valid() else -1 for h in hits], dtype=np.int64)
+        return np.array([h.t for h in hits]), triangle, np.array([list(h.prim_uv) for h in hits])
 
     def _cast(self, camera: Camera, window: Window) -> tuple[np.ndarray, np.ndarray]:
         directions = camera.directions(window.centres)

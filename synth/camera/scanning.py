@@ -29,11 +29,11 @@ def scan(studio: Studio, cameras: list[Camera], scanner: Scanner, *, seed: int) 
     squarely = facing_of_second(studio, cameras, surface, normals)
     seen = squarely > FACING
     faces = studio.surface.faces[seen[studio.surface.faces].all(axis=1)]
-    kept = rng.permutation(np.unique(faces))
-    height = _error(surface[kept], squarely[kept], scanner, rng)
+    order = rng.permutation(np.unique(faces))
+    height = _error(surface[order], squarely[order], scanner, rng)
     place = np.full(len(surface), -1, dtype=np.int32)
-    place[kept] = np.arange(len(kept), dtype=np.int32)
-    return (surface[kept] + height[:, None] * normals[kept]).astype(np.float32), rng.permutation(place[faces])
+    place[order] = np.arange(len(order), dtype=np.int32)
+    return (surface[order] + height[:, None] * normals[order]).astype(np.float32), rng.permutation(place[faces])
 
 
 def facing_of_second(studio: Studio, cameras: list[Camera], surface: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -45,9 +45,9 @@ def facing_of_second(studio: Studio, cameras: list[Camera], surface: np.ndarray,
         some = np.flatnonzero(facing > FACING)
         hit, triangle = studio.hits(camera.position, surface[some])
         met = (triangle >= 0) & (np.linalg.norm(hit - surface[some], axis=1) < SEEN_WITHIN_M)
-        found = np.zeros(len(surface))
-        found[some[met]] = facing[some[met]]
-        best = np.sort(np.concatenate([best, found[None]]), axis=0)[-NEEDED:]
+        cosines = np.zeros(len(surface))
+        cosines[some[met]] = facing[some[met]]
+        best = np.sort(np.concatenate([best, cosines[None]]), axis=0)[-NEEDED:]
     return best[0]
 
 

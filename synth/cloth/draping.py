@@ -99,9 +99,9 @@ def _part(body: Body, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     The template is fine enough for cloth to lie on, and a quarter of the surface's cost.
     """
-    whole = chosen[body.kept][body.template_faces].all(axis=1)
+    whole = chosen[body.template_to_surface][body.template_faces].all(axis=1)
     used, faces = np.unique(body.template_faces[whole], return_inverse=True)
-    return body.kept[used], faces.reshape(-1, 3)
+    return body.template_to_surface[used], faces.reshape(-1, 3)
 
 
 def _spread(body: Body, cloth: np.ndarray) -> csr_array:

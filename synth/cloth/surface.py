@@ -133,7 +133,7 @@ def scan_error(body: Body, outfit: Outfit, *, seed: int) -> np.ndarray | None:
     phases = rest @ (2 * np.pi * directions / rng.uniform(0.15, 0.4, size=(8, 1))).T + rng.uniform(0, 2 * np.pi, size=8)
     height = np.sin(phases).sum(axis=1) * body.surface.vertices_of(*CLOTHES)
     height = neighbour_mean(height, body.surface.faces, rounds=3)
-    kept = height[body.kept]
-    worn = body.surface.vertices_of(*CLOTHES)[body.kept]
-    scale = outfit.scan_mm / 1000 / np.sqrt(np.mean(kept[worn] ** 2))
-    return scale * kept[:, None] * vertex_normals(rest, body.surface.faces)[body.kept]
+    template_height = height[body.template_to_surface]
+    worn = body.surface.vertices_of(*CLOTHES)[body.template_to_surface]
+    scale = outfit.scan_mm / 1000 / np.sqrt(np.mean(template_height[worn] ** 2))
+    return scale * template_height[:, None] * vertex_normals(rest, body.surface.faces)[body.template_to_surface]

@@ -97,9 +97,9 @@ def import_motion(
     Raises:
         InputError: another kind of file, damaged, too large, without the joints that a person needs, or upside down.
     """
-    found = read_motion_file(path, skeleton, fps=fps, most=most, take=take)
-    require_upright(found)
-    return found.motion
+    imported = read_motion_file(path, skeleton, fps=fps, most=most, take=take)
+    require_upright(imported)
+    return imported.motion
 
 
 def read_motion_file(
@@ -144,16 +144,17 @@ def read_motion_file(
     )
 
 
-def require_upright(found: Imported) -> None:
+def require_upright(imported: Imported) -> None:
     """A person is on their feet for most of a motion.
 
     Raises:
         InputError: the head is below the hips in half of the frames or more.
     """
-    if found.head_above_hips <= 0.5:
+    if imported.head_above_hips <= 0.5:
         raise InputError(
-            f"{found.path}: the head is above the hips in {found.head_above_hips:.0%} of the frames, expected most; "
-            f"{found.up} was taken for up: give another --up, or other frames with --start and --length"
+            f"{imported.path}: the head is above the hips in {imported.head_above_hips:.0%} of the "
+            f"frames, expected most; {imported.up} was taken for up: give another --up, or other "
+            "frames with --start and --length"
         )
 
 

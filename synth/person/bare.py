@@ -30,7 +30,7 @@ def _bare_mannequin() -> TemplateMesh:
     body = mannequin(skirt=False)
     surface = body.surface
     inwards = surface.vertices_of(*CLOTHES)[:, None] * vertex_normals(surface.vertices, surface.faces)
-    return body.template(-MANNEQUIN_CLOTH * inwards[body.kept])
+    return body.template(-MANNEQUIN_CLOTH * inwards[body.template_to_surface])
 
 
 def _bare_anny(number: int) -> TemplateMesh:
@@ -50,12 +50,12 @@ def _undressed(number: int) -> TemplateMesh:
     body, chart, density = dressing.body_parts(baked_body(number))
     body = pack(body, chart, density, gutter=0.004)
     faces, uv_faces = decimate(body, target=dressing.TEMPLATE_VERTICES, keep=np.ones(len(body.vertices)))
-    kept, corners = np.unique(faces, return_inverse=True)
+    used, corners = np.unique(faces, return_inverse=True)
     used, uv_corners = np.unique(uv_faces, return_inverse=True)
     return TemplateMesh(
-        vertices=body.vertices[kept],
+        vertices=body.vertices[used],
         faces=corners.reshape(-1, 3),
         uvs=body.uvs[used],
         uv_faces=uv_corners.reshape(-1, 3),
-        skin_weights=body.weights[kept],
+        skin_weights=body.weights[used],
     )

@@ -47,7 +47,7 @@ class Body:
     surface: Surface
     skin_weights: np.ndarray  # [s, j] float64, rows sum to 1
     face: Face
-    kept: np.ndarray  # [v] int64: template vertex -> surface vertex
+    template_to_surface: np.ndarray  # [v] int64
     template_faces: np.ndarray  # [g, 3] int64 into the template's vertices
     template_uv_faces: np.ndarray  # [g, 3] int64 into the surface's uvs
     cage: np.ndarray  # [k] int64: the surface vertices of loose cloth that are simulated; the others lie between them
@@ -68,15 +68,15 @@ class Body:
         return np.linalg.norm((points - neck) * [1, 0.8, 1], axis=1) - 0.092
 
     def template(self, offset: np.ndarray | None = None) -> TemplateMesh:
-        """The template mesh: the kept vertices, moved by `offset` `[v, 3]` metres."""
+        """The template mesh: its vertices, moved by `offset` `[v, 3]` metres."""
         used, uv_faces = np.unique(self.template_uv_faces, return_inverse=True)
-        vertices = self.surface.vertices[self.kept]
+        vertices = self.surface.vertices[self.template_to_surface]
         return TemplateMesh(
             vertices=vertices if offset is None else vertices + offset,
             faces=self.template_faces,
             uvs=self.surface.uvs[used],
             uv_faces=uv_faces.reshape(self.template_uv_faces.shape),
-            skin_weights=self.skin_weights[self.kept],
+            skin_weights=self.skin_weights[self.template_to_surface],
         )
 
 

@@ -89,7 +89,7 @@ def _unpack(stored: dict[str, np.ndarray], person: Subject) -> Body:
         surface=Surface(**{name: stored[name] for name in ("vertices", "faces", "uvs", "uv_faces", "part")}),
         skin_weights=stored["weights"],
         face=Face(eyes=stored["eyes"], mouth=stored["mouth"], modelled=True, nape=person.head.nape),
-        kept=stored["kept"],
+        template_to_surface=stored["kept"],
         template_faces=stored["template_faces"],
         template_uv_faces=stored["template_uv_faces"],
         cage=stored["cage"],
@@ -119,7 +119,7 @@ def _dress(person: Subject, *, skirt: bool) -> dict[str, np.ndarray]:
     used = np.unique(fine.faces)
     number = np.full(len(fine.vertices), -1)
     number[used] = np.arange(len(used))
-    kept, template = np.unique(template_faces, return_inverse=True)
+    used, template = np.unique(template_faces, return_inverse=True)
     cage, cage_faces = np.unique(body.faces[body.part == PARTS.index("skirt")], return_inverse=True)
     return {
         "vertices": fine.vertices[used],
@@ -128,7 +128,7 @@ def _dress(person: Subject, *, skirt: bool) -> dict[str, np.ndarray]:
         "uvs": fine.uvs,
         "uv_faces": fine.uv_faces,
         "part": fine.part,
-        "kept": number[kept],
+        "kept": number[used],
         "template_faces": template.reshape(-1, 3),
         "template_uv_faces": template_uv_faces,
         "heads": baked["heads"],
@@ -155,8 +155,8 @@ def _clothed(
     }
     # Beneath a chin some faces may lie as far from the neck as a shirt does.
     worn["shirt"] = largest_piece(bare.faces, worn["shirt"])
-    kept = beside(bare.faces, ~(worn["shirt"] | worn["trousers"]), rings=BAND)
-    pieces, groups, kinds = [select(_with_hair(bare, person.head.depth), kept)], [group[kept]], [kind[kept]]
+    visible = beside(bare.faces, ~(worn["shirt"] | worn["trousers"]), rings=BAND)
+    pieces, groups, kinds = [select(_with_hair(bare, person.head.depth), visible)], [group[visible]], [kind[visible]]
     for layer, (name, faces) in enumerate(worn.items()):
         piece, source = cut_garment(bare, faces, name=name, fit=fit)
         pieces.append(piece)

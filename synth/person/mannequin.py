@@ -93,8 +93,8 @@ def mannequin(*, skirt: bool) -> Body:
     """Build the mannequin; the template keeps every second ring and every second segment."""
     skeleton = make_skeleton(heads())
     vertices, weights, uvs, faces, uv_faces, part = [], [], [], [], [], []
-    kept, template_faces, template_uv_faces, template_part = [], [], [], []
-    vertex_count = uv_count = kept_count = 0
+    surface_vertices, template_faces, template_uv_faces, template_part = [], [], [], []
+    vertex_count = uv_count = template_count = 0
     for tube in _tubes(skirt=skirt):
         points, along = lattice(tube, 2 * tube.rings - 1, 2 * tube.segments)
         rows, columns = points.shape[:2]
@@ -111,15 +111,19 @@ def mannequin(*, skirt: bool) -> Body:
         uv_faces.append(uv_count + grid_faces(rows, columns, stride=columns + 1, wrap=columns + 1))
         part.append(np.full(len(faces[-1]), PARTS.index(tube.part)))
         even_rows, even_columns = (rows + 1) // 2, columns // 2
-        kept.append(vertex_count + (2 * np.arange(even_rows)[:, None] * columns + 2 * np.arange(even_columns)).ravel())
-        template_faces.append(kept_count + grid_faces(even_rows, even_columns, stride=even_columns, wrap=even_columns))
+        surface_vertices.append(
+            vertex_count + (2 * np.arange(even_rows)[:, None] * columns + 2 * np.arange(even_columns)).ravel()
+        )
+        template_faces.append(
+            template_count + grid_faces(even_rows, even_columns, stride=even_columns, wrap=even_columns)
+        )
         template_part.append(np.full(len(template_faces[-1]), part[-1][0]))
         coarse = grid_faces(even_rows, even_columns, stride=even_columns + 1, wrap=even_columns + 1)
         row, column = np.divmod(coarse, even_columns + 1)
         template_uv_faces.append(uv_count + 2 * row * (columns + 1) + 2 * column)
         vertex_count += rows * columns
         uv_count += rows * (columns + 1)
-        kept_count += even_rows * even_columns
+        template_count += even_rows * even_columns
     surface = Surface(
         vertices=np.concatenate(vertices),
         faces=np.concatenate(faces),
@@ -138,9 +142,9 @@ def mannequin(*, skirt: bool) -> Body:
         face=Face(
             eyes=np.array([[0.03, 1.63, 0.1], [-0.03, 1.63, 0.1]]), mouth=np.array([0, 1.565, 0.1]), modelled=False
         ),
-        kept=np.concatenate(kept),
+        template_to_surface=np.concatenate(surface_vertices),
         template_faces=triangles,
         template_uv_faces=np.concatenate(template_uv_faces),
-        cage=np.concatenate(kept)[cage],
+        cage=np.concatenate(surface_vertices)[cage],
         cage_faces=cage_faces.reshape(-1, 3),
     )

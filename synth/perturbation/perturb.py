@@ -50,10 +50,10 @@ def perturb(source: Path, folder: Path, perturbation: Perturbation, *, seed: int
         raise InputError(f"{folder}: expected an empty folder")
     changed = _subset(capture, perturbation)
     written = dict(_changed_files(capture, changed, folder, perturbation, seed))
-    kept = _kept_files(changed, perturbation)
-    for name in kept - set(written):
+    unchanged = _unchanged_files(changed, perturbation)
+    for name in unchanged - set(written):
         link_or_copy(source / name, folder / name)
-    files = {name: written.get(name) or capture.manifest.files[name] for name in sorted(kept | set(written))}
+    files = {name: written.get(name) or capture.manifest.files[name] for name in sorted(unchanged | set(written))}
     perturbed = {"of": capture.identity, "seed": seed, **asdict(perturbation)}
     replace(capture.manifest, splits=changed.splits, perturbed=perturbed, files=files).write(folder)
     return folder
@@ -77,7 +77,7 @@ def _subset(capture: Capture, perturbation: Perturbation) -> Capture:
     return replace(capture, splits={**capture.splits, "train": train.only(cameras=cameras, frames=frames)})
 
 
-def _kept_files(capture: Capture, perturbation: Perturbation) -> set[str]:
+def _unchanged_files(capture: Capture, perturbation: Perturbation) -> set[str]:
     """Files of the original that the perturbed capture still has: all but images of dropped views, and scans.
 
     A scan is made from all training images: it would give back what was taken away. Where nothing is, it stays.

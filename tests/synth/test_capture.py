@@ -121,7 +121,7 @@ def test_skinned_template_is_wrong_only_by_what_the_scene_adds(tmp_path: Path, c
 
         body = mannequin(skirt=outfit.skirt)
         motion = make_motion(body.skeleton, (Clip(generator="walk", frames=3),), fps=12.0, seed=0)
-        truth = surface.true_surface(body, motion, outfit, seed=1)[:, body.kept]
+        truth = surface.true_surface(body, motion, outfit, seed=1)[:, body.template_to_surface]
         template = body.template()
         transforms = skinning_transforms(body.skeleton, motion.dofs)
         skinned = [dual_quaternion_skinning(template.vertices, template.skin_weights, frame) for frame in transforms]

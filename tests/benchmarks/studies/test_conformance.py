@@ -46,21 +46,21 @@ BREAKS = {
 @pytest.mark.parametrize("name", BREAKS)
 def test_a_cheat_is_caught_for_what_it_does_and_for_nothing_else(name: str, capture: Path, tmp_path: Path) -> None:
     checks = check_method(name, capture, tmp_path / "trials", preset="ci", limits=LIMITS, workers=2)
-    assert {check.rule for check in checks if check.kept is False} == BREAKS[name]
+    assert {check.rule for check in checks if check.passed is False} == BREAKS[name]
     assert not verify_capture(capture)
 
 
 def test_a_method_that_takes_too_long_is_ended(capture: Path, tmp_path: Path) -> None:
     short = Limits(seconds=4.0, memory_mb=700)
     checks = check_method("sleeping", capture, tmp_path / "trials", preset="ci", limits=short, workers=3)
-    assert {check.rule for check in checks if check.kept is False} == {"keeps to its time"}
-    assert sum(check.kept is None for check in checks) > 5, "what was not seen is not called kept"
+    assert {check.rule for check in checks if check.passed is False} == {"keeps to its time"}
+    assert sum(check.passed is None for check in checks) > 5, "what was not seen is not called kept"
 
 
 def test_a_crash_is_reported_with_file_and_line(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fakes.use(tmp_path / "fakes", monkeypatch)
     checks = check_method("fake_raising", capture, tmp_path / "trials", preset="ci", limits=LIMITS, workers=2)
-    (crash,) = [check.seen for check in checks if check.rule == "comes through"]
+    (crash,) = [check.observed for check in checks if check.rule == "comes through"]
     assert re.fullmatch(r"seed 0: RuntimeError: the method's own mistake \(helpers/fakes\.py:\d+\)", crash)
 
 

@@ -12,10 +12,10 @@ from synth.presets import scene
 def test_the_bare_mannequin_lies_inside_its_clothes_and_wears_no_skirt():
     named = scene("mannequin", size="ci")
     bare, dressed = bare_template(named), make_body(named)
-    skirted = dressed.surface.vertices_of("skirt")[dressed.kept]
-    assert len(bare.vertices) == len(dressed.kept) - skirted.sum()
-    inwards = np.linalg.norm(dressed.surface.vertices[dressed.kept][~skirted] - bare.vertices, axis=1)
-    shirt = dressed.surface.vertices_of("shirt", "trousers")[dressed.kept][~skirted]
+    skirted = dressed.surface.vertices_of("skirt")[dressed.template_to_surface]
+    assert len(bare.vertices) == len(dressed.template_to_surface) - skirted.sum()
+    inwards = np.linalg.norm(dressed.surface.vertices[dressed.template_to_surface][~skirted] - bare.vertices, axis=1)
+    shirt = dressed.surface.vertices_of("shirt", "trousers")[dressed.template_to_surface][~skirted]
     assert inwards[shirt] == pytest.approx(MANNEQUIN_CLOTH, rel=1e-6)
     assert inwards[~shirt] == pytest.approx(0, abs=1e-12)
     hips = (bare.vertices[:, 1] > 0.6) & (bare.vertices[:, 1] < 0.8) & (np.abs(bare.vertices[:, 0]) < 0.3)
