@@ -13,10 +13,11 @@ import torch
 from jaxtyping import Float
 
 from ash.capture.dataset import Camera, Capture, Motion, Pose, Skeleton, require_pose
+from ash.capture.novelty import pose_distances, pose_quats
 from ash.checkpoints import read_safetensors
 from ash.files import InputError, write_atomic
 from ash.protocol import StageClock
-from ash.rotations import root_yaw, rotvec_to_unitquat
+from ash.rotations import root_yaw
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -46,7 +47,8 @@ class NearestImage:
         with clock.stage("stg1"):
             require_pose(pose, skeleton)
             wanted = see_root(skeleton, pose, camera)
-            distances = pose_distances(pose.dofs, self.capture.motion.dofs[list(self.train.frames)])
+            trained = pose_quats(self.capture.motion.dofs[list(self.train.frames)])
+            distances = pose_distances(pose_quats(pose.dofs[None])[0], trained)
             near = self.train.frames[int(distances.argmin())]
             views = {
                 name: see_root(skeleton, Pose(self.capture.motion, near), self.capture.cameras[name])
@@ -75,15 +77,9 @@ class NearestImage:
             raise InputError(f"{path}: was written for another capture")
 
 
-def pose_distances(pose: Float[np.ndarray, " d"], poses: Float[np.ndarray, "t d"]) -> Float[np.ndarray, " t"]:
-    """Root mean square angle over joints, radians, between one pose and others; the root is left out."""
-    cosines = (_quats(pose[None]) * _quats(poses)).sum(-1).abs().clamp(max=1)  # of half the angle
-    return (2 * torch.arccos(cosines)).square().mean(1).sqrt().numpy()
-
-
 def central_frame(motion: Motion, frames: tuple[int, ...]) -> int:
     """The frame among `frames` whose pose is nearest to all others, by the sum of distances."""
-    poses = motion.dofs[list(frames)]
+    poses = pose_quats(motion.dofs[list(frames)])
     return frames[int(np.argmin([pose_distances(pose, poses).sum() for pose in poses]))]
 
 
@@ -115,10 +111,6 @@ def move_image(image: np.ndarray, view: RootView, wanted: RootView, camera: Came
     grid = torch.stack([2 * place / side - 1 for place, side in zip(source, size, strict=True)], -1)[None]
     moved = torch.nn.functional.grid_sample(premultiplied.permute(2, 0, 1)[None], grid, align_corners=False)
     return moved[0].permute(1, 2, 0).contiguous().numpy()
-
-
-def _quats(dofs: Float[np.ndarray, "t d"]) -> Float[torch.Tensor, "t j 4"]:
-    return rotvec_to_unitquat(torch.from_numpy(dofs[:, 6:].copy()).reshape(len(dofs), -1, 3))
 
 
 def nearest(capture: Capture, *, seed: int, preset: str) -> NearestImage:

@@ -105,7 +105,7 @@ def draw_all(cell: Cell, capture: Capture, client: MethodClient) -> MethodOutput
     )
 
 
-def judge(
+def score_outputs(
     cell: Cell, capture: Capture, drawn: MethodOutputs, spent: TrainingTime, training: TrainingOutcome | None = None
 ) -> CellResult:
     """Score the stored pictures, when the method's process is gone.

@@ -31,7 +31,7 @@ from benchmarks.cell.evaluation import (
     _gap_summary,
     _image_summary,
     draw_all,
-    judge,
+    score_outputs,
     scored_views,
 )
 from benchmarks.cell.registry import ORACLES, code_version, configured, find_method, offered
@@ -144,7 +144,7 @@ def evaluate_cell(cell: Cell, *, device: str | None = None) -> CellResult:
         there = cell if device is None else replace(cell, config=placed_on(cell.config, device))
         with trained_client(there, capture) as client:
             drawn = draw_all(cell, capture, client)
-        judged = judge(cell, capture, drawn, spent, before.training)
+        judged = score_outputs(cell, capture, drawn, spent, before.training)
         code = code_version(cell.config.source)
         result = replace(
             judged,
@@ -209,7 +209,7 @@ def _train_and_evaluate(cell: Cell, capture: Capture) -> CellResult:
         client.save()
         drawn = draw_all(cell, capture, client)
     stage_out(cell)
-    return judge(cell, capture, drawn, _training_time(cell, made, drawn))
+    return score_outputs(cell, capture, drawn, _training_time(cell, made, drawn))
 
 
 def _training_time(cell: Cell, made: TrainingTime, drawn: MethodOutputs) -> TrainingTime:

@@ -66,10 +66,10 @@ def check_method(
     weights = folder / "first" / WORK / "model.safetensors"
     if weights.exists():
         ran["loaded"] = bench.run(folder / "loaded", seed=0, weights=weights)
-    return judge(ran, limits)
+    return judge_trials(ran, limits)
 
 
-def judge(ran: dict[str, TrialRun], limits: Limits) -> tuple[RuleCheck, ...]:
+def judge_trials(ran: dict[str, TrialRun], limits: Limits) -> tuple[RuleCheck, ...]:
     """The rules, each with what the trials say about it."""
     outcomes = [r.outcome for r in ran.values() if r.outcome is not None]
     crashes = [r.problem for r in ran.values() if r.problem and not r.over]

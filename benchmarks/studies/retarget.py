@@ -25,7 +25,7 @@ from benchmarks.suites.progress import Progress
 from synth.capture import make_body, make_capture
 from synth.motion.importing import read_motion_file
 from synth.motion.strip import describe
-from synth.truth.retargeting import retargeted, scene_of
+from synth.truth.retargeting import recorded_scene, retargeted
 
 STRIP_FRAMES = 6
 
@@ -80,7 +80,7 @@ def retarget(cells: list[Cell], motion: Path, out: Path, *, frames: int, workers
 
 def render_truth(own: Capture, motion: Path, folder: Path, *, frames: int, workers: int) -> Capture:
     """The capture of the same person doing what the motion file says."""
-    scene = scene_of(own.manifest, own.folder)
+    scene = recorded_scene(own.manifest, own.folder)
     body = make_body(scene)
     print(describe(read_motion_file(motion, body.skeleton, fps=scene.fps, most=frames)), file=sys.stderr)
     wanted = retargeted(scene, body, motion, frames=frames)

@@ -12,7 +12,7 @@ from synth.capture import make_body
 from synth.cloth import surface as cloth
 from synth.scene import Scene, stream
 from synth.shooting import studio_of
-from synth.truth.retargeting import scene_of
+from synth.truth.retargeting import recorded_scene
 
 HISTORY = 24  # frames before the pose, through which clothes are carried: they depend on where they came from
 
@@ -26,7 +26,7 @@ class PoseTruth:
         Raises:
             InputError: the capture is not of this version's scenes, has no truth, or nothing here renders.
         """
-        self.capture, self.scene = capture, scene_of(capture.manifest, capture.folder)
+        self.capture, self.scene = capture, recorded_scene(capture.manifest, capture.folder)
         if not (capture.folder / "truth" / "surface.npz").is_file():
             raise InputError(f"{capture.folder}: has no truth to render")
         self.renderer = probe()

@@ -11,7 +11,7 @@ from synth.presets import with_motion
 from synth.scene import Clip, Scene
 
 
-def scene_of(manifest: Manifest, folder: Path) -> Scene:
+def recorded_scene(manifest: Manifest, folder: Path) -> Scene:
     """The scene that a capture's manifest describes.
 
     Raises:

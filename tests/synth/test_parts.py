@@ -14,7 +14,7 @@ from synth.capture import is_finished, make_capture
 from synth.export.formats import export
 from synth.perturbation.perturb import Perturbation, perturb
 from synth.scene import Clip, Rig, Scene
-from synth.truth.retargeting import scene_of
+from synth.truth.retargeting import recorded_scene
 
 
 def rotating_scene() -> Scene:
@@ -45,7 +45,7 @@ def test_only_what_a_split_names_is_rendered(capture):
     assert counts == {"train": 6, "novel_view": 1, "near_pose": 2, "novel_pose": 2, "far_pose": 2}
     assert capture.splits["far_pose"].frames == (5 + 4 + 2, 5 + 4 + 4 + 2)
     assert len(capture.motion.dofs) == 3 + 2 + 4 + 8
-    assert scene_of(capture.manifest, capture.folder) == rotating_scene()
+    assert recorded_scene(capture.manifest, capture.folder) == rotating_scene()
 
 
 def test_a_lost_image_of_a_part_is_noticed(capture, tmp_path):

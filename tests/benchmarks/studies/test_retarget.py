@@ -16,7 +16,7 @@ from benchmarks.commands import arguments
 from synth.capture import make_body, make_capture
 from synth.motion.importing import import_motion
 from synth.scene import Outfit
-from synth.truth.retargeting import retargeted, scene_of
+from synth.truth.retargeting import recorded_scene, retargeted
 
 
 @pytest.fixture(scope="module")
@@ -80,18 +80,18 @@ def test_avatars_are_driven_by_the_motion_and_scored_against_its_truth(
 
 def test_the_scene_of_a_capture_comes_back_from_its_manifest(capture: Path, motion: Path) -> None:
     manifest = load_capture(capture).manifest
-    scene = scene_of(manifest, capture)
+    scene = recorded_scene(manifest, capture)
     assert scene == small_scene(outfit=Outfit(skirt=True))
     driven = retargeted(scene, make_body(scene), motion, frames=3)
     assert driven.identity != scene.identity
     stored = json.loads(json.dumps(driven.parameters))
-    assert scene_of(replace(manifest, parameters=stored, identity=driven.identity), capture) == driven
+    assert recorded_scene(replace(manifest, parameters=stored, identity=driven.identity), capture) == driven
     with pytest.raises(InputError, match="another scene"):
-        scene_of(replace(manifest, seed=1, parameters=manifest.parameters | {"seed": 1}), capture)
+        recorded_scene(replace(manifest, seed=1, parameters=manifest.parameters | {"seed": 1}), capture)
     with pytest.raises(InputError, match="no scene of this version"):
-        scene_of(replace(manifest, parameters={}), capture)
+        recorded_scene(replace(manifest, parameters={}), capture)
     with pytest.raises(InputError, match="fps: expected float, got '12'"):
-        scene_of(replace(manifest, parameters=manifest.parameters | {"fps": "12"}), capture)
+        recorded_scene(replace(manifest, parameters=manifest.parameters | {"fps": "12"}), capture)
 
 
 def test_nothing_to_drive_and_a_bad_motion_are_refused(run: Path, tmp_path: Path, capsys) -> None:

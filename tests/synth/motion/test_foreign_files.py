@@ -1,6 +1,7 @@
 """Motion files as other programs write them give the motion of their twin, which is written as this project expects."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,41 @@ SMPLX, PARTS = "165 numbers", "root_orient and pose_body"
 DATA = Path(__file__).parents[2] / "data" / "motion"
 
 
+LIMBS = {  # joints of a side: in the twin, in SMPL's words, and as collar, shoulder, elbow
+    "Shoulder": ("_collar", "Collar"), "Arm": ("_shoulder", "Shoulder"), "ForeArm": ("_elbow", "Elbow"),
+    "Hand": ("_wrist", "Wrist"), "UpLeg": ("_hip", "Hip"), "Leg": ("_knee", "Knee"), "Foot": ("_ankle", "Ankle"),
+    "ToeBase": ("_foot", "Toe"),
+}  # fmt: skip
+SPINE = ({"Hips": "Pelvis", "Spine": "Spine1", "Spine2": "Spine3"}, {"Spine2": "Chest"})
+PROP = """ROOT Prop
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  End Site
+  {
+    OFFSET 0 30 0
+  }
+}
+MOTION
+"""
+
+
+def renamed(convention: int) -> str:
+    """The twin with other names of its joints."""
+    names = SPINE[convention] | {
+        f"{side}{joint}": f"{side}{words[convention]}" for side in ("Left", "Right") for joint, words in LIMBS.items()
+    }
+    return re.sub(r"(ROOT|JOINT) (\S+)", lambda m: f"{m[1]} {names.get(m[2], m[2])}", (DATA / "twin.bvh").read_text())
+
+
+def with_prop() -> str:
+    """The twin beside a prop, a root of its own that moves."""
+    skeleton, rows = (DATA / "twin.bvh").read_text().split("MOTION\n")
+    head, frames = rows.splitlines()[:2], rows.splitlines()[2:]
+    moved = [f"{row} 200 {100 + k} {-5 * k} 0 0 0" for k, row in enumerate(frames)]
+    return skeleton + PROP + "\n".join([*head, *moved]) + "\n"
+
+
 def joint_frames(path: Path, take: Take | None = None) -> np.ndarray:
     return bone_frames(SKELETON, import_motion(path, SKELETON, take=take or Take()).dofs)
 
@@ -36,14 +72,20 @@ def joint_frames(path: Path, take: Take | None = None) -> np.ndarray:
         ("lafan_rest", "twin", 0.1),  # all bones rest along x: their directions are known, the twist is not
     ],
 )
-def test_a_foreign_bvh_gives_its_twin_s_motion(name: str, twin: str, rotations: float) -> None:
-    foreign, expected = joint_frames(DATA / f"{name}.bvh"), joint_frames(DATA / f"{twin}.bvh")
+def test_a_foreign_bvh_gives_its_twin_s_motion(name: str, twin: str, rotations: float, tmp_path: Path) -> None:
+    made = {"smpl_names": lambda: renamed(0), "collar_shoulder_elbow": lambda: renamed(1), "two_roots": with_prop}
+    path = DATA / f"{name}.bvh"
+    if name in made:
+        path = tmp_path / "made.bvh"
+        path.write_text(made[name]())
+    foreign, expected = joint_frames(path), joint_frames(DATA / f"{twin}.bvh")
     np.testing.assert_allclose(foreign[..., :3, 3], expected[..., :3, 3], atol=1e-6)
     np.testing.assert_allclose(foreign[..., :3, :3], expected[..., :3, :3], atol=rotations)
 
 
-def test_the_line_says_what_was_understood() -> None:
-    told = describe(read_motion_file(DATA / "two_roots.bvh", SKELETON, fps=12.0, take=Take()))
+def test_the_line_says_what_was_understood(tmp_path: Path) -> None:
+    (tmp_path / "two_roots.bvh").write_text(with_prop())
+    told = describe(read_motion_file(tmp_path / "two_roots.bvh", SKELETON, fps=12.0, take=Take()))
     assert "25 frames at 30 per second, 10 taken at 12 per second; 21 of 21 joints matched" in told
     assert "without a partner: Prop; 2 roots, Hips taken, path 0.69 m" in told
 
