@@ -19,7 +19,7 @@ from ash.capture.novelty import novelty_deg
 from ash.files import open_regular, read_arrays, write_image
 from ash.protocol import TrainingOutcome
 from benchmarks.cell import metrics
-from benchmarks.cell.metrics import IMAGE_SPLITS, NOVELTY, VIEW_SCORES, weights_file
+from benchmarks.cell.metrics import IMAGE_SPLITS, LPIPS_SCORES, NOVELTY, VIEW_SCORES, weights_file
 from benchmarks.cell.sandbox import TEST_VIEWS, WORK
 from benchmarks.cell.schema import (
     Cell,
@@ -211,9 +211,7 @@ def scored_views(cell: Cell, capture: Capture, views: Sequence[View]) -> list[Vi
 def _score(cell: Cell, capture: Capture, view: View, prediction: np.ndarray) -> ViewScore:
     truth = metrics.on_black(capture.image(view.camera, view.frame))
     scores = metrics.score_view(prediction, truth)
-    perceptual = _perceptual(cell.config.device)
-    if perceptual is not None:
-        scores["full", "lpips"] = perceptual(prediction[..., :3], truth[..., :3])
+    scores |= lpips_scores(prediction, truth, cell.config.device)
     noise = pixels_path(capture.folder, view.camera, view.frame)
     if noise.exists():
         variance = read_arrays(noise, expected=("noise",))["noise"]
@@ -222,9 +220,20 @@ def _score(cell: Cell, capture: Capture, view: View, prediction: np.ndarray) -> 
     return ViewScore(split=view.split, camera=view.camera, frame=view.frame, prediction=digest, scores=scores)
 
 
+def lpips_scores(prediction: np.ndarray, truth: np.ndarray, device: str) -> dict[tuple[str, str], float]:
+    """LPIPS x 1000 of uint8 RGBA images on black, by `LPIPS_SCORES`; without what could not be measured."""
+    perceptual = _perceptual(device)
+    if perceptual is None:
+        return {}
+    frames = prediction[..., :3], truth[..., :3]
+    pairs = {"full": frames, "release_crop": metrics.release_crop(*frames, metrics.foreground(truth))}
+    values = {region: perceptual(*pair) for region, pair in pairs.items() if pair is not None}
+    return {(region, "lpips"): value for region, value in values.items() if value is not None}
+
+
 @cache
-def _perceptual(device: str) -> Callable[[np.ndarray, np.ndarray], float] | None:
-    """LPIPS, where the user gave its weights."""
+def _perceptual(device: str) -> Callable[[np.ndarray, np.ndarray], float | None] | None:
+    """LPIPS, where its weights are there."""
     path = weights_file()
     if path is None:
         return None
@@ -238,7 +247,7 @@ def _image_summary(scored: list[ViewScore]) -> tuple[Summary, ...]:
     rows = []
     for split in IMAGE_SPLITS:
         views = [view for view in scored if view.split == split]
-        for region, metric in (*VIEW_SCORES, ("full", "lpips"), ("foreground", "noise_ceiling"), NOVELTY):
+        for region, metric in (*VIEW_SCORES, *LPIPS_SCORES, ("foreground", "noise_ceiling"), NOVELTY):
             values = [view.scores[region, metric] for view in views if (region, metric) in view.scores]
             if values:
                 rows.append(Summary(split=split, region=region, metric=metric, value=float(np.mean(values))))

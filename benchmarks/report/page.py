@@ -170,7 +170,8 @@ def _terminal(run_tables: RunTables, curves: list[Section]) -> list[str]:
     ]
     lines += [""] if lines else []
     for scene in run_tables.scenes:
-        columns = [*tables.quality_columns(("psnr", "flip")), *tables.cost_columns(("frame_ms", "train_s"))]
+        perceptual = "lpips" if (run_tables.of(scene)["metric"] == "lpips").any() else "flip"
+        columns = [*tables.quality_columns(("psnr", perceptual)), *tables.cost_columns(("frame_ms", "train_s"))]
         short = tables.build(run_tables, scene, columns, title="")
         remarks = (f"- {remark}" for remark in sentences.remarks(run_tables, scene))
         lines += [sentences.headline(run_tables, scene), *remarks, "", tables.plain(short), ""]

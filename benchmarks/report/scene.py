@@ -36,7 +36,7 @@ QUALITY_NOTE = (
 )
 APART_NOTE = "Those below the line were given the exact surface, and are not ranked."
 VALUES_NOTE = (
-    "n/a: not measured (LPIPS needs the user's AlexNet weights). Where an interval would reach below zero, the range "
+    "n/a: not measured (LPIPS: AlexNet's weights were absent). Where an interval would reach below zero, the range "
     "of the values stands instead."
 )
 COST_NOTE = (

