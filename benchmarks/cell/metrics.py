@@ -64,7 +64,7 @@ METRICS = {
         Metric(key="gap", title="gap", unit="dB", direction="none", worst=100.0, decimals=2, abs_tol=0.1),
         Metric(key="ssim", title="SSIM", unit="", direction="up", worst=0.0, decimals=3, abs_tol=0.002),
         Metric(key="flip", title="FLIP", unit="", direction="down", worst=1.0, decimals=3, abs_tol=0.002),
-        Metric(key="lpips", title="LPIPS x1000", unit="", direction="down", worst=1000.0, decimals=1, abs_tol=2.0),
+        Metric(key="lpips", title="LPIPS", unit="x1000", direction="down", worst=1000.0, decimals=1, abs_tol=2.0),
         Metric(key="iou", title="IoU", unit="", direction="up", worst=0.0, decimals=3, abs_tol=0.002),
         Metric(
             key="template_mm", title="template error", unit="mm", direction="down", worst=1e3, decimals=1, abs_tol=0.2
