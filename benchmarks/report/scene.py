@@ -31,7 +31,7 @@ SHEETS = {"pictures": "Truth, methods and errors", "pictures_people": "All subje
 COLOURS = ("blue", "orange", "red", "ochre", "grey")  # of the regions
 SMOKE_TESTS = ("ci",)  # sizes and presets
 QUALITY_NOTE = (
-    "Quality on the foreground, LPIPS on the whole frame, IoU on the silhouette. Best and second best are marked among "
+    "Quality on the foreground, LPIPS on the whole frame. Best and second best are marked among "
     "the methods that see only training views."
 )
 APART_NOTE = "Those below the line were given the exact surface, and are not ranked."
@@ -88,7 +88,7 @@ def scene_report(data: SceneData) -> SceneReport:
     exposed = sentences.exposed(data.results)
     doubts = [Text(text=doubt, note=True) for doubt in sentences.doubts(data.results)]
     seen = [Text(text=each, note=True) for each in sentences.training_views(run_tables, scene)]
-    asked = [foreground("train_view"), *tables.quality_columns(("psnr", "gap", "ssim", "flip", "lpips", "iou"))]
+    asked = [foreground("train_view"), *tables.quality_columns(("psnr", "ssim", "lpips", "flip"))]
     quality = tables.build(run_tables, scene, asked, title=f"Accuracy on {scene}", exposed=exposed)
     costs = tables.cost_columns(COSTS)
     cost = tables.build(run_tables, scene, costs, title=f"Cost on {scene}", exposed=exposed)

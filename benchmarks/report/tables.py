@@ -16,7 +16,7 @@ from benchmarks.report.escaping import latex as tex
 REGION_TITLES = {"full": "whole frame", "release_crop": "release crop", "white_frame": "on white"}
 SEVERAL_REGIONS = ("psnr", "ssim", "flip")  # Their columns name the region, unless it is the foreground.
 UNRANKED = ("gaussians",)  # Neither more nor fewer is better.
-BESIDE = ("psnr", "flip", "lpips")  # What is shown of splits that are not ranked.
+BESIDE = ("psnr", "lpips", "flip")  # What is shown of splits that are not ranked.
 MEMORY = ("peak_rss_mb", "params", "gaussians")
 ON_WHOLE_FRAMES = ("lpips", "iou")
 
