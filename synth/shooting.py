@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ash.capture.dataset import Camera, background_path, image_path, pixels_path, scan_path, surface_path
-from ash.capture.formats import read_cameras
+from ash.capture.dataset import Camera, background_path, image_path, pixels_path, scan_path
+from ash.capture.formats import read_cameras, read_surface_truth
 from ash.files import read_arrays, read_image, write_arrays, write_image
 from synth.camera.render import Picture, Renderer, Studio, shoot_plates
 from synth.camera.scanning import scan
@@ -38,7 +38,7 @@ def render_views(scene: Scene, folder: Path, renderer: Renderer, views: list[Wan
     """Render the views of one frame and write them; the image last, so that its presence means that all is there."""
     studio = studio_of(scene, folder, renderer)
     cameras = read_cameras(folder / "cameras.json")
-    pose = _pose(folder, views[0].frame)
+    pose = read_surface_truth(folder, views[0].frame)
     _scan(scene, folder, studio, cameras, pose, views[0].frame)
     for view in views:  # Written one by one: every image is kept as soon as it is there.
         seed = stream(scene, "pixels", view.camera, view.frame)
@@ -64,11 +64,6 @@ def _scan(scene: Scene, folder: Path, studio: Studio, cameras: dict[str, Camera]
     training = [cameras[name] for name in splits(scene)["train"].seeing(frame)]
     vertices, faces = scan(studio, training, scene.scanner, seed=stream(scene, "scan", frame))
     write_arrays(scan_path(folder, frame), vertices=vertices, faces=faces)
-
-
-def _pose(folder: Path, frame: int) -> np.ndarray:
-    """The surface in a frame, `[s, 3]` metres."""
-    return read_arrays(surface_path(folder, frame), expected=("vertices",))["vertices"]
 
 
 def _write_view(folder: Path, view: WantedView, picture: Picture) -> None:

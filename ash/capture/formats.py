@@ -168,9 +168,9 @@ def read_template_truth(capture: Capture) -> np.ndarray:
     return vertices
 
 
-def read_surface_truth(capture: Capture, frame: int) -> np.ndarray:
+def read_surface_truth(folder: Path, frame: int) -> np.ndarray:
     """Vertices of the rendered surface in a frame, `[s, 3]` metres: what a lab would reconstruct per frame."""
-    path = surface_path(capture.folder, frame)
+    path = surface_path(folder, frame)
     vertices = read_arrays(path, expected=("vertices",))["vertices"]
     _require(path, {"vertices [s, 3]": vertices.ndim == 2 and vertices.shape[1] == 3 and len(vertices) > 0})
     return vertices
@@ -185,7 +185,7 @@ def read_surface_mesh_truth(capture: Capture, frame: int) -> tuple[np.ndarray, n
     shared = capture.folder / "truth" / "surface.npz"
     if not shared.exists():
         raise InputError(f"{capture.folder}: expected truth/surface.npz, found none; only oracles see the true surface")
-    return _mesh(shared, read_surface_truth(capture, frame), read_arrays(shared, expected=("faces",))["faces"])
+    return _mesh(shared, read_surface_truth(capture.folder, frame), read_arrays(shared, expected=("faces",))["faces"])
 
 
 def read_scan(capture: Capture, frame: int) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ash.capture.dataset import Capture, pixels_path, surface_path
-from ash.capture.formats import read_template_truth
+from ash.capture.formats import read_surface_mesh_truth, read_template_truth
 from ash.capture.novelty import novelty_deg
 from ash.files import open_regular, read_arrays, write_image
 from ash.protocol import TrainingOutcome
@@ -333,11 +333,9 @@ def _few(frames: list[int]) -> list[int]:
 
 
 def _surface_distance(capture: Capture, means: np.ndarray, frame: int) -> float | None:
-    path = surface_path(capture.folder, frame)
-    if not path.exists() or not len(means):
+    if not surface_path(capture.folder, frame).exists() or not len(means):
         return None
-    faces = read_arrays(capture.folder / "truth" / "surface.npz", expected=("faces",))["faces"]
-    vertices = read_arrays(path, expected=("vertices",))["vertices"].astype(np.float64)
+    vertices, faces = read_surface_mesh_truth(capture, frame)
     some = np.asarray(means, np.float64)[:: -(-len(means) // GEOMETRY_POINTS)]
     return metrics.surface_distance_mm(some, vertices, faces)
 

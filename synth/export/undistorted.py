@@ -33,7 +33,7 @@ def undistort(source: Path, folder: Path) -> Path:
     studio = _studio(capture)
     for name, frame in views:
         if not capture.cameras[name].is_pinhole:
-            studio.dress(read_surface_truth(capture, frame))
+            studio.dress(read_surface_truth(capture.folder, frame))
             written |= _write_view(capture, pinholes[name], frame, studio, folder)
     for name in set(capture.manifest.files) - written:
         link_or_copy(source / name, folder / name)

@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ash.capture.dataset import Camera, Capture, Pose, surface_path
-from ash.files import InputError, read_arrays
+from ash.capture.dataset import Camera, Capture, Pose
+from ash.capture.formats import read_surface_truth
+from ash.files import InputError
 from synth.camera.render import probe
 from synth.capture import make_body
 from synth.cloth import surface as cloth
@@ -38,7 +39,7 @@ class PoseTruth:
         anew, from `HISTORY` frames of the motion. `tell` hears what is being done.
         """
         if captured:
-            surface = read_arrays(surface_path(self.capture.folder, pose.frame), expected=("vertices",))["vertices"]
+            surface = read_surface_truth(self.capture.folder, pose.frame)
         else:
             tell("posing the body and its clothes")
             surface = dressed(self.scene, pose)

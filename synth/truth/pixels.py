@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
-from ash.capture.dataset import Capture, pixels_path, surface_path
+from ash.capture.dataset import Capture, pixels_path
+from ash.capture.formats import read_surface_truth
 from ash.files import InputError, read_arrays
 from synth.person.body import vertex_normals
 
@@ -75,7 +76,7 @@ def surface_truth(capture: Capture) -> SurfaceTruth:
 
 def posed_surface(capture: Capture, frame: int) -> np.ndarray:
     """Vertices of the rendered surface in a frame, `[s, 3]` metres."""
-    return read_arrays(surface_path(capture.folder, frame), expected=("vertices",))["vertices"].astype(np.float64)
+    return read_surface_truth(capture.folder, frame).astype(np.float64)
 
 
 def mix(pixels: PixelTruth, faces: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -185,12 +185,12 @@ def test_frames_decoded_together_are_those_decoded_alone(shared_trunk, kind):
 def test_a_halved_or_zeroed_gradient_of_one_layer_is_noticed(factor, monkeypatch):
     honest = _UNet.backward
 
-    def spoilt(ctx, grad):
+    def halved(ctx, grad):
         grads = list(honest(ctx, grad))
         grads[10] *= factor
         return tuple(grads)
 
-    monkeypatch.setattr(_UNet, "backward", staticmethod(spoilt))
+    monkeypatch.setattr(_UNet, "backward", staticmethod(halved))
     with pytest.raises(AssertionError):
         compare_with_the_definition(SHAPES["narrow"], channels_last=True)
 

@@ -143,7 +143,7 @@ class Warps(FakeAvatar):
         said = {"before": before, "after": after, "seen": int((seen.triangle == 0).sum())}
         (folder / "compiled.json").write_text(json.dumps(said))
         for name in after:
-            (Path(os.environ["WARP_CACHE_PATH"]) / name).write_bytes(b"spoilt")
+            (Path(os.environ["WARP_CACHE_PATH"]) / name).write_bytes(b"broken")
 
 
 def _files(folder: Path) -> dict[str, int]:
@@ -234,7 +234,7 @@ class Ends(FakeAvatar):
                     read_safetensors(kept)
             case "spoils":
                 libc = ctypes.CDLL(None)
-                libc.write(libc.open(str(TRUTH).encode(), os.O_WRONLY), b"spoilt", 6)
+                libc.write(libc.open(str(TRUTH).encode(), os.O_WRONLY), b"broken", 6)
             case "overwrites":
                 for path in folder.parents[1].glob("*/result.json"):
                     ctypes.CDLL(None).truncate(str(path).encode(), 10)

@@ -1,4 +1,4 @@
-"""A capture whose training frames are seen by turns, with near and far motion: rendered, spoilt, exported."""
+"""A capture whose training frames are seen by turns, with near and far motion: rendered, perturbed, exported."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -49,10 +49,10 @@ def test_only_what_a_split_names_is_rendered(capture):
 
 
 def test_a_lost_image_of_a_part_is_noticed(capture, tmp_path):
-    spoilt = perturb(capture.folder, tmp_path / "same", Perturbation())
+    perturbed = perturb(capture.folder, tmp_path / "same", Perturbation())
     camera, frame = capture.splits["train"].views[-1]
-    (spoilt / f"frames/{camera}/{frame:06d}.png").unlink()
-    assert verify_capture(spoilt) == [f"frames/{camera}/{frame:06d}.png: missing"]
+    (perturbed / f"frames/{camera}/{frame:06d}.png").unlink()
+    assert verify_capture(perturbed) == [f"frames/{camera}/{frame:06d}.png: missing"]
 
 
 def test_scans_know_only_what_the_part_saw(capture):

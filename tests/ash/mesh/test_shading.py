@@ -47,12 +47,12 @@ def test_shading_is_its_definition(lit, side, instructions):
 def test_a_halved_gradient_is_noticed(which, monkeypatch):
     honest = _Shade.backward
 
-    def spoilt(ctx, grad):
+    def halved(ctx, grad):
         grads = list(honest(ctx, grad))
         grads[which] = 0.5 * grads[which]
         return tuple(grads)
 
-    monkeypatch.setattr(_Shade, "backward", staticmethod(spoilt))
+    monkeypatch.setattr(_Shade, "backward", staticmethod(halved))
     with pytest.raises(AssertionError):
         compare(lit=True)
 

@@ -194,11 +194,11 @@ def test_a_spoilt_capture_is_made_once_whole_and_again_after_an_accident(
     monkeypatch.setattr(captures, "make_capture", make)
     spec = CaptureSpec(scene="boxes", size="ci", stress=Stress(axis="frames", severity=50.0))
     folder = make(spec, tmp_path, workers=1)
-    whole, spoilt = load_capture(clean), load_capture(folder)
-    assert len(spoilt.splits["train"].frames) == round(len(whole.splits["train"].frames) / 2)
-    assert spoilt.identity != whole.identity and not verify_capture(folder)
+    whole, perturbed = load_capture(clean), load_capture(folder)
+    assert len(perturbed.splits["train"].frames) == round(len(whole.splits["train"].frames) / 2)
+    assert perturbed.identity != whole.identity and not verify_capture(folder)
     stamp = (folder / "manifest.json").stat().st_mtime_ns
     assert make(spec, tmp_path, workers=1) == folder
     assert (folder / "manifest.json").stat().st_mtime_ns == stamp
     (folder / "manifest.json").unlink()
-    assert load_capture(make(spec, tmp_path, workers=1)).identity == spoilt.identity
+    assert load_capture(make(spec, tmp_path, workers=1)).identity == perturbed.identity

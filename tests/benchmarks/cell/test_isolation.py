@@ -340,7 +340,7 @@ def test_kernels_are_compiled_once_and_every_cell_has_its_own_copy(
     assert not (target.folder / worker.KERNELS).exists()
     if seeded:
         again = worker.copy_kernel_cache("cpu", tmp_path / "again")
-        assert not [path for path in again.rglob("*") if path.is_file() and path.read_bytes() == b"spoilt"]
+        assert not [path for path in again.rglob("*") if path.is_file() and path.read_bytes() == b"broken"]
 
 
 def test_without_a_gpu_there_is_nothing_to_compile(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

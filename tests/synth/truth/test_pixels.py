@@ -112,9 +112,9 @@ def test_perturbations_touch_training_only_and_follow_their_seed(capture: Captur
 
 
 def test_a_mask_that_is_too_large_shows_the_studio(capture: Capture, tmp_path: Path):
-    spoilt = load_capture(perturb(capture.folder, tmp_path / "grown", Perturbation(mask_px=3)))
+    perturbed = load_capture(perturb(capture.folder, tmp_path / "grown", Perturbation(mask_px=3)))
     camera, frame = capture.splits["train"].views[0]
-    before, after = capture.image(camera, frame), spoilt.image(camera, frame)
+    before, after = capture.image(camera, frame), perturbed.image(camera, frame)
     plate = read_image(background_path(capture.folder, camera), shape=before[..., :3].shape)
     ring = (before[..., 3] == 0) & (after[..., 3] == 255)
     assert ring.sum() > 50
@@ -153,10 +153,10 @@ def test_severities_are_what_they_say(capture: Capture):
 def test_colour_drift_tints_cameras_and_brightness_drift_does_not(capture: Capture, tmp_path: Path):
     def gains(name: str, perturbation: Perturbation) -> np.ndarray:
         """Linear gain of every training camera's channels, where no channel is clipped."""
-        spoilt = load_capture(perturb(capture.folder, tmp_path / name, perturbation, seed=3))
+        perturbed = load_capture(perturb(capture.folder, tmp_path / name, perturbation, seed=3))
         found = []
         for camera in capture.splits["train"].cameras:
-            before, after = (c.image(camera, capture.splits["train"].frames[0]) for c in (capture, spoilt))
+            before, after = (c.image(camera, capture.splits["train"].frames[0]) for c in (capture, perturbed))
             plain = (before[..., 3] == 255) & (before[..., :3] > 40).all(-1) & (after[..., :3] < 250).all(-1)
             found.append(((after[plain, :3] / 255.0) ** 2.2).mean(0) / ((before[plain, :3] / 255.0) ** 2.2).mean(0))
         return np.array(found)
