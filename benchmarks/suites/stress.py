@@ -11,7 +11,7 @@ from synth.perturbation.perturb import Perturbation
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class StressAxis:
-    """One way to spoil a capture, by a severity in `unit`."""
+    """One defect of a capture, by a severity in `unit`."""
 
     title: str
     unit: str
@@ -55,6 +55,11 @@ AXES = {
         title="wrong calibration",
         unit="px",
         perturbation=lambda _, s: Perturbation(calibration_px=s),
+    ),
+    "lens": StressAxis(
+        title="lens distortion that the calibration lacks",
+        unit="px",
+        perturbation=lambda _, s: Perturbation(lens_px=s),
     ),
     "mask_grown": StressAxis(
         title="masks too large",

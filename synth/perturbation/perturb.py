@@ -9,10 +9,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter1d
+from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter1d, map_coordinates
 
 from ash.capture.dataset import Camera, Capture, Motion, background_path, image_path, pixels_path, spread_cameras
 from ash.capture.formats import load_capture, write_cameras, write_motion
+from ash.capture.lens import undistort
 from ash.files import InputError, hash_of, link_or_copy, read_arrays, read_image, sha256_of, write_image
 from synth.posing import rotvec_to_rotmat
 
@@ -24,6 +25,7 @@ class Perturbation:
     tracking_deg: float = 0.0  # rms error of tracked joint rotations, smooth in time
     tracking_mm: float = 0.0  # rms error of the tracked root
     calibration_px: float = 0.0  # rms shift of training images by wrong extrinsics
+    lens_px: float = 0.0  # radial distortion of training images that no calibration tells: its shift at the near border
     mask_px: int = 0  # training masks dilated (> 0), so that the studio shows, or eroded (< 0)
     exposure_stops: float = 0.0  # rms drift of brightness between training cameras
     colour_stops: float = 0.0  # rms drift of each channel's brightness between training cameras
@@ -33,7 +35,7 @@ class Perturbation:
     first_frames: int | None = None  # how many training frames are left, the first of the training motion
 
     def __post_init__(self) -> None:
-        for name in ("tracking_deg", "tracking_mm", "calibration_px", "exposure_stops", "colour_stops"):
+        for name in ("tracking_deg", "tracking_mm", "calibration_px", "lens_px", "exposure_stops", "colour_stops"):
             if not 0 <= getattr(self, name) <= 1000:
                 raise InputError(f"perturbation: {name} is {getattr(self, name)}, expected 0 to 1000")
         if not (1 <= self.noise_factor <= 1e6 and abs(self.mask_px) <= 100):
@@ -104,7 +106,7 @@ def _changed_files(
         write_cameras(folder / "cameras.json", cameras)
         yield "cameras.json", sha256_of(folder / "cameras.json")
     drifts = perturbation.exposure_stops or perturbation.colour_stops
-    if perturbation.mask_px or drifts or perturbation.noise_factor > 1:
+    if perturbation.mask_px or perturbation.lens_px or drifts or perturbation.noise_factor > 1:
         for camera, frame in capture.splits["train"].views:
             path = image_path(folder, camera, frame)
             write_image(path, _spoil(original, camera, frame, perturbation, seed))
@@ -151,7 +153,33 @@ def _spoil(capture: Capture, camera: str, frame: int, perturbation: Perturbation
     if perturbation.mask_px:
         alpha = _shift_mask(alpha, perturbation.mask_px)
     rgb = np.round(np.clip(colour, 0, 1) * 255).astype(np.uint8)
-    return np.concatenate([np.where(alpha[..., None] > 0, rgb, 0), alpha[..., None]], axis=-1)
+    image = np.concatenate([np.where(alpha[..., None] > 0, rgb, 0), alpha[..., None]], axis=-1)
+    return through_lens(image, capture.cameras[camera], perturbation.lens_px) if perturbation.lens_px else image
+
+
+def through_lens(image: np.ndarray, camera: Camera, pixels: float) -> np.ndarray:
+    """An image (uint8 RGBA, straight alpha) as a lens with pincushion distortion shows it.
+
+    `pixels`: the shift at the middle of the border that is nearer to the centre; it falls with the cube of the radius.
+
+    Raises:
+        InputError: the camera has a lens already.
+    """
+    if not camera.is_pinhole:
+        raise InputError(f"perturbation: lens_px needs pinhole cameras, and {camera.name} has a distortion")
+    focal, centre = np.diag(camera.K)[:2], camera.K[:2, 2]
+    border = float(min((camera.width, camera.height) / focal)) / 2
+    places = np.stack(np.meshgrid(*(np.arange(side) + 0.5 for side in (camera.width, camera.height))), axis=-1)
+    ideal = undistort((places - centre) / focal, np.array([pixels / (focal.mean() * border**3), 0, 0, 0]))
+    columns, rows = np.moveaxis(ideal * focal + centre - 0.5, -1, 0)
+    alpha = image[..., 3:] / 255.0
+    premultiplied = np.concatenate([image[..., :3] * alpha, 255 * alpha], axis=-1)
+    moved = np.stack(
+        [map_coordinates(channel, [rows, columns], order=1) for channel in np.moveaxis(premultiplied, -1, 0)], -1
+    )
+    straight = moved[..., :3] / np.maximum(moved[..., 3:] / 255, 1e-6)
+    shown = np.concatenate([np.where(moved[..., 3:] >= 0.5, straight, 0), moved[..., 3:]], axis=-1)
+    return np.round(np.clip(shown, 0, 255)).astype(np.uint8)
 
 
 def _plate(capture: Capture, name: str) -> np.ndarray:

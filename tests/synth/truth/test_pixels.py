@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ash.capture.dataset import Capture, background_path, farthest_points, pixels_path
+from ash.capture.dataset import Camera, Capture, background_path, farthest_points, image_path, pixels_path
 from ash.capture.formats import load_capture, read_cameras, write_cameras
 from ash.capture.manifest import verify_capture
 from ash.files import InputError, read_image, write_arrays
 from synth.camera.rig import held_out, make_cameras, rig_from_file
 from synth.person.body import PARTS
-from synth.perturbation.perturb import Perturbation, miscalibrate, mistrack, perturb
+from synth.perturbation.perturb import Perturbation, miscalibrate, mistrack, perturb, through_lens
 from synth.scene import RIGS, Rig
 from synth.truth import pixels as truth
 
@@ -148,6 +148,22 @@ def test_severities_are_what_they_say(capture: Capture):
         for seed in range(40):
             shifts.append(miscalibrate(camera, 2.0, seed=seed).project(point)[0] - camera.project(point)[0])
     assert 1.2 < np.sqrt(np.mean(np.sum(np.concatenate(shifts) ** 2, axis=-1))) < 3.0
+
+
+def test_a_lens_moves_training_images_by_the_cube_of_the_radius_and_nothing_else(capture: Capture, tmp_path: Path):
+    K = np.array([[200.0, 0, 80], [0, 200, 60], [0, 0, 1]])
+    camera = Camera(name="plain", width=160, height=120, K=K, viewmat=np.eye(4))
+    image = np.zeros((120, 160, 4), np.uint8)
+    image[60], image[30] = 255, 255  # A line through the centre, and one halfway to the border above it.
+    column = through_lens(image, camera, 8.0)[:, 80, 3].astype(float)
+    rows = np.arange(120)
+    middles = [(column[part] * rows[part]).sum() / column[part].sum() for part in (rows >= 45, rows < 45)]
+    np.testing.assert_allclose(middles, [60, 29], atol=0.2)  # An eighth of 8 pixels, away from the centre.
+    perturbed = load_capture(perturb(capture.folder, tmp_path / "lens", Perturbation(lens_px=3.0)))
+    changed = {n for n, digest in perturbed.manifest.files.items() if capture.manifest.files.get(n) != digest}
+    assert changed == {str(image_path(Path(), *view)) for view in capture.splits["train"].views}
+    with pytest.raises(InputError, match="lens_px needs pinhole cameras"):
+        through_lens(image, replace(camera, distortion=np.array([0.1, 0, 0, 0])), 8.0)
 
 
 def test_colour_drift_tints_cameras_and_brightness_drift_does_not(capture: Capture, tmp_path: Path):
