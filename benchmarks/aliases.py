@@ -13,6 +13,9 @@ OLD_COMMANDS: dict[str, tuple[str, ...]] = {  # old command -> what is typed in 
 
 OLD_FORMATS = {"glb": "gltf"}  # of `export`, for avatars
 
-OLD_FIELDS = {"model.fade": "model.novelty_scale"}  # of configurations, as flags and as keys of a suite's file
+OLD_FIELDS = {  # of configurations and scenes, as flags and as keys of a suite's file
+    "model.fade": "model.novelty_scale",
+    "rig.part": "rig.cameras_per_frame",
+}
 OLD_SUITES = {"ladder": "factors"}
 OLD_SIZES = {"rung": "factor"}  # of scenes

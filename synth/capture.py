@@ -40,8 +40,8 @@ from synth.person.bare import bare_template
 from synth.person.body import Body
 from synth.person.cast import subject
 from synth.person.mannequin import mannequin
+from synth.rendering import render_backgrounds, render_views
 from synth.scene import Scene, stream
-from synth.shooting import render_plates, render_views
 from synth.source_hash import code_version, source_version
 from synth.views import WantedView, by_frame, is_scanned, splits, wanted_views
 
@@ -89,7 +89,7 @@ def make_capture(
                 progress(done, len(share))
         if not missing_views(scene, folder, views):
             assert executor or own
-            (executor or own).submit(render_plates, scene, folder, renderer).result()  # type: ignore[union-attr]
+            (executor or own).submit(render_backgrounds, scene, folder, renderer).result()  # type: ignore[union-attr]
     except BaseException:
         if own:  # Files are whole or absent, so nobody needs to wait for the frames that are under way.
             for process in list((own._processes or {}).values()):

@@ -14,7 +14,7 @@ from synth.motion.importing import WHOLE
 from synth.scene import Clip, Light, Outfit, Rig, Scene, Take
 
 SIZES = ("ci", "factor", "quick", "long", "table", "paper")
-ROTATING = Rig(cameras=24, held_out=4, part=4)
+ROTATING = Rig(cameras=24, held_out=4, cameras_per_frame=4)
 ALONE: dict[str, Any] = {"near": (), "far": (), "near_stride": 1, "far_stride": 1}  # no motion beside what is asked for
 EVENING = Light(falloff=0.4, gloss=0.2)  # a lamp that lights one side of the floor, on cloth that shines a little
 
@@ -40,7 +40,7 @@ def _size(name: str) -> Size:
         apart = {"test_frames": 3, "stride": 3, "near_stride": 2, "far_stride": 2}
         return Size(rig=rig, repeats=1, frames=4, **apart, samples=16, texture=512)
     if name == "factor":  # Novel views lie between cameras, and pixels show what a factor adds.
-        rig = Rig(cameras=20, held_out=4, part=8, width=192, height=192)
+        rig = Rig(cameras=20, held_out=4, cameras_per_frame=8, width=192, height=192)
         apart = {"test_frames": 12, "stride": 10, "near_stride": 10, "far_stride": 4}
         return Size(rig=rig, repeats=2, frames=10, **apart, samples=50, texture=1024)
     if name == "quick":  # 104 training frames, and fewer than 550 images.
@@ -50,7 +50,7 @@ def _size(name: str) -> Size:
         apart = {"test_frames": 12, "stride": 40, "near_stride": 8, "far_stride": 4}
         return Size(rig=ROTATING, repeats=8, frames=10, **apart, samples=60, texture=2048)
     if name == "table":
-        rig = Rig(cameras=34, held_out=4, part=10, width=512, height=512)
+        rig = Rig(cameras=34, held_out=4, cameras_per_frame=10, width=512, height=512)
         apart = {"test_frames": 80, "stride": 20, "near_stride": 4, "far_stride": 2}
         return Size(rig=rig, repeats=4, frames=20, **apart, samples=128, texture=4096)
     if name == "paper":
@@ -141,7 +141,7 @@ def still(*, size: str, seed: int) -> Scene:
     """One pose: the textured body, path-traced. Static Gaussians suffice."""
     base = skinned(size=size, seed=seed)
     train, test = (Clip(generator="stand", frames=frames) for frames in (4, 2))
-    rig = replace(base.rig, part=0)
+    rig = replace(base.rig, cameras_per_frame=0)
     return replace(base, name="still", rig=rig, train=(train,), test=(test,), **ALONE, novel_view_stride=2)
 
 

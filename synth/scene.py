@@ -108,7 +108,7 @@ class Rig:
     given: str = ""  # the text of a user's cameras.json, for kind "given"
     cameras: int = 16
     held_out: int = 4
-    part: int = 0  # so many training cameras see each training frame, by turns; 0, or as many as there are: all do
+    cameras_per_frame: int = 0  # so many training cameras see each training frame, by turns; 0: all
     width: int = 256
     height: int = 256
     radius: float = 3.4  # metres
@@ -122,10 +122,8 @@ class Rig:
             raise InputError("a rig of kind 'given' needs the text of a cameras.json, and only such a rig has one")
         if not 0 < self.held_out < self.cameras <= 1000:
             raise InputError(f"rig: {self.held_out} of {self.cameras} cameras held out, expected 1 to all but one")
-        if self.part < 0:
-            raise InputError(
-                f"rig: a part of {self.part} training cameras sees each frame, expected 1 or more, or 0 for all"
-            )
+        if self.cameras_per_frame < 0:
+            raise InputError(f"rig.cameras_per_frame: expected 1 or more, or 0 for all, got {self.cameras_per_frame}")
         if not (16 <= self.width <= 8192 and 16 <= self.height <= 8192):
             raise InputError(f"rig: images of {self.width}x{self.height}, expected 16 to 8192 pixels")
         if not 0.1 <= self.pixel_aspect <= 10:
@@ -202,8 +200,8 @@ class Scene:
         parameters = asdict(self)
         if not self.subject:
             del parameters["subject"]
-        if not self.rig.part:
-            del parameters["rig"]["part"]
+        if per_frame := parameters["rig"].pop("cameras_per_frame"):
+            parameters["rig"]["part"] = per_frame  # Its name in manifests: identities stay.
         parameters["rig"]["shutter"] = 0.0  # Of earlier versions, which had motion blur: the identity stays.
         for name in ("near", "far"):
             if not parameters[name]:

@@ -51,7 +51,7 @@ def _some(clips: tuple[Clip, ...], *, first: int, stride: int) -> tuple[int, ...
 
 def _parts(scene: Scene, frames: int) -> tuple[tuple[str, ...], ...]:
     """The names of the cameras that see each training frame; none where all do."""
-    if not 0 < scene.rig.part < scene.rig.cameras - scene.rig.held_out:
+    if not 0 < scene.rig.cameras_per_frame < scene.rig.cameras - scene.rig.held_out:
         return ()
     names = camera_names(scene.rig)
     return tuple(tuple(names[k] for k in sorted(part)) for part in rotation(scene.rig, frames))

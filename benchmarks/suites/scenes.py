@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ash.fields import Changes, apply_overrides, suggest
 from ash.files import InputError
+from benchmarks.cell.registry import current_fields
 from benchmarks.suites.progress import Progress
 from synth.presets import SCENES, scene, skinned
 from synth.scene import Scene
@@ -27,7 +28,8 @@ def scene_of(of: str, *, size: str, seed: int = 0, subject: int = 0, name: str =
     """
     if of not in scene_names():
         raise InputError(f"unknown scene {of!r}, {suggest(of, scene_names())}")
-    return apply_overrides(replace(_plain(of, size, seed), subject=subject, name=name or of), changes, of=of)
+    plain = replace(_plain(of, size, seed), subject=subject, name=name or of)
+    return apply_overrides(plain, current_fields(plain, changes), of=of)
 
 
 def _plain(of: str, size: str, seed: int) -> Scene:

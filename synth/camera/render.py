@@ -18,8 +18,8 @@ import numpy as np
 
 from ash.capture.dataset import Camera
 from ash.files import InputError
+from synth.camera.background import make_hall
 from synth.camera.lighting import is_plain, make_integrator, make_lamps, make_sky, sky_and_lamps
-from synth.camera.plates import make_hall
 from synth.camera.sensing import Window, make_sensor, window_of
 from synth.person.body import Surface, vertex_normals
 from synth.scene import Light
@@ -192,7 +192,7 @@ class Studio:
         if self.plain:
             self.integrator.person = self.bare
 
-    def shoot(
+    def render(
         self,
         pose: np.ndarray,
         cameras: list[Camera],
@@ -274,18 +274,18 @@ class Studio:
         return triangle.astype(np.int32).reshape(shape), barycentric.reshape(*shape, 2)
 
 
-def shoot_plates(renderer: Renderer, cameras: list[Camera], *, seed: int, samples: int = 64) -> list[np.ndarray]:
+def empty_studio(renderer: Renderer, cameras: list[Camera], *, seed: int, samples: int = 64) -> list[np.ndarray]:
     """The empty studio in every camera, sRGB uint8 `[h, w, 3]`."""
     mi = _use(renderer)
     radius = max(float(np.hypot(*camera.position[[0, 2]])) for camera in cameras)
     hall, integrator = make_hall(mi, radius, seed), mi.load_dict({"type": "direct"})
-    plates = []
+    images = []
     for camera in cameras:
         whole = Window(left=0, top=0, width=camera.width, height=camera.height)
         sensor = make_sensor(mi, camera, whole, vectorised=bool(renderer.libllvm))
         image = np.array(mi.render(hall, sensor=sensor, integrator=integrator, spp=samples, seed=seed % 2**32))
-        plates.append(np.round(255 * _to_srgb(image[..., :3].astype(np.float64))).astype(np.uint8))
-    return plates
+        images.append(np.round(255 * _to_srgb(image[..., :3].astype(np.float64))).astype(np.uint8))
+    return images
 
 
 def _to_srgb(linear: np.ndarray) -> np.ndarray:
@@ -310,7 +310,7 @@ def _probe_here(variant: str) -> None:
     viewmat[:3, 3] = [0, 1, 4]
     K = np.array([[32.0, 0, 16], [0, 32, 16], [0, 0, 1]])
     camera = Camera(name="probe", width=32, height=32, K=K, viewmat=viewmat)
-    picture = studio.shoot(surface.vertices, [camera], samples=8, seeds=[0])[0]
+    picture = studio.render(surface.vertices, [camera], samples=8, seeds=[0])[0]
     if picture.rgba[16, 16, 3] != 255 or picture.triangle[16, 16] < 0 or not 20 < picture.rgba[16, 16, :3].mean() < 250:
         raise SystemExit("the probe picture is wrong")
     print(json.dumps({"mitsuba": studio.mi.__version__}))

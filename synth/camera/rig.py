@@ -244,16 +244,16 @@ def held_out(rig: Rig) -> list[int]:
 
 
 def rotation(rig: Rig, frames: int) -> list[list[int]]:
-    """Indices of the training cameras that see each frame: `rig.part` of them, one out of each sector around the rig.
+    """Indices of the training cameras that see each frame: `cameras_per_frame`, one out of each sector around the rig.
 
-    In every round of (training cameras / part) frames each camera is used once; where that is no whole number, sectors
+    In every round of (training cameras / cameras per frame) frames each camera is used once; where that is no whole number, sectors
     of one camera less begin anew a frame earlier. From round to round the sectors are shifted against each other, so
     that cameras meet in other parts. An axis through the middle of the rig is up.
     """
     around = place(rig) if rig.kind != "given" else np.stack([camera.position for camera in _parse(rig.given)])
     training = [k for k in range(rig.cameras) if k not in held_out(rig)]
     azimuth = np.arctan2(*(around[training][:, [0, 2]] - around[:, [0, 2]].mean(axis=0)).T)
-    sectors = np.array_split(np.array(training)[np.argsort(azimuth, kind="stable")], rig.part)
+    sectors = np.array_split(np.array(training)[np.argsort(azimuth, kind="stable")], rig.cameras_per_frame)
     return [
         [int(sector[(frame + number * (frame // len(sector))) % len(sector)]) for number, sector in enumerate(sectors)]
         for frame in range(frames)

@@ -309,7 +309,7 @@ def export_official(capture: Capture, folder: Path, *, subject: str = "Synthetic
     if capture.splits["train"].parts:
         raise InputError(
             f"{capture.folder}: a part of the cameras saw each frame, and the release reads an image of every camera in"
-            " every frame; make the capture with --rig.part 0"
+            " every frame; make the capture with --rig.cameras-per-frame 0"
         )
     _require_faces_everywhere(capture)
     nodes = graph_nodes(template)

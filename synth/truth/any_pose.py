@@ -11,8 +11,8 @@ from ash.files import InputError
 from synth.camera.render import probe
 from synth.capture import make_body
 from synth.cloth import surface as cloth
+from synth.rendering import studio_of
 from synth.scene import Scene, stream
-from synth.shooting import studio_of
 from synth.truth.retargeting import recorded_scene
 
 HISTORY = 24  # frames before the pose, through which clothes are carried: they depend on where they came from
@@ -46,7 +46,7 @@ class PoseTruth:
         tell("tracing light")
         studio = studio_of(self.scene, self.capture.folder, self.renderer)
         seed = stream(self.scene, "pixels", camera.name, pose.frame)
-        return studio.shoot(surface, [camera], samples=self.scene.samples, seeds=[seed])[0].rgba
+        return studio.render(surface, [camera], samples=self.scene.samples, seeds=[seed])[0].rgba
 
 
 def dressed(scene: Scene, pose: Pose) -> np.ndarray:

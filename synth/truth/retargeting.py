@@ -10,6 +10,8 @@ from synth.person.body import Body
 from synth.presets import with_motion
 from synth.scene import Clip, Scene
 
+OLD_RIG = {"part": "cameras_per_frame"}  # fields by their names in manifests
+
 
 def recorded_scene(manifest: Manifest, folder: Path) -> Scene:
     """The scene that a capture's manifest describes.
@@ -20,7 +22,8 @@ def recorded_scene(manifest: Manifest, folder: Path) -> Scene:
     try:
         parameters = dict(manifest.parameters)
         if isinstance(rig := parameters.get("rig"), dict) and rig.get("shutter") == 0:
-            parameters["rig"] = {key: value for key, value in rig.items() if key != "shutter"}
+            rig = {key: value for key, value in rig.items() if key != "shutter"}
+            parameters["rig"] = {OLD_RIG.get(key, key): value for key, value in rig.items()}
         scene: Scene = from_json(Scene, parameters)
     except ValueError as error:
         raise InputError(f"{folder}: its manifest describes no scene of this version ({error})") from error

@@ -54,10 +54,10 @@ def test_a_switch_learns_and_draws_a_person(row: MethodSpec, capture: Capture, t
 
 @pytest.mark.parametrize("row", LEARNED, ids=lambda row: row.name)
 def test_a_way_to_the_template_is_learned_and_draws(row: MethodSpec, capture: Capture, tmp_path: Path) -> None:
-    require_a_way(made(row, capture), row.name == "unlearned", capture, tmp_path)
+    require_template_used(made(row, capture), row.name == "unlearned", capture, tmp_path)
 
 
-def require_a_way(avatar: AshAvatar, unlearned: bool, capture: Capture, folder: Path) -> None:
+def require_template_used(avatar: AshAvatar, unlearned: bool, capture: Capture, folder: Path) -> None:
     assert (avatar.template.learned is None) == unlearned
     avatar.fit(capture, folder=folder)
     assert np.isfinite(avatar.render(Pose(capture.motion, 3), capture.cameras["cam0"], clock=StageClock())).all()

@@ -16,7 +16,7 @@ import pytest
 import torch
 from helpers.captures import tiny_preset, write_tube_capture
 from helpers.figures import tube_mesh
-from helpers.parts import differing, taken_apart
+from helpers.parts import differing, fingerprints
 
 from ash import presets
 from ash.capture.dataset import Capture, Pose, scan_path
@@ -66,7 +66,7 @@ def apart(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Apart:
     def made(method: str, changes: tuple[tuple[str, Any], ...]) -> Parts:
         config = apply_overrides(METHODS[method].config("ci"), changes, of=method)
         avatar = METHODS[method](capture, seed=config.seed, preset="ci", config=config)
-        return taken_apart(avatar, capture, tmp_path_factory.mktemp("apart"))
+        return fingerprints(avatar, capture, tmp_path_factory.mktemp("apart"))
 
     return lambda method, changes: made(method, tuple(sorted(changes.items())))
 
@@ -120,7 +120,7 @@ def test_a_switch_changes_what_it_names_and_nothing_else(
     row = SWITCHES[name]
     factory = find_method(row.of or row.name).load()
     avatar = factory(capture.training_only(), seed=0, preset="ci", config=configured(row.of, "ci", row.changes))
-    assert differing(apart("ash", {}), taken_apart(avatar, capture, tmp_path)) == CHANGED_BY_SWITCH[name]
+    assert differing(apart("ash", {}), fingerprints(avatar, capture, tmp_path)) == CHANGED_BY_SWITCH[name]
 
 
 CAMERAS = {"batches", "start"}  # The first colours are means over the cameras.
@@ -158,7 +158,7 @@ def test_a_row_changes_what_it_names_and_nothing_else(
     name: str, capture: Capture, tmp_path: Path, apart: Apart
 ) -> None:
     seen = capture if name.endswith("truth") else capture.training_only()
-    made = taken_apart(find_method(name).load()(seen, seed=0, preset="ci"), capture, tmp_path)
+    made = fingerprints(find_method(name).load()(seen, seed=0, preset="ci"), capture, tmp_path)
     assert differing(apart("ddc" if name.startswith("ddc") else "ash", {}), made) == CHANGED_BY_ROW[name]
 
 

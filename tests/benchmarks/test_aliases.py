@@ -7,7 +7,9 @@ from benchmarks import cli
 from benchmarks.aliases import OLD_COMMANDS, OLD_FIELDS
 from benchmarks.cell.registry import configured
 from benchmarks.commands.arguments import read_command
+from benchmarks.commands.captures import SynthCommand
 from benchmarks.commands.runs import TrainCommand
+from benchmarks.suites.scenes import scene_of
 
 
 @pytest.mark.parametrize("old", OLD_COMMANDS)
@@ -19,10 +21,16 @@ def test_an_old_command_is_the_new_one_and_says_so(old: str, capsys: pytest.Capt
     assert f"ash-bench {OLD_COMMANDS[old][0]}" in printed.out
 
 
-@pytest.mark.parametrize(("old", "new"), OLD_FIELDS.items())
-def test_an_old_field_is_read_as_a_flag_and_in_a_suite(old: str, new: str) -> None:
-    part, _, field = new.partition(".")
-    value = getattr(getattr(named("ci"), part), field) / 2
-    assert getattr(getattr(configured("ash", "ci", {old: value}), part), field) == value
-    command = read_command(TrainCommand, "train", ["ash", "data/x", "--preset", "ci", f"--{old}", str(value)])
-    assert command.changes == ((new, value),)
+def test_an_old_field_of_a_method_is_read_as_a_flag_and_in_a_suite() -> None:
+    assert OLD_FIELDS["model.fade"] == "model.novelty_scale"
+    value = named("ci").model.novelty_scale / 2
+    assert configured("ash", "ci", {"model.fade": value}).model.novelty_scale == value
+    command = read_command(TrainCommand, "train", ["ash", "data/x", "--preset", "ci", "--model.fade", str(value)])
+    assert command.changes == (("model.novelty_scale", value),)
+
+
+def test_an_old_field_of_a_scene_is_read_as_a_flag_and_in_a_suite() -> None:
+    command = read_command(SynthCommand, "synth", ["loose", "--rig.part", "5"])
+    assert command.changes == (("rig.cameras_per_frame", 5),)
+    old, new = (scene_of("loose", size="quick", changes=((key, 5),)) for key in ("rig.part", "rig.cameras_per_frame"))
+    assert old == new and old.parameters["rig"]["part"] == 5 and "cameras_per_frame" not in old.parameters["rig"]

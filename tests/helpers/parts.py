@@ -358,7 +358,7 @@ PARTS = {
 }  # by whether it is a mesh
 
 
-def taken_apart(avatar: AshAvatar | DdcAvatar, capture: Capture, folder: Path) -> dict[str, str]:
+def fingerprints(avatar: AshAvatar | DdcAvatar, capture: Capture, folder: Path) -> dict[str, str]:
     """The fingerprints of all parts of an avatar, by their names."""
     subject = Subject(avatar, capture, folder)
     return {name: part(subject) for name, part in PARTS[subject.is_mesh].items()}

@@ -23,8 +23,8 @@ from synth.camera import render
 from synth.camera.render import find_libllvm, llvm_version, probe
 from synth.capture import _begin, is_finished, make_body, make_capture, why_stale
 from synth.posing import dual_quaternion_skinning, skinning_transforms
+from synth.rendering import render_views, studio_of
 from synth.scene import Clip, Outfit, Rig
-from synth.shooting import render_views, studio_of
 from synth.views import splits, wanted_views
 
 

@@ -21,7 +21,7 @@ def rotating_scene() -> Scene:
     """Four training cameras, of which two see each frame."""
     return replace(
         small_scene(),
-        rig=Rig(cameras=5, held_out=1, part=2, width=64, height=64),
+        rig=Rig(cameras=5, held_out=1, cameras_per_frame=2, width=64, height=64),
         near=(Clip(generator="walk", frames=4),),
         near_stride=2,
         far=(Clip(generator="arms_up", frames=4), Clip(generator="jump", frames=4)),
@@ -79,7 +79,7 @@ def test_exports_write_the_cameras_of_the_frame_or_refuse(capture, tmp_path):
         capture.splits["train"].seeing(1)
     )
     assert "seen by 2 of its 4 cameras" in (tmp_path / "colmap/ABOUT.txt").read_text()
-    with pytest.raises(InputError, match=r"--rig\.part 0"):
+    with pytest.raises(InputError, match=r"--rig\.cameras-per-frame 0"):
         export(capture, tmp_path / "ash", form="ash")
 
 

@@ -72,7 +72,7 @@ def test_known_points_land_on_their_pixels(shape: str):
     view = replace(view, distortion=np.array(LENSES.get(shape, (0, 0, 0, 0)), dtype=np.float64))
     centres = np.concatenate([GRID, np.zeros((len(GRID), 1))], axis=1)
     pose = squares(centres, 0.04)
-    picture = studio(len(GRID)).shoot(pose, [view], samples=128, seeds=[1])[0]
+    picture = studio(len(GRID)).render(pose, [view], samples=128, seeds=[1])[0]
     alpha = picture.rgba[..., 3] / 255
     expected, depth = view.project(centres)
     straight, _ = plain.project(centres)

@@ -16,7 +16,7 @@ PLACES = np.array([[0.0, 0.3, 0.0], [0.25, 0.6, 0.6], [-0.6, -0.5, 0.2]])
 
 def _mean(place: Studio, pose: np.ndarray, samples: int) -> tuple[np.ndarray, float]:
     """Colour of the squares, mean over their pixels in 0..1, and the mean variance of a pixel."""
-    picture = place.shoot(pose, [VIEW], samples=samples, seeds=[7])[0]
+    picture = place.render(pose, [VIEW], samples=samples, seeds=[7])[0]
     inside = picture.rgba[..., 3] == 255
     return picture.rgba[inside][:, :3].mean(axis=0) / 255, float(picture.noise[inside].mean())
 
@@ -51,7 +51,7 @@ def test_only_gloss_looks_different_from_elsewhere(gloss: float):
     for towards in (mirrored, [3.0, 9.0, 9.0], [5.0, -4.0, 12.0]):
         position = centre + 3 * np.array(towards) / np.linalg.norm(towards)
         view = replace(VIEW, viewmat=look_at(position, centre))
-        picture = place.shoot(squares(centre[None], 0.3), [view], samples=200, seeds=[1])[0]
+        picture = place.render(squares(centre[None], 0.3), [view], samples=200, seeds=[1])[0]
         assert abs(int((picture.rgba[..., 3] > 127).sum()) - int((picture.triangle >= 0).sum())) < 8  # No lamp is seen.
         colours.append(picture.rgba[picture.rgba[..., 3] == 255][:, :3].mean(axis=0) / 255)
     highlight, *others = np.array(colours)

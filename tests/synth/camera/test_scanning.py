@@ -17,8 +17,8 @@ from synth.camera.render import Studio, probe
 from synth.camera.scanning import FACING, facing_of_second, scan
 from synth.capture import make_capture
 from synth.person.body import vertex_normals
+from synth.rendering import studio_of
 from synth.scene import Scanner, stream
-from synth.shooting import studio_of
 
 
 @pytest.fixture(scope="module")

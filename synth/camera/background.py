@@ -1,4 +1,4 @@
-"""Clean plates: the empty studio as every camera sees it, which is what shows where a mask is too large.
+"""Backgrounds: the empty studio as every camera sees it, which is what shows where a mask is too large.
 
 A round hall with a boarded floor and a wall of panels. It casts no light on the person and takes none, so that masks
 that are right give the same images with and without it.

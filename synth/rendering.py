@@ -1,4 +1,4 @@
-"""What the cameras and the scanner make of a scene: images with their truth, scans, and plates of the empty studio."""
+"""What the cameras and the scanner make of a scene: images with their truth, scans, and the empty studio."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import numpy as np
 from ash.capture.dataset import Camera, background_path, image_path, pixels_path, scan_path
 from ash.capture.formats import read_cameras, read_surface_truth
 from ash.files import read_arrays, read_image, write_arrays, write_image
-from synth.camera.render import Picture, Renderer, Studio, shoot_plates
+from synth.camera.render import Picture, Renderer, Studio, empty_studio
 from synth.camera.scanning import scan
 from synth.person.body import Surface
 from synth.scene import Scene, stream
@@ -42,18 +42,18 @@ def render_views(scene: Scene, folder: Path, renderer: Renderer, views: list[Wan
     _scan(scene, folder, studio, cameras, pose, views[0].frame)
     for view in views:  # Written one by one: every image is kept as soon as it is there.
         seed = stream(scene, "pixels", view.camera, view.frame)
-        (picture,) = studio.shoot(pose, [cameras[view.camera]], samples=scene.samples, seeds=[seed])
+        (picture,) = studio.render(pose, [cameras[view.camera]], samples=scene.samples, seeds=[seed])
         _write_view(folder, view, picture)
     return len(views)
 
 
-def render_plates(scene: Scene, folder: Path, renderer: Renderer) -> None:
+def render_backgrounds(scene: Scene, folder: Path, renderer: Renderer) -> None:
     """Write the empty studio as every camera sees it."""
     cameras = list(read_cameras(folder / "cameras.json").values())
     if all(background_path(folder, camera.name).is_file() for camera in cameras):
         return
-    for camera, plate in zip(cameras, shoot_plates(renderer, cameras, seed=stream(scene, "plates")), strict=True):
-        write_image(background_path(folder, camera.name), plate)
+    for camera, image in zip(cameras, empty_studio(renderer, cameras, seed=stream(scene, "plates")), strict=True):
+        write_image(background_path(folder, camera.name), image)
 
 
 def _scan(scene: Scene, folder: Path, studio: Studio, cameras: dict[str, Camera], pose: np.ndarray, frame: int) -> None:
