@@ -246,9 +246,9 @@ def held_out(rig: Rig) -> list[int]:
 def rotation(rig: Rig, frames: int) -> list[list[int]]:
     """Indices of the training cameras that see each frame: `cameras_per_frame`, one out of each sector around the rig.
 
-    In every round of (training cameras / cameras per frame) frames each camera is used once; where that is no whole number, sectors
-    of one camera less begin anew a frame earlier. From round to round the sectors are shifted against each other, so
-    that cameras meet in other parts. An axis through the middle of the rig is up.
+    In every round of (training cameras / cameras per frame) frames each camera is used once; where that is no whole
+    number, sectors of one camera less begin anew a frame earlier. From round to round the sectors are shifted against
+    each other, so that cameras meet in other parts. An axis through the middle of the rig is up.
     """
     around = place(rig) if rig.kind != "given" else np.stack([camera.position for camera in _parse(rig.given)])
     training = [k for k in range(rig.cameras) if k not in held_out(rig)]
