@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 
 import pandas as pd
 
-from benchmarks.analysis.results import RANKED_SPLITS, Quantity, RunTables, foreground
-from benchmarks.analysis.statistics import kendall
+from benchmarks.analysis.results import Quantity, RunTables
 
 SEEN = {  # by the paper's rows that were trained on a part of its views, under our names
     "cams_12": "12 of 120 cameras",
@@ -100,21 +99,14 @@ PAPER_TABLES = (
 )
 
 
-def tables_beside(tables: RunTables) -> tuple[tuple[PaperTable, dict[str, float]], ...]:
-    """The paper's tables of which at least two methods were run, and by split Kendall's tau of the orders by PSNR."""
+def tables_beside(tables: RunTables) -> tuple[PaperTable, ...]:
+    """The paper's tables of which at least two methods were run."""
     beside = []
     for table in PAPER_TABLES:
         run = tables.methods(table.scene)
-        table = replace(table, rows=tuple(_as_run(row, run) for row in table.rows))
-        ours = [row for row in table.rows if row.method in run]
-        if len(ours) > 1:
-            taus = {}
-            for split in RANKED_SPLITS:
-                means = tables.values(table.scene, foreground(split), [str(row.method) for row in ours])
-                if len(means) == len(ours):
-                    theirs = [row.view[0] if split == "novel_view" else row.pose[0] for row in ours]
-                    taus[split] = kendall(theirs, list(means.values()))
-            beside.append((table, taus))
+        rows = tuple(_as_run(row, run) for row in table.rows)
+        if sum(row.method in run for row in rows) > 1:
+            beside.append(replace(table, rows=rows))
     return tuple(beside)
 
 
@@ -134,14 +126,12 @@ CONVENTIONS = {  # region, and who scores so
 }
 
 
-def conventions(tables: RunTables, scene: str, split: str, metric: str) -> tuple[pd.DataFrame, list[float]] | None:
-    """The same renders scored by the conventions of others: methods by `CONVENTIONS`, and Kendall's tau with ours.
+def conventions(tables: RunTables, scene: str, split: str, metric: str) -> pd.DataFrame | None:
+    """The same renders scored by the conventions of others: methods by `CONVENTIONS`.
 
     Oracles are left out; None where fewer than two methods were scored so.
     """
     names = tables.methods(scene, oracles=False)
     by_region = {region: tables.values(scene, Quantity(split, region, metric), names) for region in CONVENTIONS}
     values = pd.DataFrame(by_region, index=list(names))
-    if len(names) < 2 or values.isna().any(axis=None):
-        return None
-    return values, [kendall(list(values["foreground"]), list(values[region])) for region in values]
+    return None if len(names) < 2 or values.isna().any(axis=None) else values

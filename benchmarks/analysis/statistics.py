@@ -187,12 +187,6 @@ def wilson(failures: int, trials: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def kendall(a: Sequence[float], b: Sequence[float]) -> float:
-    """Kendall's tau-a: the share of pairs in the same order minus that in the opposite one; ties count as neither."""
-    signs = [np.sign(np.subtract.outer(values, values)) for values in (a, b)]
-    return float((signs[0] * signs[1]).sum() / (len(a) * (len(a) - 1)))
-
-
 def _noncentrality(freedom: float, quantile: float) -> float:
     """The true difference, in standard errors, at which a t test has the power wanted."""
     return float(nctdtrinc(freedom, 1 - POWER, quantile))

@@ -227,23 +227,21 @@ def _other_numbers(run_tables: RunTables, scene: str, shown: Sequence[Quantity])
 def _conventions(run_tables: RunTables, scene: str) -> tuple[Block, ...]:
     blocks: list[Block] = []
     for split, metric in [(split, metric) for split in RANKED_SPLITS for metric in ("psnr", "ssim")]:
-        if (scored := paper.conventions(run_tables, scene, split, metric)) is not None:
-            values, taus = scored
+        if (values := paper.conventions(run_tables, scene, split, metric)) is not None:
             ranks, measure = values.rank(ascending=False, method="min").astype(int), METRICS[metric]
             texts = {
                 paper.CONVENTIONS[region]: [
-                    *(f"{v:.{measure.decimals}f} #{r}" for v, r in zip(values[region], ranks[region], strict=True)),
-                    f"{tau:.2f}",
+                    f"{v:.{measure.decimals}f} #{r}" for v, r in zip(values[region], ranks[region], strict=True)
                 ]
-                for region, tau in zip(values, taus, strict=True)
+                for region in values
             }
             moved = ranks.ne(ranks["foreground"], axis=0).to_numpy()
-            index = [*(style_of(method).title for method in values.index), "agreement with ours (Kendall's tau)"]
+            index = [style_of(method).title for method in values.index]
             title = f"{SPLIT_NAMES[split].title}, {measure.title}"
             marks: dict[tuple[int, int], Mark] = {
                 (int(i), int(k)): "strong" for i, k in zip(*moved.nonzero(), strict=True)
             }
-            blocks.append(Table(title=title, frame=pd.DataFrame(texts, index=index), marks=marks, below=1))
+            blocks.append(Table(title=title, frame=pd.DataFrame(texts, index=index), marks=marks))
     return (*blocks, Text(text=CONVENTIONS_NOTE, note=True)) if blocks else ()
 
 

@@ -11,7 +11,6 @@ from benchmarks.analysis.statistics import (
     holm,
     independent,
     intervals,
-    kendall,
     mean_interval,
     spreads,
     wilson,
@@ -155,12 +154,6 @@ def test_mean_interval_and_wilson_agree_with_scipy() -> None:
         assert wilson(failures, trials) == pytest.approx((expected.low, expected.high), abs=1e-6)
     with pytest.raises(ValueError, match="expected"):
         wilson(3, 2)
-
-
-def test_kendall_is_scipys_without_ties_and_counts_ties_as_neither() -> None:
-    a, b = [1.0, 4.0, 2.0, 3.0], [2.0, 3.0, 1.0, 4.0]
-    assert kendall(a, b) == pytest.approx(stats.kendalltau(a, b).statistic)
-    assert kendall([1.0, 1.0, 2.0], [1.0, 2.0, 3.0]) == pytest.approx(2 / 3)
 
 
 def test_spreads_between_captures_and_between_seeds() -> None:
