@@ -56,11 +56,15 @@ class AshModel(MovingModule):
                 bound=config.bound,
                 novelty_scale=config.novelty_scale,
             )
-        self.base_texels = nn.Parameter(initial.clone(), requires_grad=decoders is None)
         self.decoders = decoders
+        self._add_texels(initial)
         self.refinement: MotionRefinement | None = None
         if isinstance(template.deformation, RefinedDeformation):
             self.refinement = template.deformation.refinement
+
+    def _add_texels(self, initial: Float[Tensor, "n o"]) -> None:
+        """Make the parameters that no network has."""
+        self.base_texels = nn.Parameter(initial.clone(), requires_grad=self.decoders is None)
 
     def frame_inputs(self, pose: Pose, clock: StageClock | None = None, threads: int = 1) -> FrameInputs:
         """Stg. 1 and 2: pose the template, and draw what the decoders take."""

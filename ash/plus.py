@@ -4,12 +4,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ash.config import ModelConfig
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.texels import LIGHT_COEFFICIENTS, pose
 from ash.model import AshModel
-from ash.template.template import Template
-from ash.textures import FrameInputs, TexelLattice
+from ash.textures import FrameInputs
 
 
 class AshPlusModel(AshModel):
@@ -19,20 +17,12 @@ class AshPlusModel(AshModel):
     `novelty_scale`: far from the training poses the render is blended with that of `fallback_texels`, a static avatar.
     """
 
-    def __init__(
-        self,
-        config: ModelConfig,
-        template: Template,
-        lattice: TexelLattice,
-        initial: Float[Tensor, "n o"],
-        decoders: nn.Module | None,
-    ) -> None:
-        """See `AshModel`."""
-        super().__init__(config, template, lattice, initial, decoders)
-        self.base_texels.requires_grad_(config.base)
-        blends = config.novelty_scale > 0 and decoders is not None
+    def _add_texels(self, initial: Float[Tensor, "n o"]) -> None:
+        super()._add_texels(initial)
+        self.base_texels.requires_grad_(self.config.base)
+        blends = self.config.novelty_scale > 0 and self.decoders is not None
         self.fallback_texels = nn.Parameter(initial.clone()) if blends else None
-        self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if config.light else None
+        self.light = nn.Parameter(torch.zeros(LIGHT_COEFFICIENTS, 3)) if self.config.light else None
 
     def gaussians(self, raw: Float[Tensor, "n o"], inputs: FrameInputs, threads: int = 1) -> Gaussians:
         """Eq. 5, lit."""

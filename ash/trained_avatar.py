@@ -26,7 +26,7 @@ from ash.training.loop import Trainer
 from ash.training.losses import view_loss
 
 FALLBACK_EVERY = 2  # Steps, of which one also trains what is blended in far from the training motion.
-COMPARED_FRAMES = 40  # Training frames, evenly taken, over which the decoders' output is averaged and compared.
+SPREAD_FRAMES = 40  # Training frames, evenly taken, over which the decoders' output is averaged and compared.
 
 Own = TypeVar("Own", bound="TrainedAvatar")
 
@@ -125,6 +125,7 @@ class TrainedAvatar(ABC):
         ]
         losses = [view_loss(drawn, batches, training)]
         if fallback is not None and step >= training.static_steps and step % FALLBACK_EVERY == 0:
+            # Inputs anew: each loss is differentiated by itself, and frees its graph.
             static = [self._draw_fallback(self._inputs_of(b.frame), b.cameras, b.background) for b in batches]
             losses.append(view_loss(static, batches, training))
         return losses
@@ -159,7 +160,7 @@ class TrainedAvatar(ABC):
     @torch.no_grad()
     def _residual_spread(self, frames: Sequence[int]) -> float:
         """How far what the decoders add differs between training frames, rms."""
-        some = frames[:: -(-len(frames) // COMPARED_FRAMES)]
+        some = frames[:: -(-len(frames) // SPREAD_FRAMES)]
         added = [self.module.residual([self._inputs_of(frame)])[0] for frame in some]
         mean = torch.stack(added).mean(0)
         return float(torch.stack([(one - mean).square().mean() for one in added]).mean().sqrt())

@@ -330,6 +330,5 @@ def _on_exact(preset: str) -> DdcConfig:
 
 
 ddc = MethodFactory(config=_of_preset, build=DdcAvatar.from_capture)  # On the template that ASH gets.
-ddc_truth = MethodFactory(
-    config=_on_exact, build=DdcAvatar.from_capture
-)  # An oracle on the exact surface, to see when a mesh wins.
+# An oracle on the exact surface, to see when a mesh wins.
+ddc_truth = MethodFactory(config=_on_exact, build=DdcAvatar.from_capture)

@@ -60,8 +60,7 @@ class MlpAvatar(AshAvatar):
         return MlpDecoder(self.config.model, dofs=self._motion.dofs.shape[1])
 
 
-mlp_base = MethodFactory(
-    config=named, build=MlpAvatar.from_capture
-)  # In place of the 2D decoders, on ASH's learned texels.
+# In place of the 2D decoders, on ASH's learned texels.
+mlp_base = MethodFactory(config=named, build=MlpAvatar.from_capture)
 # The paper's row: Gaussians straight from 3D, so no learned texels beneath; its limits of training as the preset says.
 mlp = mlp_base.with_overrides({"model.base": False, "model.novelty_scale": 0.0, "training.warmup": "fitted"})

@@ -53,6 +53,5 @@ def _on_exact(preset: str) -> DdcConfig:
     return replace(mesh, texture=TEXTURE_FACTOR * config.model.texels, model=model)
 
 
-oracle_texture = MethodFactory(
-    config=_on_exact, build=OracleTexture.from_capture
-)  # One texture, at the preset's budget.
+# One texture, at the preset's budget.
+oracle_texture = MethodFactory(config=_on_exact, build=OracleTexture.from_capture)

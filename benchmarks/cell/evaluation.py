@@ -116,9 +116,7 @@ def score_outputs(
     scored = scored_views(cell, capture, drawn.views)
     curve = read_curve(cell.folder / "log.jsonl")
     summary = (
-        _image_summary(scored)
-        + _gap_summary(scored)
-        + _flicker_summary(cell, capture, scored)
+        quality_summary(cell, capture, scored)
         + _geometry_summary(capture, drawn.geometry, drawn.views)
         + _cost_summary(drawn, spent, before_s=max((point.seconds for point in curve), default=0.0))
         + _training_summary(training, curve)
@@ -242,6 +240,12 @@ def _perceptual(device: str) -> Callable[[np.ndarray, np.ndarray], float | None]
     return Lpips(path, device)
 
 
+def quality_summary(cell: Cell, capture: Capture, scored: list[ViewScore]) -> tuple[Summary, ...]:
+    """What follows from the stored pictures: means over images, the gap to training views, flicker."""
+    means = _image_summary(scored)
+    return means + _gap_summary(means) + _flicker_summary(cell, capture, scored)
+
+
 def _image_summary(scored: list[ViewScore]) -> tuple[Summary, ...]:
     """Means over the images of each split."""
     rows = []
@@ -254,11 +258,9 @@ def _image_summary(scored: list[ViewScore]) -> tuple[Summary, ...]:
     return tuple(rows)
 
 
-def _gap_summary(scored: list[ViewScore]) -> tuple[Summary, ...]:
-    """By how much training views are better than the views of each other split: what was learned by heart."""
-    means = {
-        row.split: row.value for row in _image_summary(scored) if (row.region, row.metric) == ("foreground", "psnr")
-    }
+def _gap_summary(rows: tuple[Summary, ...]) -> tuple[Summary, ...]:
+    """By how much training views are better than the views of each other split: the generalisation gap."""
+    means = {row.split: row.value for row in rows if (row.region, row.metric) == ("foreground", "psnr")}
     return tuple(
         Summary(split=split, region="foreground", metric="gap", value=means["train_view"] - value)
         for split, value in means.items()

@@ -11,6 +11,9 @@ Regions, ours first, then those of others' conventions:
   is scikit-image's default, a 7x7 box. In protocol "1" the window had the true mask's place and never cut.
 - `white_frame`: as AnimatableGaussians scores: the whole frame on white, the truth cut out by its mask, the prediction
   composited by its own alpha; SSIM with the 7x7 box.
+
+SciPy, scikit-image and FLIP are imported where they compute: a method's process imports this module too, and the memory
+of that process is measured.
 """
 
 import os
@@ -21,8 +24,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from scipy import ndimage
-from skimage.metrics import structural_similarity
 
 from ash.files import InputError
 
@@ -159,6 +160,8 @@ def ssim_map(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def _similarity(predicted: np.ndarray, truth: np.ndarray, *, blank: int, **options: Any) -> np.ndarray:
     """scikit-image's SSIM per pixel `[h, w]`. Where both images are `blank` far and wide it is 1 and not computed."""
+    from skimage.metrics import structural_similarity
+
     similarity = np.ones(truth.shape[:2])
     window = occupied((predicted != blank).any(-1) | (truth != blank).any(-1), SSIM_MARGIN)
     if window is not None:
@@ -201,6 +204,8 @@ def silhouette_iou(predicted: np.ndarray, truth: np.ndarray) -> float:
 
 def release_crop(predicted: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """The pair of images that the released ASH code would compare, or None where the eroded mask is empty."""
+    from scipy import ndimage
+
     mask = ndimage.binary_erosion(mask, np.ones((3, 3)))
     if not mask.any():
         return None

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
+from ash.capture.dataset import Capture
 from ash.fields import Changes, apply_overrides, flat, suggest
 from ash.files import InputError, hash_sources
 from ash.protocol import Configurable
@@ -135,6 +136,19 @@ def configured(name: str, preset: str, changes: Mapping[str, Any] | Changes) -> 
         return apply_overrides(config, current_fields(config, changes), of=name)
     except ValueError as error:  # A dataclass of someone else's may not know our kind of it.
         raise InputError(str(error)) from error
+
+
+def make_avatar(
+    factory: Callable[..., Any], capture: Capture, *, of: str, seed: int, preset: str, changes: Mapping[str, Any]
+) -> Any:
+    """Call a factory; `changes` in the configuration that `preset` means to the method `of`.
+
+    Raises:
+        InputError: as `configured`.
+    """
+    if not changes:
+        return factory(capture, seed=seed, preset=preset)
+    return factory(capture, seed=seed, preset=preset, config=configured(of, preset, changes))
 
 
 def current_fields(config: Any, changes: Mapping[str, Any] | Changes) -> dict[str, Any]:

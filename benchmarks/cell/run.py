@@ -13,7 +13,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -25,16 +25,8 @@ from ash.capture.manifest import verify_capture
 from ash.files import InputError, disk_problem
 from ash.protocol import Avatar
 from benchmarks import provenance
-from benchmarks.cell.evaluation import (
-    MethodOutputs,
-    _flicker_summary,
-    _gap_summary,
-    _image_summary,
-    draw_all,
-    score_outputs,
-    scored_views,
-)
-from benchmarks.cell.registry import ORACLES, code_version, configured, find_method, offered
+from benchmarks.cell.evaluation import MethodOutputs, draw_all, quality_summary, score_outputs, scored_views
+from benchmarks.cell.registry import ORACLES, code_version, find_method, make_avatar, offered
 from benchmarks.cell.sandbox import WORK, add_method_paths, adopt_orphans, seen_by_method, watched
 from benchmarks.cell.schema import (
     CHECKPOINT,
@@ -112,9 +104,8 @@ def run_cell(cell: Cell) -> CellResult:
     try:
         result = _train_and_evaluate(cell, capture)
     except MethodFailed as error:
-        if resumed and not isinstance(
-            error, CaptureModifiedError
-        ):  # What an earlier attempt left may be damaged, and a whole training ends the same.
+        # What an earlier attempt left may be damaged, and a whole training ends the same.
+        if resumed and not isinstance(error, CaptureModifiedError):
             print(f"{cell.config.title}: {error.status}: {error}; once more, from nothing", file=sys.stderr)
             shutil.rmtree(cell.folder / WORK)
             return run_cell(cell)
@@ -178,7 +169,10 @@ def load_avatar(
     factory = method.load()
     with _seen(cell, capture) as seen:
         with watched(capture, seen):
-            avatar = _make(placed_on(cell.config, device), seen, factory)
+            config = placed_on(cell.config, device)
+            avatar = make_avatar(
+                factory, seen, of=config.source, seed=config.seed, preset=config.preset, changes=config.changes
+            )
             avatar.load(cell.folder / CHECKPOINT)
         yield avatar, seen
 
@@ -193,7 +187,7 @@ def rescore_cell(cell: Cell) -> CellResult:
         if old.prediction != new.prediction:
             name = prediction_path(cell.folder, View(split=new.split, camera=new.camera, frame=new.frame))
             raise InputError(f"{name}: altered since it was scored (SHA-256 differs from result.json)")
-    recomputed = _image_summary(scored) + _gap_summary(scored) + _flicker_summary(cell, capture, scored)
+    recomputed = quality_summary(cell, capture, scored)
     names = {(row.split, row.region, row.metric) for row in recomputed}
     others = tuple(row for row in before.summary if (row.split, row.region, row.metric) not in names)
     result = replace(before, views=tuple(scored), summary=recomputed + others)
@@ -305,13 +299,6 @@ def placed_on(config: CellConfig, device: str) -> CellConfig:
         return config
     elsewhere = {} if device == "cpu" else {"device": device}
     return replace(config, changes={k: v for k, v in config.changes.items() if k != "device"} | elsewhere)
-
-
-def _make(config: CellConfig, capture: Capture, factory: Callable[..., Avatar]) -> Avatar:
-    if not config.changes:
-        return factory(capture, seed=config.seed, preset=config.preset)
-    wanted = configured(config.source, config.preset, config.changes)
-    return factory(capture, seed=config.seed, preset=config.preset, config=wanted)
 
 
 def _seen(cell: Cell, capture: Capture) -> AbstractContextManager[Capture]:

@@ -31,7 +31,7 @@ from ash.capture.formats import load_capture, read_cameras, read_motion, write_c
 from ash.capture.typed import from_json
 from ash.files import InputError, require_plain
 from ash.protocol import Displayed, LearnsTemplate, PosedGeometry, StageClock, TellsOutcome, TrainingOutcome
-from benchmarks.cell.registry import OUR_PACKAGES, Method, configured, located
+from benchmarks.cell.registry import OUR_PACKAGES, Method, located, make_avatar
 from benchmarks.cell.sandbox import (
     BASE,
     ISOLATION,
@@ -66,6 +66,7 @@ MOST_POINTS, MOST_COUNT = 10_000_000, 10**13
 LOWEST, HIGHEST = -0.5, 2.0  # of a picture; rounding and overbright colours leave 0..1 a little, other units far
 CLOCK_SLACK_MS, CLOCK_SLACK = 2.0, 0.1
 CLOCK_LIE_MS, TRAINING_SLACK_S = 20.0, 5.0  # what a busy machine's scheduler may add
+LARGEST_HEADER = 1 << 16  # bytes of a reply, besides its array
 KERNELS = "kernels"  # In a cell's folder, while its method runs.
 
 
@@ -259,9 +260,8 @@ class MethodClient:
         if code == -signal.SIGKILL:
             return Killed()
         name = signal.Signals(-code).name if code < 0 and -code in list(signal.Signals) else f"exit code {code}"
-        if (
-            self.isolated and name == "SIGSEGV"
-        ):  # Abort's signal spares the first process of a namespace; a trap follows.
+        # SIGABRT does not end the first process of a namespace; the trap after it does, as SIGSEGV.
+        if self.isolated and name == "SIGSEGV":
             name = "SIGSEGV or SIGABRT"
         return MethodFailed("crashed", f"the method's process ended with {name}")
 
@@ -341,19 +341,19 @@ def stage_in(cell: Cell) -> None:
 
 
 def frame_times_ms(frames: list[Timed]) -> tuple[float, ...]:
-    """Milliseconds of each frame: by the method's clock where ours bears it out, but for the way between processes.
+    """Milliseconds of each frame: the method's, or the host's if the exchange between the processes takes long.
 
-    On a busy machine that way takes longer, and then ours count: nobody gains by a clock that runs slow.
+    If it does, host time is used, so that a method cannot under-report.
 
     Raises:
-        MethodFailed: the clocks contradict each other by more than any machine's mood.
+        MethodFailed: the two clocks differ by more than the exchange between processes can take.
     """
-    way = min(frame.outside_ms - frame.inside_ms for frame in frames)
+    exchange = min(frame.outside_ms - frame.inside_ms for frame in frames)
     shortest = min(frames, key=lambda frame: frame.outside_ms)
     inside, outside = shortest.inside_ms, shortest.outside_ms
-    if way < -0.5 or way > CLOCK_LIE_MS + CLOCK_SLACK * outside:
+    if exchange < -0.5 or exchange > CLOCK_LIE_MS + CLOCK_SLACK * outside:
         raise MethodFailed("crashed", f"its clock says {inside:.1f} ms for a frame, ours {outside:.1f} ms")
-    if way > CLOCK_SLACK_MS + CLOCK_SLACK * outside:
+    if exchange > CLOCK_SLACK_MS + CLOCK_SLACK * outside:
         print(f"frames are timed from outside: {outside:.1f} ms, by the method {inside:.1f} ms", file=sys.stderr)
         return tuple(frame.outside_ms for frame in frames)
     return tuple(frame.inside_ms for frame in frames)
@@ -369,7 +369,7 @@ def _start(order: dict[str, Any], kernels: Path, spec: SandboxSpec | None) -> tu
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         pass_fds=(theirs, answers),
-        env=kernel_env(kernels),
+        env=clean_environment() | {"WARP_CACHE_PATH": str(kernels)},
     )
     os.close(theirs)
     os.close(answers)
@@ -420,14 +420,6 @@ def copy_kernel_cache(device: str, place: Path) -> Path:
             check=False,
         )
     return folder
-
-
-def kernel_env(folder: Path) -> dict[str, str]:
-    """The environment of a process whose Warp has its cache there."""
-    return clean_environment() | {"WARP_CACHE_PATH": str(folder)}
-
-
-LARGEST_HEADER = 1 << 16
 
 
 def main(argv: list[str]) -> int:
@@ -492,10 +484,14 @@ class Handlers:
         self.capture = replace(load_capture(Path(self.order["input"])), store=store)
         self.begun = True
         factory = Method(name="", target=self.order["target"], distribution="").load()
-        wanted = {"seed": self.order["seed"], "preset": self.order["preset"]}
-        if self.order["changes"]:
-            wanted["config"] = configured(self.order["target"], self.order["preset"], self.order["changes"])
-        self.avatar = factory(self.capture, **wanted)
+        self.avatar = make_avatar(
+            factory,
+            self.capture,
+            of=self.order["target"],
+            seed=self.order["seed"],
+            preset=self.order["preset"],
+            changes=self.order["changes"],
+        )
         return {}, b""
 
     def do_fit(self) -> tuple[dict[str, Any], bytes]:

@@ -65,9 +65,8 @@ class RunCommand:
     workers: CountIfAny = None  # cells side by side; default: all cores, on CUDA all GPUs
     executor: str = LOCAL  # or dask://HOST:PORT, for a cluster
     shard: Annotated[str | None, Argument(metavar="i/n")] = None  # every n-th cell only, from the i-th; for job arrays
-    lpips_weights: LpipsWeights = (
-        None  # AlexNet's, of torchvision; default: torch's cache, or those that set-up installed
-    )
+    # AlexNet's, of torchvision; default: torch's cache, or those that set-up installed
+    lpips_weights: LpipsWeights = None
     retry_failed: bool = False  # run cells again that failed before
     dry_run: bool = False  # print cells, hours and gigabytes, and do nothing
     list: bool = False  # print the suites as TOML, or only SUITE: a copy is a start for your own
@@ -298,9 +297,8 @@ class EvalCommand:
     frames: Count = 12  # of that motion
     out: Folder | None = None  # of the results on that motion; default: RUN/motion-FILE
     workers: CountIfAny = None  # processes that render that motion; default: all cores
-    lpips_weights: LpipsWeights = (
-        None  # AlexNet's, of torchvision; default: torch's cache, or those that set-up installed
-    )
+    # AlexNet's, of torchvision; default: torch's cache, or those that set-up installed
+    lpips_weights: LpipsWeights = None
 
     def __call__(self) -> int:
         """Render where that is asked for, and score."""

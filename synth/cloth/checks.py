@@ -52,8 +52,8 @@ def self_intersections(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     ends = vertices[edges]
     half = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max() / 2
     near = cKDTree(ends.mean(axis=1)).query_ball_point(middles, size + half)
-    face = np.repeat(np.arange(len(faces)), [len(edges) for edges in near])
-    edge = np.concatenate([np.array(edges, dtype=np.int64) for edges in near])
+    face = np.repeat(np.arange(len(faces)), [len(close) for close in near])
+    edge = np.concatenate([np.array(close, dtype=np.int64) for close in near])
     strange = (faces[face][:, :, None] != edges[edge][:, None, :]).all(axis=(1, 2))
     face, edge = face[strange], edge[strange]
     a, b, c = (vertices[faces[face, k]] for k in range(3))

@@ -12,6 +12,7 @@ from ash.capture.dataset import Camera, Capture, image_path, pixels_path
 from ash.capture.formats import load_capture, read_surface_truth, write_cameras
 from ash.files import InputError, link_or_copy, read_arrays, sha256_of, write_arrays, write_image
 from synth.camera.render import Studio, probe
+from synth.camera.resampling import resample, resample_rgba
 from synth.person.body import Surface
 from synth.scene import Light
 from synth.truth.pixels import surface_truth
@@ -44,45 +45,18 @@ def undistort(source: Path, folder: Path) -> Path:
     return folder
 
 
-def resample(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """An image `[h, w, k]` of a distorting camera as its pinhole sees it, bilinearly; zero where it saw nothing.
-
-    Also returns the sum of squared weights per pixel `[h, w]`: what remains of independent noise's variance.
-    """
-    pinhole = replace(camera, distortion=np.zeros(4))
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    rays = pinhole.directions(np.stack([x, y], axis=-1))
-    place = camera.project(camera.position + rays)[0] - 0.5
-    low = np.floor(place).astype(np.int64)
-    share = place - low
-    result, squares = np.zeros(image.shape), np.zeros(image.shape[:2])
-    for dx in (0, 1):
-        for dy in (0, 1):
-            column, row = low[..., 0] + dx, low[..., 1] + dy
-            inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-            weight = np.abs(1 - dx - share[..., 0]) * np.abs(1 - dy - share[..., 1]) * inside
-            value = image[np.clip(row, 0, camera.height - 1), np.clip(column, 0, camera.width - 1)]
-            result += weight[..., None] * value
-            squares += weight**2
-    return result, squares
-
-
 def _write_view(capture: Capture, pinhole: Camera, frame: int, studio: Studio, folder: Path) -> set[str]:
     camera = capture.cameras[pinhole.name]
-    rgba = capture.image(camera.name, frame) / 255.0
     noise = read_arrays(pixels_path(capture.folder, camera.name, frame), expected=("noise",))["noise"]
-    premultiplied = np.concatenate([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:], noise[..., None]], axis=-1)
-    straight, squares = resample(premultiplied, camera)
-    alpha = straight[..., 3:4]
-    colour = np.where(alpha > 0.5 / 255, straight[..., :3] / np.maximum(alpha, 1e-6), 0)
-    image = np.round(255 * np.clip(np.concatenate([colour, alpha], axis=-1), 0, 1)).astype(np.uint8)
+    variance, squares = resample(noise[..., None], camera, pinhole)
     triangle, barycentric = studio.look(pinhole)
     write_arrays(
         pixels_path(folder, camera.name, frame),
         triangle=triangle,
         barycentric=barycentric.astype(np.float16),
-        noise=(straight[..., 4] * squares).astype(np.float16),
+        noise=(variance[..., 0] * squares).astype(np.float16),
     )
+    image = resample_rgba(capture.image(camera.name, frame), camera, pinhole)
     write_image(image_path(folder, camera.name, frame), image)
     return {str(place(Path(), camera.name, frame)) for place in (image_path, pixels_path)}
 

@@ -9,12 +9,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter1d, map_coordinates
+from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter1d
 
 from ash.capture.dataset import Camera, Capture, Motion, background_path, image_path, pixels_path, spread_cameras
 from ash.capture.formats import load_capture, write_cameras, write_motion
-from ash.capture.lens import undistort
 from ash.files import InputError, hash_of, link_or_copy, read_arrays, read_image, sha256_of, write_image
+from synth.camera.resampling import resample_rgba
 from synth.posing import rotvec_to_rotmat
 
 
@@ -167,19 +167,10 @@ def through_lens(image: np.ndarray, camera: Camera, pixels: float) -> np.ndarray
     """
     if not camera.is_pinhole:
         raise InputError(f"perturbation: lens_px needs pinhole cameras, and {camera.name} has a distortion")
-    focal, centre = np.diag(camera.K)[:2], camera.K[:2, 2]
+    focal = np.diag(camera.K)[:2]
     border = float(min((camera.width, camera.height) / focal)) / 2
-    places = np.stack(np.meshgrid(*(np.arange(side) + 0.5 for side in (camera.width, camera.height))), axis=-1)
-    ideal = undistort((places - centre) / focal, np.array([pixels / (focal.mean() * border**3), 0, 0, 0]))
-    columns, rows = np.moveaxis(ideal * focal + centre - 0.5, -1, 0)
-    alpha = image[..., 3:] / 255.0
-    premultiplied = np.concatenate([image[..., :3] * alpha, 255 * alpha], axis=-1)
-    moved = np.stack(
-        [map_coordinates(channel, [rows, columns], order=1) for channel in np.moveaxis(premultiplied, -1, 0)], -1
-    )
-    straight = moved[..., :3] / np.maximum(moved[..., 3:] / 255, 1e-6)
-    shown = np.concatenate([np.where(moved[..., 3:] >= 0.5, straight, 0), moved[..., 3:]], axis=-1)
-    return np.round(np.clip(shown, 0, 255)).astype(np.uint8)
+    lens = np.array([pixels / (focal.mean() * border**3), 0, 0, 0])
+    return resample_rgba(image, camera, replace(camera, distortion=lens))
 
 
 def _plate(capture: Capture, name: str) -> np.ndarray:

@@ -29,6 +29,12 @@ def test_help_lists_every_command_and_how_to_go_on(capsys) -> None:
     assert f"{arguments.own_name()} run my.toml" in told
 
 
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_help_says_what_every_argument_is(command: str) -> None:
+    flags = list(arguments._flags_of(cli._command(command)))
+    assert [flag.name for flag in flags if not flag.about] == []
+
+
 def test_a_commands_help_needs_nothing_heavy() -> None:
     code = """
 import sys
