@@ -119,7 +119,7 @@ def _dress(person: Subject, *, skirt: bool) -> dict[str, np.ndarray]:
     used = np.unique(fine.faces)
     number = np.full(len(fine.vertices), -1)
     number[used] = np.arange(len(used))
-    used, template = np.unique(template_faces, return_inverse=True)
+    template_vertices, template = np.unique(template_faces, return_inverse=True)
     cage, cage_faces = np.unique(body.faces[body.part == PARTS.index("skirt")], return_inverse=True)
     return {
         "vertices": fine.vertices[used],
@@ -128,7 +128,7 @@ def _dress(person: Subject, *, skirt: bool) -> dict[str, np.ndarray]:
         "uvs": fine.uvs,
         "uv_faces": fine.uv_faces,
         "part": fine.part,
-        "kept": number[used],
+        "kept": number[template_vertices],
         "template_faces": template.reshape(-1, 3),
         "template_uv_faces": template_uv_faces,
         "heads": baked["heads"],
@@ -279,7 +279,7 @@ def _shoe(skeleton: Skeleton, side: str, scale: float) -> Tube:
     return Tube(
         part="shoes", knots=knots, radii=rings[:, 2:], front=(0.0, 1.0, 0.0),
         chain=(f"toe_{side}", f"foot_{side}"), borders=(0.36,), rings=20, segments=20,
-        chart=(0, 0, 0.3, 0.33), blend=0.1,
+        chart=(0.0, 0.0, 0.3, 0.33), blend=0.1,
     )  # fmt: skip
 
 
