@@ -27,13 +27,12 @@ class AtlasConfig:
 
     texels: int  # resolution of the texel lattice, per side
     window: int  # frames in the motion-aware textures (k)
-    yaw_normalise: bool  # turn the textures into the root's heading; the release does not
+    yaw_normalise: bool = False  # turn what networks see into the root's heading; not in the paper
     width: int = 64  # channels of the U-Nets' first level
     levels: int = 4  # halvings of the U-Nets
     norm: str = "none"  # of the U-Nets: "batch-as-released" (always on the statistics of its batch of 1), or "instance"
     shuffle: int = 1  # decode at 1/shuffle of the lattice's resolution and shuffle pixels up; not in the paper
     standardise: bool = False  # decoders see deviations from the mean training texture, in its units; not in the paper
-    bound: float = 3.0  # spreads at which those are cut off: what lies farther out was hardly ever learned from
     # novelty of a pose, in spreads, at which half of its picture is a static avatar's; 0: never; not in the paper
     novelty_scale: float = 0.0
     light: bool = False  # colour times exp(SH2 of the posed normal), 27 numbers; not in the paper
@@ -55,8 +54,6 @@ class AtlasConfig:
             raise InputError(f"texels: expected a multiple of {unit}, got {self.texels}")
         if min(self.window, self.width) < 1:
             raise InputError(f"window and width: expected at least 1, got {self.window} and {self.width}")
-        if not self.bound > 0:
-            raise InputError(f"bound: expected more than 0 spreads (inf: none), got {self.bound}")
         if not 0 <= self.novelty_scale < math.inf:
             raise InputError(f"novelty_scale: expected a finite novelty of at least 0, got {self.novelty_scale}")
         if self.novelty_scale and not (self.standardise and self.decoded_texels % 4 == 0):
@@ -70,8 +67,7 @@ class ModelConfig(AtlasConfig):
     """The avatar. Fields that the paper does not have say so."""
 
     motion: bool = True  # False: one static set of Gaussians, skinned only (w/o mot.)
-    offset: bool = True  # False: no learned canonical offset d at all
-    motion_offset: bool = True  # False: d is the same in all frames, that of the static texels (w/o disp.)
+    offset: bool = True  # False: no learned canonical offset d (w/o disp.)
     shared_trunk: bool = False  # one U-Net for E_geo and E_app together; not in the paper
     sh_degree: int = 3
     offset_unit_m: float = 0.01  # metres per unit of a decoded offset; the release decodes metres
@@ -100,7 +96,7 @@ class TrainingConfig:
     steps: int  # at most: training ends where it has nothing more to gain, see `ash.training.stopping`
     views_per_step: int  # images of one frame that share one decoding
     warmup: str  # "static": the base alone first; "analytic": as released; "fitted": the paper's per-frame fits; "none"
-    warmup_steps: int
+    warmup_steps: int  # of a static warm-up, which are among `steps`; else of the regression before them
     l1_weight: float  # lambda_pix
     ssim_weight: float  # lambda_str
     learning_rate: float  # of the networks
@@ -116,7 +112,7 @@ class TrainingConfig:
     ema: float = 0.0  # decay of an average of the weights, which is then the result; 0: none
     texture_noise: float = 0.0  # in the standardised motion-aware textures while decoders learn; not in the paper
     camera_share: float = 1.0  # of the training cameras, evenly spread
-    frame_share: float = 1.0  # of the training frames, from the first on
+    footage_s: float = math.inf  # seconds of training motion that are learned from, from its start
     fitted_steps: int = 2000  # at most, in which the paper's warm-up fits a frame alone: less where no more is gained
     seconds: float = math.inf  # of CPU time, at most
     snapshots: bool = False  # keep the weights of half a minute, of 42 s, of a minute, ... of half an hour
@@ -138,13 +134,16 @@ class TrainingConfig:
             raise InputError(f"seconds: expected more than 0, got {self.seconds}")
         if not 0 <= self.texture_noise < math.inf:
             raise InputError(f"texture_noise: expected a finite standard deviation, got {self.texture_noise}")
-        for name in ("camera_share", "frame_share"):
-            if not 0 < getattr(self, name) <= 1:
-                raise InputError(f"{name}: expected more than 0 and at most 1, got {getattr(self, name)}")
+        if not 0 < self.camera_share <= 1:
+            raise InputError(f"camera_share: expected more than 0 and at most 1, got {self.camera_share}")
+        if not self.footage_s > 0:
+            raise InputError(f"footage_s: expected more than 0 seconds, got {self.footage_s}")
         if self.fitted_steps < 1:
             raise InputError(f"fitted_steps: expected at least 1, got {self.fitted_steps}")
-        if min(self.steps, self.views_per_step) < 1 or not 0 <= self.warmup_steps <= self.steps:
-            raise InputError("expected steps >= 1, views_per_step >= 1 and 0 <= warmup_steps <= steps")
+        if min(self.steps, self.views_per_step) < 1 or self.warmup_steps < 0:
+            raise InputError("expected steps >= 1, views_per_step >= 1 and warmup_steps >= 0")
+        if self.static_steps > self.steps:
+            raise InputError(f"warmup_steps: a static warm-up is part of {self.steps} steps, got {self.warmup_steps}")
         if self.frames_per_step < 1:
             raise InputError(f"frames_per_step: expected at least 1, got {self.frames_per_step}")
 
@@ -167,6 +166,7 @@ class TemplateConfig:
     network: str = "linear"  # a map per node of the embedded graph; "graph": the paper's graph convolutions
     nodes: int = 400  # of the embedded graph
     window: int = 2  # frames of motion that are seen
+    yaw_normalise: bool = False  # in the heading of the root; not in the paper
     blocks: int = 2  # of the graph convolutions
     steps: int = 300  # of their training
     # as the release: convolutions with weights per node, a full matrix over the vertices in the displacement network,

@@ -53,7 +53,6 @@ class AshModel(MovingModule):
                 window=config.window,
                 yaw_normalise=config.yaw_normalise,
                 standardise=config.standardise,
-                bound=config.bound,
                 novelty_scale=config.novelty_scale,
             )
         self.decoders = decoders
@@ -78,12 +77,15 @@ class AshModel(MovingModule):
             return FrameInputs(
                 textures=textures,
                 decoder_weight=1.0 if self.textures is None else self.textures.decoder_weight(textures),
-                motion=normalised_motion(pose, window=self.config.window).to(device),
+                motion=self._motion_window(pose).to(device),
                 root_translation=torch.from_numpy(pose.dofs[:3]).float().to(device),
                 canonical=canonical,
                 normals=normals,
                 transforms=transforms,
             )
+
+    def _motion_window(self, pose: Pose) -> Float[Tensor, "k d"]:
+        return normalised_motion(pose, window=self.config.window, yaw_normalise=self.config.yaw_normalise)
 
     def _textures(self, pose: Pose) -> Float[Tensor, "c r r"]:
         return self.base_texels.new_zeros(0, 1, 1) if self.textures is None else self.textures(self.template, pose)
@@ -95,12 +97,10 @@ class AshModel(MovingModule):
         return self.base_texels[None] + self.residual(inputs)
 
     def residual(self, inputs: Sequence[FrameInputs]) -> Float[Tensor, "b n o"]:
-        """What the decoders add: all of their output, or all but the offsets."""
+        """What the decoders add."""
         assert self.decoders is not None
         decoded: Tensor = self.decoders(inputs)
-        if self.config.motion_offset:
-            return decoded
-        return torch.cat([torch.zeros_like(decoded[..., :3]), decoded[..., 3:]], -1)
+        return decoded
 
     def gaussians(self, raw: Float[Tensor, "n o"], inputs: FrameInputs, threads: int = 1) -> Gaussians:
         """Activate the raw parameters and carry them from canonical to posed space (Eq. 5)."""

@@ -24,6 +24,7 @@ from ash.template.template import Template
 
 NOISE_GRID = 4
 POOL = 4  # Texels per side that are one when frames are compared: poses differ over limbs, not over texels.
+BOUND = 3.0  # Spreads at which standardised textures are cut off: what lies farther out was hardly ever learned from.
 COMPARED_FRAMES = 512  # Training frames, evenly taken, that a new frame is compared with.
 
 
@@ -167,7 +168,7 @@ class TextureDrawer(MovingModule):
     """Stg.2 as a network sees it: the motion-aware textures of a frame, standardised if asked.
 
     What is standardised is a deviation from the mean training texture, in units of its channel's spread, cut
-    off at `bound` of them (not in the paper). Mean, spread and the frames that others are compared with are part of a
+    off at `BOUND` of them (not in the paper). Mean, spread and the frames that others are compared with are part of a
     checkpoint.
     """
 
@@ -178,13 +179,12 @@ class TextureDrawer(MovingModule):
         window: int,
         yaw_normalise: bool,
         standardise: bool,
-        bound: float = 3.0,
         novelty_scale: float = 0.0,
     ) -> None:
         """`novelty_scale`: see `decoder_weight`; 0: the decoders' weight is always 1."""
         super().__init__()
         self.lattice, self.window, self.yaw_normalise, self.standardise = lattice, window, yaw_normalise, standardise
-        self.bound, self.novelty_scale = bound, novelty_scale
+        self.novelty_scale = novelty_scale
         self.mean: Tensor
         self.spread: Tensor
         self.training_poses: Tensor  # [t, d]: the newest frame's textures of training frames, coarse
@@ -207,7 +207,7 @@ class TextureDrawer(MovingModule):
         textures = self._draw(template, pose)
         if not self.standardise:
             return textures
-        return ((textures - self.mean) / self.spread).clamp(-self.bound, self.bound)
+        return ((textures - self.mean) / self.spread).clamp(-BOUND, BOUND)
 
     @torch.no_grad()
     def novelty(self, textures: Float[Tensor, "c r r"]) -> float:

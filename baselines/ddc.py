@@ -26,7 +26,7 @@ from ash.gaussians.initialising import initial_texture
 from ash.gaussians.texels import LIGHT_COEFFICIENTS
 from ash.mesh.drawing import MeshView, draw_seen, see_mesh, textured, topology_of
 from ash.model import stage
-from ash.presets import MethodFactory, named
+from ash.presets import MethodFactory, named, plus
 from ash.protocol import Display, DressedMesh, StageClock
 from ash.rotations import RigidTransforms
 from ash.template.template import PosedTemplate, Template
@@ -37,11 +37,7 @@ from ash.training.batches import over
 from ash.training.images import TrainingImages
 from baselines.display import MeshDisplay, texture_gain
 
-# Texture pixels per Gaussian of ASH's lattice, per side: the mesh must not be starved. At 256x256 a body's pixel is
-# 9 mm wide, twice 256 texels are 3 mm apart and more shows nothing; at full size pixels of 2.5 mm ask for four times.
-TEXTURE_FACTOR = 2
 GREY = 0.5  # Of a texture that starts from nothing.
-TEXTURE_FACTORS = {"paper": 4, "official": 4}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -73,12 +69,18 @@ class DdcConfig:
         return self.texture // self.model.decoded_texels
 
 
-def ddc_config(ash: AshConfig, *, seed: int, template: TemplateConfig) -> DdcConfig:
-    """DDC with the budget and the conditions of an ASH preset."""
+def ddc_config(ash: AshConfig, *, seed: int, template: TemplateConfig, texture_factor: int = 4) -> DdcConfig:
+    """DDC with the budget and the conditions of an ASH configuration.
+
+    Where ASH learns static texels, it learns a static texture; it has no Gaussians that could be fitted to frames.
+    `texture_factor`: texture pixels per texel of ASH's lattice, per side: the mesh must not be starved. At 256x256 a
+    body's pixel is 9 mm wide; 512 texture pixels are 3 mm apart, and more shows nothing.
+    """
+    static = ash.training.warmup == "static"
     return DdcConfig(
-        texture=TEXTURE_FACTOR * ash.model.texels,
+        texture=texture_factor * ash.model.texels,
         model=AtlasConfig(**{field.name: getattr(ash.model, field.name) for field in fields(AtlasConfig)}),
-        training=ash.training,
+        training=ash.training if static else replace(ash.training, warmup="none", warmup_steps=0),
         template=template,
         refine="static" if template.kind != "exact" or template.error_mm > 0 else "none",
         seed=seed,
@@ -198,7 +200,6 @@ class DdcAvatar(TrainedAvatar):
             window=config.model.window,
             yaw_normalise=config.model.yaw_normalise,
             standardise=config.model.standardise,
-            bound=config.model.bound,
             novelty_scale=config.model.novelty_scale,
         )
         textures.fit_normalization(template, capture.motion, capture.splits["train"].frames)
@@ -320,15 +321,19 @@ class DdcAvatar(TrainedAvatar):
 
 
 def _of_preset(preset: str) -> DdcConfig:
-    config = named(preset)
-    texture = TEXTURE_FACTORS.get(preset, TEXTURE_FACTOR) * config.model.texels
-    return replace(ddc_config(config, seed=0, template=config.template), texture=texture)
+    return ddc_config(named(preset), seed=0, template=named(preset).template)
+
+
+def _plus(preset: str) -> DdcConfig:
+    return ddc_config(plus(preset), seed=0, template=plus(preset).template)
 
 
 def _on_exact(preset: str) -> DdcConfig:
     return ddc_config(named(preset), seed=0, template=TemplateConfig(kind="exact"))
 
 
-ddc = MethodFactory(config=_of_preset, build=DdcAvatar.from_capture)  # On the template that ASH gets.
+ddc = MethodFactory(config=_of_preset, build=DdcAvatar.from_capture)  # On the template that `ash` gets.
+# With what `ash_plus` adds, as far as a mesh can have it: static texture, light, blending, and how textures are seen.
+ddc_plus = MethodFactory(config=_plus, build=DdcAvatar.from_capture)
 # An oracle on the exact surface, to see when a mesh wins.
 ddc_truth = MethodFactory(config=_on_exact, build=DdcAvatar.from_capture)

@@ -17,5 +17,11 @@ OLD_FIELDS = {  # of configurations and scenes, as flags and as keys of a suite'
     "model.fade": "model.novelty_scale",
     "rig.part": "rig.cameras_per_frame",
 }
+OLD_METHODS = {  # rows that are others now
+    "ash_wo_base": "ash",
+    "ddc_wo_base": "ddc",
+    "wo_motion_offset": "wo_disp",
+    "wo_offset": "wo_disp",
+}
 OLD_SUITES = {"ladder": "factors"}
 OLD_SIZES = {"rung": "factor"}  # of scenes

@@ -24,6 +24,7 @@ Units are metres, radians and seconds; right-handed, y up; cameras follow OpenCV
 centres at +0.5. NumPy only: this module knows formats, no method and no renderer.
 """
 
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -202,15 +203,15 @@ def require_pose(pose: Pose, skeleton: Skeleton) -> None:
         raise InputError(f"frame {frame}: expected a pose of finite numbers, got NaN or infinity")
 
 
-def fewer_views(capture: Capture, *, cameras: float = 1.0, frames: float = 1.0) -> Capture:
-    """The capture with shares (0..1] of its training cameras and frames, at least one; other splits keep theirs.
+def fewer_views(capture: Capture, *, cameras: float = 1.0, footage_s: float = math.inf) -> Capture:
+    """The capture with a share (0..1] of its training cameras and the first seconds of its training motion.
 
-    Cameras are chosen by `spread_cameras`. Frames are the first ones; where only some of the cameras recorded each
-    frame, frames that none of the chosen cameras recorded are left out.
+    At least one camera and one frame stay; other splits keep theirs. Cameras are chosen by `spread_cameras`. Where only
+    some of the cameras recorded each frame, frames that none of the chosen cameras recorded are left out.
     """
     train = capture.splits["train"]
     names = spread_cameras(capture, max(1, round(cameras * len(train.cameras))))
-    first = train.frames[: max(1, round(frames * len(train.frames)))]
+    first = train.frames[: max(1, round(min(footage_s * capture.motion.fps, len(train.frames))))]
     return replace(capture, splits=capture.splits | {"train": train.only(cameras=names, frames=first)})
 
 

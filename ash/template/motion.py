@@ -1,4 +1,4 @@
-"""Motion as the networks see it: relative to the heading of the frame they predict."""
+"""Motion as the networks see it: relative to where the frame that they predict stands."""
 
 import torch
 from jaxtyping import Float
@@ -9,12 +9,15 @@ from ash.rotations import quat_multiply, root_yaw, rotate, rotvec_to_unitquat, u
 
 
 @torch.no_grad()
-def normalised_motion(pose: Pose, *, window: int) -> Float[Tensor, "k d"]:
-    """Degrees of freedom of a window of frames, newest first, without where the newest stands and faces (ASH Sec. 3.1).
+def normalised_motion(pose: Pose, *, window: int, yaw_normalise: bool) -> Float[Tensor, "k d"]:
+    """Degrees of freedom of a window of frames, newest first; root translations relative to the newest (ASH Sec. 3.1).
 
-    Root translations become R_y(-yaw) (t_k - t_f), and root rotations are turned by -yaw, as in the release.
+    With `yaw_normalise` translations become R_y(-yaw) (t_k - t_f), and root rotations are turned by -yaw, as in the
+    release: the result does not say where the newest frame faces.
     """
     dofs = torch.from_numpy(pose.motion.dofs[pose.window(window)])
+    if not yaw_normalise:
+        return torch.cat([dofs[:, :3] - dofs[0, :3], dofs[:, 3:]], dim=1).float()
     yaw = root_yaw(dofs[0])
     unturn = about_y(-yaw).expand(len(dofs), 4)
     translation = rotate(unturn, dofs[:, :3] - dofs[0, :3])

@@ -39,8 +39,9 @@ class LinearDeformation(MovingModule):
         self.mean_window = nn.Parameter(torch.zeros(inputs), requires_grad=False)
 
     def window(self, pose: Pose) -> Float[Tensor, " f"]:
-        """The normalised motion window, in a row: it does not say where the root is or heads."""
-        return normalised_motion(pose, window=self.config.window).flatten().to(self.rest.device)
+        """The motion window, in a row: it does not say where the root is."""
+        window, yaw_normalise = self.config.window, self.config.yaw_normalise
+        return normalised_motion(pose, window=window, yaw_normalise=yaw_normalise).flatten().to(self.rest.device)
 
     def shift(self, pose: Pose) -> Float[Tensor, "v 3"]:
         """Canonical vertices less those at rest, metres; differentiable in what is learned."""

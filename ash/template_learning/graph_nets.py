@@ -115,11 +115,12 @@ class GraphDeformation(MovingModule):
 
     @torch.no_grad()
     def window_transforms(self, pose: Pose) -> list[RigidTransforms]:
-        """Per-vertex skinning of the window's frames, newest first, seen from the newest frame's root and heading."""
+        """Per-vertex skinning of the window's frames, newest first, seen from the newest frame's root (and heading)."""
         now = torch.from_numpy(pose.dofs)
         origin = now[:3] + torch.from_numpy(self.skeleton.heads[0])
         zero = now.new_zeros(())
-        unturn = rotvec_to_unitquat(torch.stack([zero, -root_yaw(now), zero]))
+        yaw = root_yaw(now) if self.config.yaw_normalise else zero
+        unturn = rotvec_to_unitquat(torch.stack([zero, -yaw, zero]))
         window = []
         for past in pose.window(self.config.window):
             joints = forward_kinematics(self.skeleton, torch.from_numpy(pose.motion.dofs[past]))

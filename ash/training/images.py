@@ -97,7 +97,7 @@ class TrainingImages:
 
 def training_part(capture: Capture, training: TrainingConfig) -> Capture:
     """The capture with as many views as a configuration trains on."""
-    return fewer_views(capture, cameras=training.camera_share, frames=training.frame_share)
+    return fewer_views(capture, cameras=training.camera_share, footage_s=training.footage_s)
 
 
 def load_training_images(

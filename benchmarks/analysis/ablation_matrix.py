@@ -13,19 +13,19 @@ from synth.presets import FACTORS
 
 REFERENCE = "ash"
 NOT_ABLATIONS = ("static", "nearest", "ddc")  # other methods than ASH without one component
-# Rows that have a component which ASH lacks in our presets: spherical harmonics above degree 0.
-ADDED = {"sh_3": "SH 0, not 3", "sh_2": "SH 0, not 2", "sh_1": "SH 0, not 1"}
+# Rows that have a component which ASH lacks, and what ASH is without.
+ADDED = {"plus_light": "w/o light", "plus_heading": "w/o heading normalised"}
 FLIPPED = {"better": "worse", "worse": "better"}
 # Rows without the component that the one phenomenon of a scene needs.
 EXPECTED: dict[str, tuple[str, ...]] = {
     "splats": (),
     "still": (),
     "skinned": (),
-    "wrinkles": ("wo_mot", "wo_disp", "wo_offset"),
+    "wrinkles": ("wo_mot", "wo_disp"),
     "swing": ("wo_mot", "window_1", "unlearned"),
-    "lit": ("wo_phi", "wo_light", "wo_phi_and_light"),
-    "glossy": tuple(ADDED),
-    "turning": ("wo_heading",),
+    "lit": ("wo_phi", "plus_light"),
+    "glossy": ("sh_0", "sh_1", "sh_2"),
+    "turning": ("plus_heading",),
     "loose": ("unlearned",),
 }
 COMPONENTS = tuple(dict.fromkeys(row for rows in EXPECTED.values() for row in rows))
@@ -33,7 +33,7 @@ COMPONENTS = tuple(dict.fromkeys(row for rows in EXPECTED.values() for row in ro
 OVERCAST = ("overcast", "under an even sky, where no lamp casts shadows")
 CONTROL_SCENES = {
     **{(scene, "wo_mot"): OVERCAST for scene in ("skinned", "lit", "turning")},
-    ("turning", "wo_heading"): ("turned_wrinkles", "with wrinkles at headings outside training"),
+    ("turning", "plus_heading"): ("turned_wrinkles", "with wrinkles at headings outside training"),
     ("wrinkles", "wo_disp"): ("wrinkles_twice", "with wrinkles twice as large"),
 }
 ZERO_STRENGTH = "skinned"  # equal to every factor scene of strength 0
@@ -76,7 +76,7 @@ def is_strength(scene: str) -> bool:
 def effects(table: pd.DataFrame, split: str) -> list[AblationEffect]:
     """All cells of a split, from `differences`; components that scenes need first."""
     cells = []
-    for row in table[table["split"] == split].itertuples():
+    for row in table[(table["split"] == split) & (table["reference"] == REFERENCE)].itertuples():
         mean, low, high, verdict = row.mean, row.low, row.high, row.verdict
         if row.method in ADDED:
             mean, low, high, verdict = -mean, -high, -low, FLIPPED.get(verdict, verdict)

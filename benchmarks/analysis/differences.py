@@ -8,29 +8,34 @@ import pandas as pd
 
 from benchmarks.analysis.results import RANKED_SPLITS, RunTables, compare, foreground
 from benchmarks.analysis.statistics import Comparison, corrected, detectable
+from benchmarks.analysis.style import REFERENCES, reference_of
 
-COLUMNS = ["scene", "split", "method", *Comparison.__dataclass_fields__, "verdict"]
+COLUMNS = ["scene", "split", "reference", "method", *Comparison.__dataclass_fields__, "verdict"]
 CAPTURES = (1, 2, 4, 8, 16)  # for which reports print the detectable difference
 
 
 def differences(
-    tables: RunTables, *, reference: str = "ash", splits: Sequence[str] = RANKED_SPLITS, scenes: Sequence[str] = ()
+    tables: RunTables, *, splits: Sequence[str] = RANKED_SPLITS, scenes: Sequence[str] = ()
 ) -> pd.DataFrame:
-    """Foreground PSNR of the reference minus that of every other method that is no oracle, in dB: `COLUMNS`.
+    """Foreground PSNR of ASH (or ASH+) minus that of every other method that is no oracle, in dB: `COLUMNS`.
+
+    A method is compared with the one of its pair (`benchmarks.analysis.style.reference_of`), ASH+ with ASH.
 
     p is corrected over the methods and splits of a scene: splits asked for apart cost the others no power.
     """
     rows = []
     for scene in scenes or tables.scenes:
+        methods = tables.methods(scene, oracles=False)
         compared = [
-            (split, method, comparison)
+            ({"scene": scene, "split": split, "reference": reference, "method": method}, comparison)
             for split in splits
-            for method in tables.methods(scene, oracles=False)
-            if method != reference
+            for method in methods
+            if method != REFERENCES[0]
+            and (reference := reference_of(method, methods)) is not None
             and (comparison := compare(tables.of(scene), reference, method, foreground(split))) is not None
         ]
-        for (split, method, _), each in zip(compared, corrected([each for *_, each in compared]), strict=True):
-            rows.append({"scene": scene, "split": split, "method": method, **asdict(each), "verdict": each.verdict})
+        for (row, _), each in zip(compared, corrected([each for _, each in compared]), strict=True):
+            rows.append({**row, **asdict(each), "verdict": each.verdict})
     return pd.DataFrame(rows, columns=COLUMNS)
 
 

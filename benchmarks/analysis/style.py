@@ -1,6 +1,6 @@
 """Titles and colours of methods in tables and charts; a method of a third party keeps its own name."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -18,6 +18,7 @@ class MethodStyle:
 
     title: str
     colour: str
+    reference: str = "ash"  # what it is compared with
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -30,56 +31,69 @@ class SplitName:
 
 STYLES = {
     "ash": MethodStyle(title="ASH", colour="#2f6fde"),
+    "ash_plus": MethodStyle(title="ASH+", colour="#12b5cb"),
     "ash_truth": MethodStyle(title="ASH, exact surface", colour="#2f6fde"),
     "ddc": MethodStyle(title="DDC", colour="#dd6b20"),
+    "ddc_plus": MethodStyle(title="DDC+", colour="#e5a500", reference="ash_plus"),
     "ddc_truth": MethodStyle(title="DDC, exact surface", colour="#dd6b20"),
     "wo_disp": MethodStyle(title="w/o disp.", colour="#2a9d8f"),
-    "wo_motion_offset": MethodStyle(title="no motion offset", colour="#2a9d8f"),
-    "wo_offset": MethodStyle(title="no offset", colour="#5b8c2a"),
     "wo_mot": MethodStyle(title="w/o mot.", colour="#9b59b6"),
-    "wo_mot_truncated": MethodStyle(title="w/o mot., 1/27 of frames", colour="#7a869a"),
-    "ash_wo_base": MethodStyle(title="ASH, no learned texels", colour="#008fb3"),
-    "ddc_wo_base": MethodStyle(title="DDC, no learned texels", colour="#b8860b"),
+    "wo_mot_plus": MethodStyle(title="ASH+ w/o mot.", colour="#c77dff", reference="ash_plus"),
+    "wo_mot_twice": MethodStyle(title="two w/o mot. averaged", colour="#7a869a"),
+    "wo_mot_plus_twice": MethodStyle(title="two ASH+ w/o mot. averaged", colour="#7a869a", reference="ash_plus"),
+    "wo_mot_truncated": MethodStyle(title="w/o mot., 40 s of footage", colour="#7a869a"),
+    "decoded": MethodStyle(title="ASH+, decoded picture alone", colour="#008fb3", reference="ash_plus"),
     "res_128": MethodStyle(title="half texels", colour="#5b8c2a"),
-    "half_width": MethodStyle(title="half width", colour="#c2415c"),
-    "res_128_half_width": MethodStyle(title="half texels and width", colour="#008fb3"),
-    "res_64": MethodStyle(title="quarter texels", colour="#a0522d"),
+    "half_width": MethodStyle(title="ASH+, half width", colour="#c2415c", reference="ash_plus"),
+    "half_texels": MethodStyle(title="ASH+, half texels", colour="#5b8c2a", reference="ash_plus"),
+    "half_texels_and_width": MethodStyle(title="ASH+, half texels and width", colour="#008fb3", reference="ash_plus"),
+    "double_texels": MethodStyle(title="ASH+, double texels", colour="#a0522d", reference="ash_plus"),
     "res_512": MethodStyle(title="double texels", colour="#008fb3"),
     "cams_12": MethodStyle(title="1/10 of cameras", colour="#a0522d"),
     "cams_30": MethodStyle(title="1/4 of cameras", colour="#b8860b"),
     "cams_60": MethodStyle(title="1/2 of cameras", colour="#7a869a"),
-    "ash_studio": MethodStyle(title="ASH, known background", colour="#5b8c2a"),
     "window_1": MethodStyle(title="window 1", colour="#008fb3"),
     "unlearned": MethodStyle(title="skinned template", colour="#b8860b"),
     "wo_phi": MethodStyle(title="w/o Phi", colour="#c2415c"),
-    "wo_light": MethodStyle(title="w/o light", colour="#b8860b"),
-    "wo_phi_and_light": MethodStyle(title="w/o Phi and light", colour="#5b8c2a"),
+    "wo_phi_and_light": MethodStyle(title="ASH+ w/o Phi and light", colour="#5b8c2a", reference="ash_plus"),
+    "sh_0": MethodStyle(title="SH 0", colour="#008fb3"),
     "sh_1": MethodStyle(title="SH 1", colour="#a0522d"),
     "sh_2": MethodStyle(title="SH 2", colour="#7a869a"),
-    "sh_3": MethodStyle(title="SH 3", colour="#008fb3"),
-    "wo_heading": MethodStyle(title="w/o heading", colour="#8d6e63"),
     "mlp": MethodStyle(title="w/ MLP", colour="#c2415c"),
     "mlp_base": MethodStyle(title="w/ MLP on learned texels", colour="#a0522d"),
     "smpl": MethodStyle(title="bare-body template", colour="#8d6e63"),
     # Suite `switches`.
-    "warm_up_paper": MethodStyle(title="warm-up as in the paper", colour="#5b8c2a"),
     "warm_up_released": MethodStyle(title="warm-up as released", colour="#7a869a"),
     "warm_up_none": MethodStyle(title="no warm-up", colour="#b8860b"),
-    "loss_paper": MethodStyle(title="loss as in the paper", colour="#b8860b"),
     "loss_released": MethodStyle(title="loss as released", colour="#c2415c"),
     "norm_released": MethodStyle(title="batch norm as released", colour="#5b8c2a"),
     "norm_instance": MethodStyle(title="instance norm", colour="#b8860b"),
     "world_rotations": MethodStyle(title="world-frame rotations", colour="#008fb3"),
     "released_phi": MethodStyle(title="Phi as released", colour="#a0522d"),
-    "wide_dilation": MethodStyle(title="dilation 0.3 px²", colour="#008fb3"),
-    "wo_base": MethodStyle(title="no learned texels or warm-up", colour="#008fb3"),
-    "blended_anchor": MethodStyle(title="texels on blended corners", colour="#5b8c2a"),
-    "wo_light_and_motion": MethodStyle(title="w/o light and motion", colour="#8d6e63"),
-    "wo_standardise": MethodStyle(title="no standardisation", colour="#c2415c"),
-    "wo_bound": MethodStyle(title="no clipping", colour="#9b59b6"),
-    "two_trunks": MethodStyle(title="two trunks", colour="#2a9d8f"),
-    "noisy_textures": MethodStyle(title="noise on textures", colour="#7a869a"),
+    "offset_in_metres": MethodStyle(title="offset in metres", colour="#9b59b6"),
+    "constant_rate": MethodStyle(title="constant learning rate", colour="#c2415c"),
+    "noisy_textures": MethodStyle(title="ASH+, noise on textures", colour="#7a869a", reference="ash_plus"),
     "last_weights": MethodStyle(title="no weight averaging", colour="#a0522d"),
+    # Suite `plus`: one addition to `ash`, and all up to one.
+    "plus_base": MethodStyle(title="+ static texels", colour="#5b8c2a"),
+    "plus_light": MethodStyle(title="+ light", colour="#b8860b"),
+    "plus_standardise": MethodStyle(title="+ standardised textures", colour="#c2415c"),
+    "plus_heading": MethodStyle(title="+ heading normalised", colour="#8d6e63"),
+    "plus_anchor": MethodStyle(title="+ texels on triangles", colour="#a0522d"),
+    "plus_background": MethodStyle(title="+ random background", colour="#2a9d8f"),
+    "plus_loss": MethodStyle(title="+ more L1 in the loss", colour="#9b59b6"),
+    "plus_dilation": MethodStyle(title="+ less dilation", colour="#008fb3"),
+    "plus_matt": MethodStyle(title="+ SH 0", colour="#7a869a"),
+    "plus_coarse": MethodStyle(title="+ one coarse U-Net", colour="#dd6b20"),
+    "to_light": MethodStyle(title="up to light", colour="#b8860b"),
+    "to_standardise": MethodStyle(title="up to standardised textures", colour="#c2415c"),
+    "to_heading": MethodStyle(title="up to heading normalised", colour="#8d6e63"),
+    "to_anchor": MethodStyle(title="up to texels on triangles", colour="#a0522d"),
+    "to_background": MethodStyle(title="up to random background", colour="#2a9d8f"),
+    "to_loss": MethodStyle(title="up to more L1 in the loss", colour="#9b59b6"),
+    "to_dilation": MethodStyle(title="up to less dilation", colour="#008fb3"),
+    "to_matt": MethodStyle(title="up to SH 0", colour="#7a869a"),
+    "to_coarse": MethodStyle(title="up to one coarse U-Net", colour="#dd6b20"),
     # Rows that differ in what the template is learned from.
     "by_scans": MethodStyle(title="template from scans", colour="#2a9d8f"),
     "ddc_by_scans": MethodStyle(title="DDC, template from scans", colour="#b8860b"),
@@ -99,11 +113,9 @@ SPLIT_NAMES = {
     "memory": SplitName(title="Cost", words="cost"),
 }
 SPARE_COLOURS = ("#b8860b", "#c2415c", "#5b8c2a", "#7a869a", "#008fb3", "#a0522d")
-# Rows of published results that no suite has any more: name, factory, changes.
-FORMER_ROWS = (
-    ("ash_studio", "ash", {"training.background": "studio"}),
-    ("wo_bound", "ash", {"model.bound": "inf"}),
-)
+# The two pairs that are compared: the paper's text, and both with what the paper does not have.
+PAIRS = (("ash", "ddc"), ("ash_plus", "ddc_plus"))
+REFERENCES = tuple(splats for splats, _ in PAIRS)
 EXACT = {"ash": "ash_truth", "ddc": "ddc_truth"}  # A method and the same method given the exact surface.
 
 
@@ -112,7 +124,7 @@ _USER_ROWS: ContextVar[dict[str, str]] = ContextVar("_USER_ROWS")  # titles by n
 
 def user_rows(configs: Iterable[CellConfig]) -> frozenset[str]:
     """Rows with a name of ours but another factory or other changes."""
-    ours = our_rows() | {(name, factory, hash_of(changes)) for name, factory, changes in FORMER_ROWS}
+    ours = our_rows()
     rows = set()
     for config in configs:
         changes = {key: value for key, value in config.changes.items() if key != "device"}
@@ -153,6 +165,13 @@ def style_of(method: str) -> MethodStyle:
     name = method.rpartition(":")[2]
     title = name.replace("_", " ") if name != method else method  # A factory's name, where it came by its path.
     return MethodStyle(title=titles.get(method, title), colour=SPARE_COLOURS[sum(method.encode()) % len(SPARE_COLOURS)])
+
+
+def reference_of(method: str, methods: Collection[str]) -> str | None:
+    """Which of the methods of a run a method is compared with: ASH or ASH+, of its own pair first; None: neither."""
+    first = STYLES[method].reference if is_ours(method) and method in STYLES else REFERENCES[0]
+    known = [name for name in (first, *REFERENCES) if name in methods and name != method]
+    return known[0] if known else None
 
 
 def is_ours(method: str) -> bool:

@@ -22,7 +22,7 @@ from ash.capture.dataset import Capture
 from ash.fields import Changes, apply_overrides, flat, suggest
 from ash.files import InputError, hash_sources
 from ash.protocol import Configurable
-from benchmarks.aliases import OLD_FIELDS
+from benchmarks.aliases import OLD_FIELDS, OLD_METHODS
 
 SUFFIXES = frozenset({".py", ".pyi", ".so", ".pyd", ".cpp", ".cc", ".cu", ".c", ".h", ".hpp", ".cuh", ".inc", ".toml"})
 NOT_SOURCES = frozenset({"build", "dist", "node_modules", "site-packages", "__pycache__"})
@@ -97,6 +97,7 @@ def find_method(name: str) -> Method:
     if ":" in name and find_spec_of(name) is not None:
         return Method(name=name, target=name, distribution="")
     known = methods()
+    name = name if name in known else OLD_METHODS.get(name, name)
     if name not in known:
         hint = "; --method-path DIR adds a folder where it is looked for" if ":" in name else ""
         raise InputError(f"unknown method {name!r}, {suggest(name, tuple(known))}{hint}")

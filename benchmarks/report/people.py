@@ -18,7 +18,7 @@ from benchmarks.report.pictures import Album, Frames, Shown
 from benchmarks.suites.runs import Run
 
 REFERENCE = "ash"
-RIVALS = ("ddc", "wo_mot")  # of many rows, those that are shown, and the user's own
+RIVALS = ("ddc", "wo_mot", "ash_plus", "ddc_plus")  # of many rows, those that are shown, and the user's own
 FEW = 5
 FEW_SUBJECTS = 4  # whose pictures are shown at twice their size
 NOTE = (

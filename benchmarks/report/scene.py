@@ -24,7 +24,7 @@ COSTS = (
     *("frame_ms", "stg1_ms", "stg2_ms", "stg3_ms", "stg4_ms", "train_s", "train_cpu_s", "settled_s", "steps"),
     *("train_cameras", "train_frames", "peak_rss_mb", "params", "gaussians"),
 )
-ON_SHEETS = ("ash", "ddc", "ash_truth", "ddc_truth")
+ON_SHEETS = ("ash", "ddc", "ash_plus", "ddc_plus", "ash_truth", "ddc_truth")
 AT_MOST_ON_SHEETS = 5
 WORST, FEW_WORST, MANY = 3, 1, 24  # worst frames of each method; of more than so many methods on all scenes, one
 SHEETS = {"pictures": "Truth, methods and errors", "pictures_people": "All subjects", "worst": "The worst frames"}
@@ -160,7 +160,7 @@ def detectable(run_tables: RunTables, scene: str, ranked: pd.DataFrame) -> str:
     ]
     if not smallest:
         return "One value per row: differences between rows have no verdict."
-    text = f"Smallest detectable difference to ASH, median row: {' and '.join(smallest)}"
+    text = f"Smallest detectable difference, median row: {' and '.join(smallest)}"
     if run_tables.captures(scene) > 1:
         return f"{text} ({run_tables.captures(scene)} captures, compared in pairs)."
     return f"{text} (seeds of one capture: it holds for this subject)."
@@ -174,8 +174,8 @@ def difference_blocks(run_tables: RunTables, scene: str, ranked: pd.DataFrame) -
     others = tuple(split for split in MOTION_SPLITS if split not in RANKED_SPLITS)
     beside = differences.differences(run_tables, splits=others, scenes=(scene,))
     test = "captures, paired t" if run_tables.captures(scene) > 1 else "seeds, Welch"
-    for title, table in (("", ranked), ("Near and far novel poses", beside)):
-        if len(table):
+    for title, rows in (("", ranked), ("Near and far novel poses", beside)):
+        for reference, table in rows.groupby("reference", sort=False):
             frame = pd.DataFrame(
                 {
                     "split": table["split"].map(lambda split: SPLIT_NAMES[split].title),
@@ -187,7 +187,9 @@ def difference_blocks(run_tables: RunTables, scene: str, ranked: pd.DataFrame) -
                 }
             ).set_axis(table["method"].map(lambda method: style_of(method).title))
             marks: dict[tuple[int, int], Mark] = {(i, 1): "strong" for i, p in enumerate(table["p"]) if p < 0.05}
-            blocks.append(Table(title=title, corner="ASH minus", frame=frame, marks=marks))
+            blocks.append(
+                Table(title=title, corner=f"{style_of(str(reference)).title} minus", frame=frame, marks=marks)
+            )
     blocks.append(Text(text=DIFFERENCES_NOTE, note=True))
     effects = differences.detectable_effects(ranked)
     if len(effects):

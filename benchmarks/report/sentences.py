@@ -1,10 +1,11 @@
 """The sentences that head a report, computed from its numbers. Differences are taken before anything is rounded."""
 
 from collections.abc import Sequence
+from itertools import chain
 
 from benchmarks.analysis import paper, pareto
 from benchmarks.analysis.results import FRAME_MS, RANKED_SPLITS, Quantity, RunTables, foreground
-from benchmarks.analysis.style import EXACT, SPLIT_NAMES, style_of
+from benchmarks.analysis.style import EXACT, PAIRS, SPLIT_NAMES, style_of
 from benchmarks.cell.registry import is_oracle
 from benchmarks.cell.schema import CellResult
 from synth.person.cast import VALIDATION
@@ -39,8 +40,8 @@ def headline(tables: RunTables, scene: str) -> str:
 
 
 def _finding(tables: RunTables, scene: str) -> str:
-    if {"ash", "ddc"} <= set(tables.methods(scene)):
-        return _ash_and_ddc(tables, scene)
+    if pairs := [pair for pair in PAIRS if set(pair) <= set(tables.methods(scene))]:
+        return " ".join(_pair(tables, scene, *pair) for pair in pairs)
     means = tables.values(scene, foreground(), tables.methods(scene, oracles=False))
     ranked = sorted(means.items(), key=lambda pair: -pair[1])
     if not ranked:
@@ -54,18 +55,21 @@ def _finding(tables: RunTables, scene: str) -> str:
     return sentence(text)
 
 
-def _ash_and_ddc(tables: RunTables, scene: str) -> str:
-    if lost := [method for method in ("ash", "ddc") if tables.failed(scene, method)]:
-        return f"On {scene}, {' and '.join(style_of(m).title for m in lost)} failed: ASH and DDC cannot be compared."
+def _pair(tables: RunTables, scene: str, splats: str, mesh: str) -> str:
+    names = style_of(splats).title, style_of(mesh).title
+    if lost := [method for method in (splats, mesh) if tables.failed(scene, method)]:
+        return f"On {scene}, {titles(lost)} failed: {names[0]} and {names[1]} cannot be compared."
     parts = []
     for split in RANKED_SPLITS:
-        means = tables.values(scene, foreground(split), ("ash", "ddc"))
+        means = tables.values(scene, foreground(split), (splats, mesh))
         if len(means) == 2:
-            lead = means["ash"] - means["ddc"]
-            far = f"{abs(lead):.1f} dB {'ahead of' if lead > 0 else 'behind'} DDC"
-            standing = "level with DDC" if abs(lead) < TOO_CLOSE_DB else far
-            parts.append(f"{standing} on {SPLIT_NAMES[split].words} ({means['ash']:.1f} and {means['ddc']:.1f} dB)")
-    return f"On {scene}, ASH is {' and '.join(parts)}." if parts else f"On {scene}, ASH and DDC were not both scored."
+            lead = means[splats] - means[mesh]
+            far = f"{abs(lead):.1f} dB {'ahead of' if lead > 0 else 'behind'} {names[1]}"
+            standing = f"level with {names[1]}" if abs(lead) < TOO_CLOSE_DB else far
+            parts.append(f"{standing} on {SPLIT_NAMES[split].words} ({means[splats]:.1f} and {means[mesh]:.1f} dB)")
+    if not parts:
+        return f"On {scene}, {names[0]} and {names[1]} were not both scored."
+    return f"On {scene}, {names[0]} is {' and '.join(parts)}."
 
 
 def remarks(tables: RunTables, scene: str) -> list[str]:
@@ -104,7 +108,7 @@ def _cost(tables: RunTables, scene: str) -> str:
     frame_ms = tables.values(scene, FRAME_MS, names)
     if len(frame_ms) > FEW_METHODS:
         ends = [pick(frame_ms, key=lambda name: frame_ms[name]) for pick in (min, max)]
-        frame_ms = {name: ms for name, ms in frame_ms.items() if name in ("ash", "ddc", *ends)}
+        frame_ms = {name: ms for name, ms in frame_ms.items() if name in (*chain(*PAIRS), *ends)}
     parts = [f"{style_of(method).title} {ms:.0f} ms" for method, ms in frame_ms.items()]
     return f"A frame takes {', '.join(parts)} on one core." if parts else ""
 

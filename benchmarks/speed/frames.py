@@ -22,7 +22,7 @@ from ash.gaussians.splatting import Splatted, splat_naive
 from ash.gaussians.texels import pose_naive, sample_surface_naive
 from ash.model import AshModel, blend_renders, image_of, views_of
 from ash.plus import AshPlusModel
-from ash.presets import named
+from ash.presets import named, plus
 from ash.protocol import Avatar, StageClock
 from ash.textures import FrameInputs
 from ash.training.adam import Adam
@@ -102,16 +102,15 @@ class Agreement:
 
 
 def subjects() -> tuple[Subject, ...]:
-    """`cpu` at four resolutions of the texel lattice, and the paper's."""
-    cpu = named("cpu")
+    """`ash`, `ash_plus` at four resolutions of the texel lattice, and the paper's size."""
+    cpu = plus("cpu")
     lattices = {texels: replace(cpu, model=replace(cpu.model, texels=texels)) for texels in (64, 128, 256, 512)}
-    small = [
-        Subject(
-            name="cpu" if config == cpu else f"cpu@{texels}", config=config, width=512, height=512, trains=config == cpu
-        )
-        for texels, config in lattices.items()
-    ]
-    return (*small, Subject(name="paper", config=named("paper"), width=1285, height=940))
+    small = []
+    for texels, config in lattices.items():
+        name = "ash_plus cpu" if config == cpu else f"ash_plus cpu@{texels}"
+        small.append(Subject(name=name, config=config, width=512, height=512, trains=config == cpu))
+    ash = Subject(name="ash cpu", config=named("cpu"), width=512, height=512, trains=True)
+    return (ash, *small, Subject(name="ash paper", config=named("paper"), width=1285, height=940))
 
 
 def speed_frame(

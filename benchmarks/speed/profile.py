@@ -33,7 +33,7 @@ from ash.native.library import has_tiles
 from ash.training.batches import draw_batch
 from ash.training.images import TrainingImages, load_training_images
 from ash.training.loop import Trainer
-from baselines.ddc import DdcAvatar, ddc
+from baselines.ddc import DdcAvatar, ddc, ddc_plus
 from benchmarks.speed.frames import captured
 from benchmarks.speed.timing import (
     Candidate,
@@ -51,11 +51,18 @@ FORWARD = ("batch", "decode", "pose", "draw", "loss")
 BACKWARD = ("loss backward", "draw backward", "pose backward", "decode backward")
 PARTS = (*FORWARD, *BACKWARD, "adam", "rest", "step")  # "step": the whole; "rest": what no other part holds
 STEPS = 80
+FACTORIES: dict[str, presets.MethodFactory[Any]] = {
+    "ash": presets.ash,
+    "ash_plus": presets.ash_plus,
+    "ddc": ddc,
+    "ddc_plus": ddc_plus,
+}
 SUBJECTS = (
     ("ash", "cpu", "float32"),
     ("ash", "cpu", "bfloat16"),
+    ("ash_plus", "cpu", "float32"),
     ("ddc", "cpu", "float32"),
-    ("ddc", "cpu", "bfloat16"),
+    ("ddc_plus", "cpu", "float32"),
 )
 
 
@@ -171,8 +178,7 @@ def profile_rows(capture: Capture, device: torch.device = CPU) -> list[SpeedRow]
         for method, preset, precision in SUBJECTS:
             if precision == "bfloat16" and device == CPU and not has_tiles():
                 continue
-            factory: presets.MethodFactory[Any] = presets.ash if method == "ash" else ddc
-            make = factory.with_overrides({"training.precision": precision, "device": str(device)})
+            make = FACTORIES[method].with_overrides({"training.precision": precision, "device": str(device)})
             learner: AshAvatar | DdcAvatar = make(capture, seed=0, preset=preset)
             name = f"{method} {preset} {precision}"
             candidates.append(profiled(learner, images, name, Path(folder) / name))

@@ -17,7 +17,7 @@ from ash.capture.dataset import Capture, Pose
 from ash.config import AshConfig, TemplateConfig
 from ash.devices import CPU, cuda_error, device_named, moved
 from ash.files import InputError
-from ash.presets import PRESETS, named
+from ash.presets import PRESETS, named, plus
 from ash.template.graph import NeighbourMean
 from ash.template.template import Template
 from ash.template_learning.deforming import LinearDeformation
@@ -34,15 +34,15 @@ def tube(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 def refining() -> AshConfig:
     """Vertices that learn with the avatar."""
-    config = named("ci")
+    config = plus("ci")
     return replace(config, model=replace(config.model, refine=True))
 
 
 VARIANTS = {
     "refining": (refining(), {}),
     **{name: (named(name), {}) for name in PRESETS},
-    "exact": (named("ci"), {"kind": "exact"}),
-    "planted_error": (named("ci"), {"kind": "exact", "error_mm": 4.0}),
+    "exact": (plus("ci"), {"kind": "exact"}),
+    "planted_error": (plus("ci"), {"kind": "exact", "error_mm": 4.0}),
 }
 
 
@@ -67,7 +67,7 @@ def test_nothing_of_a_step_is_made_on_the_default_device(variant: str, tube: Cap
 
 @pytest.mark.parametrize("kind", [LinearDeformation, GraphDeformation])
 def test_a_learned_template_is_posed_on_its_device(kind: type, tube: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = tiny(named("ci")).template
+    config = tiny(plus("ci")).template
     template = Template(tube.template, tube.skeleton, kind(config, tube.template, tube.skeleton))
     monkeypatch.setattr(NeighbourMean, "__call__", as_if_averaged)  # `meta` has no sparse product.
     posed = template.to(META).pose(Pose(tube.motion, 2))
@@ -130,7 +130,7 @@ def test_an_avatar_learns_its_template_on_its_own_device(
 
     monkeypatch.setattr(ash.trained_avatar, "device_named", lambda name: META)
     monkeypatch.setattr(ash.trained_avatar, "template_of", ask)
-    config = named("ci") if kind is AshAvatar else ddc.config("ci")
+    config = plus("ci") if kind is AshAvatar else ddc.config("ci")
     with pytest.raises(Asked, match="meta"):
         kind.from_capture(config, tube)
 
@@ -159,9 +159,9 @@ def test_a_device_that_is_not_there_is_refused_with_the_reason(tube: Capture) ->
     with pytest.raises(InputError, match=re.escape(f"device cuda:1: {cuda_error('cuda:1')}")):
         device_named("cuda:1")
     with pytest.raises(InputError, match=r"^device cuda: torch"):
-        AshAvatar.from_capture(replace(tiny(named("ci")), device="cuda"), tube)
+        AshAvatar.from_capture(replace(tiny(plus("ci")), device="cuda"), tube)
     with pytest.raises(InputError, match="expected cpu, cuda or cuda:N, got 'gpu'"):
-        replace(named("ci"), device="gpu")
+        replace(plus("ci"), device="gpu")
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")

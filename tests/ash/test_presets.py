@@ -14,7 +14,7 @@ from ash.decoders import ConvBlock, GlobalFeatures
 from ash.files import InputError
 from ash.gaussians.initialising import released_gaussians
 from ash.native.library import has_tiles
-from ash.presets import CHOSEN_ON, PRESETS, named
+from ash.presets import CHOSEN_ON, PRESETS, named, plus
 from ash.rotations import rotate, unitquat_to_rotmat
 from ash.textures import smooth_noise
 from ash.training.adam import Adam
@@ -101,7 +101,7 @@ def test_the_global_mlps_are_as_wide_as_stated():
 
 
 def test_the_offsets_unit_scales_the_offset_alone(capture):
-    avatar = AshAvatar.from_capture(AshConfig(model=tube_model_config(), training=small(named("ci")).training), capture)
+    avatar = AshAvatar.from_capture(AshConfig(model=tube_model_config(), training=small(plus("ci")).training), capture)
     inputs = avatar.module.frame_inputs(Pose(capture.motion, 2))
     raw = avatar.module.base_texels.detach().clone()
     raw[:, :3] = torch.randn(len(raw), 3, generator=torch.Generator().manual_seed(0))
@@ -118,7 +118,7 @@ def test_degrees_of_sh_add_coefficients_and_leave_the_others_alone(capture):
     images = []
     for degree in (0, 3):
         avatar = AshAvatar.from_capture(
-            AshConfig(model=tube_model_config(sh_degree=degree), training=small(named("ci")).training), capture
+            AshConfig(model=tube_model_config(sh_degree=degree), training=small(plus("ci")).training), capture
         )
         assert avatar.module.base_texels.shape[1] == 11 + 3 * (degree + 1) ** 2
         with torch.no_grad():
@@ -128,11 +128,11 @@ def test_degrees_of_sh_add_coefficients_and_leave_the_others_alone(capture):
 
 def test_the_weights_of_the_loss_weigh_its_two_parts(capture):
     images = load_training_images(capture)
-    batch = draw_batch(images, small(named("ci")).training, 0, 0)
+    batch = draw_batch(images, small(plus("ci")).training, 0, 0)
     drawn = batch.targets + 0.1 * torch.randn(batch.targets.shape, generator=torch.Generator().manual_seed(0))
     weights = {"paper": (0.1, 0.9), "official": (0.9, 0.1), "l1": (1.0, 0.0), "ssim": (0.0, 1.0)}
     losses = {
-        name: float(view_loss([drawn], [batch], replace(small(named("ci")).training, l1_weight=a, ssim_weight=b)))
+        name: float(view_loss([drawn], [batch], replace(small(plus("ci")).training, l1_weight=a, ssim_weight=b)))
         for name, (a, b) in weights.items()
     }
     for name in ("paper", "official"):
@@ -164,7 +164,7 @@ def test_the_releases_warm_up_aims_at_round_gaussians_turned_to_the_normal(captu
 
 def seen_by_steps(capture, tmp_path, **training) -> list[tuple]:
     """What the steps of a training are given: sizes of the images, and the learning rate."""
-    config = small(named("ci"), steps=6, **training)
+    config = small(plus("ci"), steps=6, **training)
     avatar = AshAvatar.from_capture(config, capture)
     seen, losses = [], avatar.losses
 
@@ -199,7 +199,7 @@ def test_a_constant_schedule_keeps_the_learning_rates(capture, tmp_path, monkeyp
 
 @pytest.mark.skipif(not has_tiles(), reason="on a CPU without tiles (AMX) decoders learn in float32")
 def test_bfloat16_is_a_matter_of_the_decoders_alone(capture):
-    config = small(named("ci"))
+    config = small(plus("ci"))
     avatar = AshAvatar.from_capture(replace(config, model=replace(config.model, width=16)), capture)
     for net in avatar.module.decoders.nets:
         torch.nn.init.normal_(net.head.weight, std=0.1)
@@ -214,8 +214,8 @@ def test_bfloat16_is_a_matter_of_the_decoders_alone(capture):
 
 
 def test_noise_in_the_textures_is_for_learning_alone_and_another_one_in_every_step(capture):
-    noisy = AshAvatar.from_capture(small(named("ci"), texture_noise=0.5), capture)
-    plain = AshAvatar.from_capture(small(named("ci")), capture)
+    noisy = AshAvatar.from_capture(small(plus("ci"), texture_noise=0.5), capture)
+    plain = AshAvatar.from_capture(small(plus("ci")), capture)
     seen = []
     for avatar in (noisy, plain):
         torch.nn.init.normal_(avatar.module.decoders.nets[0].head.weight, std=0.1, generator=torch.manual_seed(1))
@@ -241,7 +241,7 @@ def test_noise_is_smooth_standard_and_a_function_of_its_seed():
 
 @pytest.mark.parametrize("model", [{"standardise": False}, {"motion": False}])
 def test_noise_without_standardised_textures_is_refused(model):
-    base = named("ci")
+    base = plus("ci")
     with pytest.raises(InputError, match="texture_noise"):
         replace(
             base,

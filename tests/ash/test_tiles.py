@@ -14,7 +14,7 @@ import ash.native.library
 from ash.avatar import AshAvatar
 from ash.decoders import ConvBlock, UNet, decoding_precision
 from ash.native.library import has_tiles
-from ash.presets import named
+from ash.presets import plus
 from baselines.ddc import DdcAvatar, ddc_config
 
 needs_tiles = pytest.mark.skipif(not has_tiles(), reason="this machine has no tiles (AMX)")
@@ -140,7 +140,7 @@ def test_where_there_are_no_tiles_decoders_learn_in_float32(monkeypatch):
 @pytest.mark.parametrize("method", ["ash", "ddc"])
 def test_training_in_bfloat16_says_in_which_precision_it_was(method, tmp_path):
     capture = write_tube_capture(tmp_path / "capture")
-    config = named("ci")
+    config = plus("ci")
     model = replace(config.model, texels=16, width=16, levels=2, window=2)
     training = replace(config.training, steps=6, warmup_steps=2, views_per_step=1, precision="bfloat16")
     config = replace(config, model=model, training=training)

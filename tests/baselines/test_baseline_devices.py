@@ -11,21 +11,22 @@ from helpers.devices import META, step_of, tiny, without_numbers
 from ash.capture.dataset import Capture
 from ash.devices import CPU
 from ash.presets import MethodFactory
-from baselines.ablations import wo_disp, wo_mot, wo_offset
-from baselines.ddc import ddc
+from baselines.ablations import wo_disp, wo_mot, wo_mot_plus
+from baselines.ddc import ddc, ddc_plus
 from baselines.mlp import mlp, mlp_base
 from baselines.oracle_texture import oracle_texture
 from baselines.static import static
 
 RECIPES: dict[str, MethodFactory[Any]] = {
     "ddc": ddc,
+    "ddc_plus": ddc_plus,
     "ddc_moves": ddc.with_overrides({"refine": "motion"}),
     "ddc_still": ddc.with_overrides({"refine": "none"}),
     "oracle_texture": oracle_texture,
     "static": static,
     "wo_mot": wo_mot,
     "wo_disp": wo_disp,
-    "wo_offset": wo_offset,
+    "wo_mot_plus": wo_mot_plus,
     "mlp": mlp,
     "mlp_base": mlp_base,
 }

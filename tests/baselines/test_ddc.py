@@ -15,7 +15,7 @@ from ash.config import TemplateConfig
 from ash.fields import apply_overrides
 from ash.files import InputError, write_image
 from ash.mesh.drawing import SUPERSAMPLING, sample_texture
-from ash.presets import named
+from ash.presets import named, plus
 from ash.protocol import StageClock
 from baselines.ddc import DdcAvatar, ddc_config
 
@@ -26,11 +26,12 @@ def capture(tmp_path_factory):
 
 
 def avatar(capture, *, steps: int = 120) -> DdcAvatar:
-    ash = named("ci")
+    ash = plus("ci")
     small = replace(ash.model, texels=16, width=4, levels=2, window=2)
     training = replace(ash.training, steps=steps, warmup_steps=steps // 2)
     return DdcAvatar.from_capture(
-        ddc_config(replace(ash, model=small, training=training), seed=0, template=TemplateConfig()), capture
+        ddc_config(replace(ash, model=small, training=training), seed=0, template=TemplateConfig(), texture_factor=2),
+        capture,
     )
 
 
@@ -93,7 +94,7 @@ def _psnr(made, capture) -> float:
 
 
 def test_noise_in_the_textures_is_for_learning_alone(capture):
-    config = named("ci")
+    config = plus("ci")
     config = replace(config, training=replace(config.training, texture_noise=0.5, warmup_steps=2))
     avatar = DdcAvatar.from_capture(ddc_config(config, seed=0, template=TemplateConfig(kind="exact")), capture)
     for parameter in avatar.module.network.parameters():
@@ -109,8 +110,8 @@ def test_the_network_is_sized_as_the_presets_decoders_and_fills_its_texture():
     preset = named("cpu")
     config = ddc_config(preset, seed=0, template=TemplateConfig())
     assert all(getattr(config.model, field.name) == getattr(preset.model, field.name) for field in fields(config.model))
-    assert config.texture == 2 * preset.model.texels == config.shuffle * config.model.decoded_texels
-    with pytest.raises(InputError, match="texture: expected a multiple of 64, got 500"):
+    assert config.texture == 4 * preset.model.texels == config.shuffle * config.model.decoded_texels
+    with pytest.raises(InputError, match="texture: expected a multiple of 128, got 500"):
         replace(config, texture=500)
     with pytest.raises(InputError, match=r"unknown key 'width', did you mean model\.width"):
         apply_overrides(config, {"width": 8}, of="ddc")

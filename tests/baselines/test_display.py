@@ -22,12 +22,12 @@ import torch
 from ash.capture.dataset import Pose
 from ash.capture.formats import load_capture
 from ash.files import InputError
-from ash.presets import named
+from ash.presets import plus
 from ash.protocol import StageClock
 from baselines.ddc import DdcAvatar, ddc_config
 
 capture, scratch = load_capture(Path(sys.argv[1])), Path(sys.argv[2])
-ash = named("ci")
+ash = plus("ci")
 model = replace(ash.model, texels=16, shuffle=1, width=4, levels=2, window=2)
 training = replace(ash.training, steps=25, warmup_steps=5)
 config = ddc_config(replace(ash, model=model, training=training), seed=0, template=ash.template)

@@ -23,16 +23,22 @@ from ash.capture.dataset import Capture, Pose, scan_path
 from ash.config import AshConfig, AtlasConfig, ModelConfig, TemplateConfig, TrainingConfig
 from ash.fields import apply_overrides, changed
 from ash.files import write_arrays
+from ash.presets import ADDITIONS
 from ash.template.template import skinned_template
 from ash.template_learning import tracking
-from baselines.ddc import DdcConfig, ddc
+from baselines.ddc import DdcConfig, ddc, ddc_plus
 from benchmarks.cell.registry import configured, find_method, offered
 from benchmarks.suites.files import find_suite
 
 Parts = dict[str, str]
 Changes = Mapping[str, Any]
 Apart = Callable[[str, Changes], Parts]
-METHODS: dict[str, Any] = {"ash": presets.ash, "ddc": ddc}
+METHODS: dict[str, Any] = {
+    "ash": presets.ash,
+    "ash_plus": presets.ash_plus,
+    "ddc": ddc,
+    "ddc_plus": ddc_plus,
+}
 BULGE_M = 0.01  # of the true surface where the tube is straight, and as much more per radian
 
 
@@ -54,7 +60,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 def tiny() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tracking, "SCAN_RIM", 0)  # The tube is open at its ends, and its scans are exact there.
-        patch.setitem(presets.PRESETS, "ci", partial(tiny_preset, steps=10, warmup_steps=3))
+        patch.setitem(presets.PRESETS, "ci", partial(tiny_preset, steps=10, warmup_steps=15))
         yield
 
 
@@ -75,41 +81,19 @@ DECODERS = {"decoding", "weights"}
 SURFACE = {"template", "places", "start", "textures"}  # the template, and all that is drawn from it
 SWITCHES = {row.name: row for row in find_suite("switches").methods if row.changes}
 CHANGED_BY_SWITCH = {
-    "warm_up_paper": {"warm_up", "turns"},
-    "warm_up_released": {"warm_up", "turns"},
-    "warm_up_none": {"warm_up", "turns"},
-    "loss_paper": {"loss"},
+    "warm_up_released": {"warm_up"},
+    "warm_up_none": {"warm_up"},
     "loss_released": {"loss"},
     "norm_released": DECODERS,
     "norm_instance": DECODERS,
     "world_rotations": {"posing"},
     "released_phi": DECODERS,
     "wo_phi": DECODERS,
-    "sh_3": DECODERS | {"spread"},
-    "wide_dilation": {"drawing"},
-    "wo_base": {
-        "start",
-        "rates",
-        "decoder_weight",
-        "warm_up",
-        "turns",
-    },  # Nothing static could take over far from training.
-    "blended_anchor": {"places"},
-    "wo_light": {"light", "rates"},
-    "wo_light_and_motion": DECODERS
-    | {"light", "rates", "textures", "decoder_weight", "warm_up", "turns"},  # No motion: no decoders.
-    "wo_standardise": {
-        "textures",
-        "decoder_weight",
-        "rates",
-        "turns",
-    },  # Novelty is told in units of the standardised textures.
-    "wo_bound": {"textures"},
-    "wo_heading": {"textures"},
-    "two_trunks": DECODERS,
+    "sh_0": DECODERS | {"spread"},
+    "offset_in_metres": {"posing"},
     "noisy_textures": {"noise"},
     "last_weights": {"average"},
-    "learned_template": SURFACE | {"deformation"},
+    "constant_rate": {"course"},
 }
 
 
@@ -120,10 +104,47 @@ def test_a_switch_changes_what_it_names_and_nothing_else(
     row = SWITCHES[name]
     factory = find_method(row.of or row.name).load()
     avatar = factory(capture.training_only(), seed=0, preset="ci", config=configured(row.of, "ci", row.changes))
-    assert differing(apart("ash", {}), fingerprints(avatar, capture, tmp_path)) == CHANGED_BY_SWITCH[name]
+    assert differing(apart(row.of, {}), fingerprints(avatar, capture, tmp_path)) == CHANGED_BY_SWITCH[name]
 
 
-CAMERAS = {"batches", "start"}  # The first colours are means over the cameras.
+CHANGED_BY_ADDITION = {
+    "base": {"start", "rates", "warm_up"},
+    "light": {"light", "rates"},
+    "standardise": {"textures"},
+    "heading": {"textures"},
+    "anchor": {"places"},
+    "background": {"batches"},
+    "loss": {"loss"},
+    "dilation": {"drawing"},
+    "matt": DECODERS | {"spread"},
+    "coarse": DECODERS | {"textures"},
+    "blend": {"decoder_weight", "rates", "turns"},
+}
+NEEDED = {"blend": ("base", "standardise")}  # additions that another one needs
+
+
+@pytest.mark.parametrize("name", ADDITIONS)
+def test_an_addition_changes_what_it_names_and_nothing_else(name: str, apart: Apart) -> None:
+    below = {key: value for other in NEEDED.get(name, ()) for key, value in ADDITIONS[other].items()}
+    assert differing(apart("ash", below), apart("ash", {**below, **ADDITIONS[name]})) == CHANGED_BY_ADDITION[name]
+
+
+def test_the_rows_of_the_suite_are_the_additions() -> None:
+    """One at a time and one after the other; all of them are `ash_plus`."""
+    suite = {row.name: row for row in find_suite("plus").methods}
+    merged: dict[str, Any] = {}
+    for name, changes in ADDITIONS.items():
+        merged |= changes
+        rows = {f"plus_{name}": changes, f"to_{name}": merged}
+        for row, wanted in rows.items():
+            if row in suite:
+                assert configured("ash", "cpu", suite[row].changes) == apply_overrides(presets.cpu(), wanted, of=row)
+        assert f"plus_{name}" in suite or name == "blend"
+        assert f"to_{name}" in suite or name in ("base", "blend")
+    assert apply_overrides(presets.cpu(), merged, of="all") == presets.plus("cpu")
+
+
+CAMERAS = {"batches"}
 NO_MOTION = DECODERS | {
     "textures",
     "decoder_weight",
@@ -131,25 +152,24 @@ NO_MOTION = DECODERS | {
     "warm_up",
     "turns",
 }  # no decoders, nothing that they would see
+STATIC = (NO_MOTION - {"turns"}) | {"start"}  # `ash` learns no texels, but for this.
 LATTICE = {"places", "start", "textures", "decoding", "posing"}  # other texels: all that is one per texel
 UNLEARNED = {"start", "decoder_weight", "rates", "warm_up", "turns"}  # no learned texels
 CHANGED_BY_ROW = {
-    "wo_disp": {"counting"},
-    "wo_motion_offset": {"counting"},
-    "wo_offset": {"posing"},
-    "wo_mot": NO_MOTION,
-    "wo_mot_truncated": NO_MOTION | {"batches", "start"},
-    "ash_wo_base": UNLEARNED,
-    "mlp": UNLEARNED | DECODERS,
-    "mlp_base": DECODERS,
+    "wo_disp": {"posing"},
+    "wo_mot": STATIC,
+    "wo_mot_plus": NO_MOTION,
+    "wo_mot_truncated": STATIC,  # The capture is shorter than 40 s.
+    "mlp": DECODERS | {"precision"},
+    "mlp_base": DECODERS | {"precision", "start", "rates", "warm_up"},
     "res_128": LATTICE,
     "res_512": LATTICE,
     "cams_12": CAMERAS,
     "cams_30": CAMERAS,
     "cams_60": CAMERAS,
     "ash_truth": SURFACE | {"deformation"},
-    "ddc_wo_base": {"start", "decoder_weight", "rates", "turns", "warm_up"},
-    "ddc_truth": (SURFACE - {"places"}) | {"deformation", "refinement", "pulls", "rates"},  # Exact: it is not moved.
+    "ddc_truth": (SURFACE - {"places", "start"})
+    | {"deformation", "refinement", "pulls", "rates"},  # Exact: it is not moved.
 }
 
 
@@ -159,7 +179,8 @@ def test_a_row_changes_what_it_names_and_nothing_else(
 ) -> None:
     seen = capture if name.endswith("truth") else capture.training_only()
     made = fingerprints(find_method(name).load()(seen, seed=0, preset="ci"), capture, tmp_path)
-    assert differing(apart("ddc" if name.startswith("ddc") else "ash", {}), made) == CHANGED_BY_ROW[name]
+    method = ("ddc" if name.startswith("ddc") else "ash") + ("_plus" if "_plus" in name else "")
+    assert differing(apart(method, {}), made) == CHANGED_BY_ROW[name]
 
 
 @dataclass(frozen=True)
@@ -193,7 +214,7 @@ OF_BOTH = {
     "model.window": Case(3, DECODERS | {"textures"}),
     "model.width": Case(8, DECODERS),
     "model.levels": Case(1, DECODERS),
-    "model.shuffle": Case(2, DECODERS | {"textures"}),
+    "model.shuffle": Case(1, DECODERS | {"textures"}),
     "model.standardise": Case(False, {"textures"}, ALWAYS_DECODED),
     "model.novelty_scale": Case(0.35, {"decoder_weight"}),
     "model.base": Case(False, {"start", "rates"}, {**ALWAYS_DECODED, "training.warmup": "none"}),
@@ -215,24 +236,24 @@ OF_BOTH = {
 OF_ASH = {
     "model.motion": Case(False, NO_MOTION),
     "model.refine": Case(True, SURFACE | MOVING | {"rates"}),  # It starts at nothing, but for the last bit.
-    "training.frame_share": Case(0.5, {"batches", "start", "textures"}),  # Standardised by what is seen.
+    "training.footage_s": Case(0.1, {"batches", "start", "textures"}),  # Standardised by what is seen.
     "template.error_mm": Case(4.0, SURFACE, PLANTED),
     "template.supervision": Case("scans", SURFACE, NETS),
     "template.network": Case("linear", SURFACE | {"deformation"}, NETS),
     "template.nodes": Case(25, SURFACE | {"deformation", "skinning"}, NETS),
     "template.window": Case(3, SURFACE | {"deformation"}, NETS),
+    "template.yaw_normalise": Case(False, SURFACE, NETS),
     "template.released": Case(False, SURFACE | {"deformation", "skinning"}, NETS),
     "template.blocks": Case(2, SURFACE | {"deformation"}, NETS),
     "template.steps": Case(10, SURFACE, NETS),
 }
 OF_THE_MESH = {
-    "texture": Case(64, DECODERS | {"start"}),
+    "texture": Case(32, DECODERS | {"start"}),
     "refine": Case("motion", MOVING | {"rates"}),
     "vertices_every": Case(2, {"pulls"}),
     "model.texels": Case(8, DECODERS | {"textures"}),
     "model.yaw_normalise": Case(False, {"textures"}),
     "model.norm": Case("instance", DECODERS),
-    "model.bound": Case(float("inf"), {"textures"}),
     "model.light": Case(False, {"light", "drawing", "rates"}),
     "model.global_features": Case(False, DECODERS | {"rates"}),
     "model.global_mlp": Case("released", DECODERS),
@@ -240,14 +261,15 @@ OF_THE_MESH = {
     "training.ema": Case(0.0, {"average"}),
     "training.texture_noise": Case(0.5, {"noise"}),
     "training.camera_share": Case(0.5, {"batches", "start"}),
-    "training.frame_share": Case(0.5, {"batches", "start", "textures"}),
+    "training.footage_s": Case(0.1, {"batches", "start", "textures"}),
     "training.fitted_steps": Case(3, set(), FITTED),  # A mesh has no Gaussians that could be fitted.
     "template.nodes": Case(25, {"refinement"}, MOVED),
     "template.window": Case(3, MOVING, MOVED),
+    "template.yaw_normalise": Case(False, {"refinement"}, MOVED),
     "template.released": Case(True, MOVING, MOVED),
     "template.blocks": Case(2, MOVING, MOVED),
 }
-CASES = {"ash": OF_BOTH | OF_ASH, "ddc": OF_BOTH | OF_THE_MESH}
+CASES = {"ash_plus": OF_BOTH | OF_ASH, "ddc_plus": OF_BOTH | OF_THE_MESH}
 
 
 @pytest.mark.parametrize(("method", "name"), [(method, name) for method in CASES for name in CASES[method]])
@@ -259,17 +281,17 @@ def test_a_field_changes_what_it_names_and_nothing_else(method: str, name: str, 
 @pytest.mark.parametrize("on", [PLANTED, FROM_IMAGES, NETS], ids=["planted", "images", "nets"])
 def test_the_mesh_stands_on_the_template_that_ash_gets(on: Changes, apart: Apart) -> None:
     """Whichever field of the template has another value than by default."""
-    splats, mesh = apart("ash", on), apart("ddc", on)
+    splats, mesh = apart("ash_plus", on), apart("ddc_plus", on)
     assert all(splats[part] == mesh[part] for part in ("template", "skinning", "deformation", "textures"))
 
 
 ELSEWHERE = {
-    "ash": {
+    "ash_plus": {
         "model.offset_unit_m": ("ash/test_presets.py", "test_the_offsets_unit_scales_the_offset_alone"),
         "training.fitted_steps": ("ash/training/test_warm_up.py", "test_a_fit_ends_where_nothing_is_gained"),
         "device": ("ash/test_devices.py", "test_a_training_step_stays_on_its_device"),
     },
-    "ddc": {"device": ("baselines/test_baseline_devices.py", "test_a_training_step_stays_on_its_device")},
+    "ddc_plus": {"device": ("baselines/test_baseline_devices.py", "test_a_training_step_stays_on_its_device")},
 }
 OF_THE_TEMPLATE = (
     "kind",
@@ -279,14 +301,23 @@ OF_THE_TEMPLATE = (
     "steps",
 )
 HERE: dict[str, dict[str, Callable[..., None]]] = {
-    "ash": {},
-    "ddc": {f"template.{name}": test_the_mesh_stands_on_the_template_that_ash_gets for name in OF_THE_TEMPLATE},
+    "ash_plus": {},
+    "ddc_plus": {f"template.{name}": test_the_mesh_stands_on_the_template_that_ash_gets for name in OF_THE_TEMPLATE},
 }
 ROWS_OF_ASH = [
     *(row.changes for row in SWITCHES.values()),
+    *(
+        changed(presets.ci(), apply_overrides(presets.ci(), ADDITIONS[name], of=name))
+        for name in ADDITIONS
+        if name not in NEEDED
+    ),
     *(changed(presets.ci(), offered(name, "ci")) for name in CHANGED_BY_ROW if not name.startswith("ddc")),
 ]
-BY_A_ROW = {"ash": {key for changes in ROWS_OF_ASH for key, _ in changes if len(changes) == 1}, "ddc": set[str]()}
+BY_A_ROW = {
+    "ash_plus": {key for changes in ROWS_OF_ASH for key, _ in changes if len(changes) == 1}
+    - {*CASES["ash_plus"], *ELSEWHERE["ash_plus"]},
+    "ddc_plus": set[str](),
+}
 
 
 def all_fields(whole: type, **parts: type) -> list[str]:
@@ -296,12 +327,12 @@ def all_fields(whole: type, **parts: type) -> list[str]:
 
 
 FIELDS = {
-    "ash": all_fields(AshConfig, model=ModelConfig, training=TrainingConfig, template=TemplateConfig),
-    "ddc": all_fields(DdcConfig, model=AtlasConfig, training=TrainingConfig, template=TemplateConfig),
+    "ash_plus": all_fields(AshConfig, model=ModelConfig, training=TrainingConfig, template=TemplateConfig),
+    "ddc_plus": all_fields(DdcConfig, model=AtlasConfig, training=TrainingConfig, template=TemplateConfig),
 }
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", CASES)
 def test_every_field_is_tested_once(method: str) -> None:
     tested = [*CASES[method], *BY_A_ROW[method], *ELSEWHERE[method], *HERE[method]]
     assert sorted(tested) == sorted(FIELDS[method])

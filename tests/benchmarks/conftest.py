@@ -40,12 +40,12 @@ def installed_fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def tube_run(shared: Shared) -> Path:
-    """What `train` leaves: a bending tube as ash and as ddc, trained for a moment, colours seen from all sides."""
+    """What `train` leaves: a bending tube as ash_plus and as ddc_plus, trained for a moment, colours seen from all sides."""
 
     def make(folder: Path) -> None:
         write_tube_capture(folder / "capture")
         short = ["--training.steps", "60", "--training.warmup_steps", "10"]
-        for method, more in (("ash", ["--model.sh_degree", "2"]), ("ddc", [])):
+        for method, more in (("ash_plus", ["--model.sh_degree", "2"]), ("ddc_plus", [])):
             command = ["train", method, str(folder / "capture"), "--preset", "ci", "--out", str(folder / "run")]
             assert cli.main([*command, *short, *more]) == cli.DONE
 
@@ -54,10 +54,10 @@ def tube_run(shared: Shared) -> Path:
 
 @pytest.fixture(scope="session")
 def tube_cells(tube_run: Path) -> dict[str, Path]:
-    """The folder of each method's cell."""
+    """The folder of the cell of ash and of ddc."""
     found = {}
     for config in tube_run.glob("cells/*/config.json"):
-        found[read_cell(config.parent).config.method.partition("+")[0]] = config.parent
+        found[read_cell(config.parent).config.method.partition("_")[0]] = config.parent
     return found
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ash.presets import named
+from ash.presets import plus
 from benchmarks import cli
 from benchmarks.aliases import OLD_COMMANDS, OLD_FIELDS
 from benchmarks.cell.registry import configured
@@ -23,9 +23,9 @@ def test_an_old_command_is_the_new_one_and_says_so(old: str, capsys: pytest.Capt
 
 def test_an_old_field_of_a_method_is_read_as_a_flag_and_in_a_suite() -> None:
     assert OLD_FIELDS["model.fade"] == "model.novelty_scale"
-    value = named("ci").model.novelty_scale / 2
-    assert configured("ash", "ci", {"model.fade": value}).model.novelty_scale == value
-    command = read_command(TrainCommand, "train", ["ash", "data/x", "--preset", "ci", "--model.fade", str(value)])
+    value = plus("ci").model.novelty_scale / 2
+    assert configured("ash_plus", "ci", {"model.fade": value}).model.novelty_scale == value
+    command = read_command(TrainCommand, "train", ["ash_plus", "data/x", "--preset", "ci", "--model.fade", str(value)])
     assert command.changes == (("model.novelty_scale", value),)
 
 

@@ -10,7 +10,7 @@ from helpers.figures import ring_cameras, tube_mesh, tube_motion, tube_skeleton
 from ash import presets
 from ash.capture.dataset import Capture, Pose, image_path, scan_path, surface_path
 from ash.capture.formats import load_capture, write_cameras, write_motion, write_skeleton, write_template
-from ash.config import AshConfig, ModelConfig
+from ash.config import AshConfig, ModelConfig, TemplateConfig
 from ash.files import sha256_of, write_arrays, write_image, write_json
 from ash.gaussians.initialising import blank_gaussians
 from ash.model import AshModel
@@ -38,11 +38,19 @@ def tube_model_config(**changes) -> ModelConfig:
 
 
 def tiny_preset(*, steps: int, warmup_steps: int) -> AshConfig:
-    """The preset `ci` at a size for the tube."""
-    base = presets.ci()
-    model = replace(base.model, texels=16, shuffle=1, width=4, levels=2, window=2)
-    training = replace(base.training, steps=steps, warmup_steps=warmup_steps)
-    return replace(base, model=model, training=training, template=replace(base.template, nodes=20, steps=3))
+    """The preset `ci` at a size for the tube: the paper's text."""
+    return _tiny(replace(presets.ci(), template=TemplateConfig(nodes=20, steps=3)), steps, warmup_steps)
+
+
+def tiny_plus(*, steps: int, warmup_steps: int) -> AshConfig:
+    """The same with all additions; the warm-up is static."""
+    return _tiny(replace(presets.plus("ci"), template=TemplateConfig(nodes=20, steps=3)), steps, warmup_steps)
+
+
+def _tiny(config: AshConfig, steps: int, warmup_steps: int) -> AshConfig:
+    model = replace(config.model, texels=16, shuffle=1, width=4, levels=2, window=2)
+    training = replace(config.training, steps=steps, warmup_steps=warmup_steps, fitted_steps=3)
+    return replace(config, model=model, training=training)
 
 
 def known_model() -> AshModel:

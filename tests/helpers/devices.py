@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.captures import tiny_preset
+from helpers.captures import tiny_plus
 from torch import Tensor
 
 import ash.mesh.drawing
@@ -37,7 +37,7 @@ META = torch.device("meta")
 
 def tiny(config: Any, **template: Any) -> Any:
     """The configuration of a preset as it is, but for its size; on the skinned template, or another."""
-    small = tiny_preset(steps=4, warmup_steps=0)
+    small = tiny_plus(steps=4, warmup_steps=0)
     size = {"texels": 16, "width": 4, "levels": 2, "window": 2, "shuffle": min(2, config.model.shuffle)}
     return replace(
         config,

@@ -203,10 +203,12 @@ def test_a_capture_moves_with_its_folder(capture_folder, tmp_path):
 def test_fewer_views_take_the_first_frames(capture_folder):
     capture = load_capture(capture_folder)
     train = capture.splits["train"]
-    fewer = fewer_views(capture, frames=0.5)
+    seconds = len(train.frames) / 2 / capture.motion.fps
+    fewer = fewer_views(capture, footage_s=seconds)
     assert fewer.splits["train"].frames == train.frames[: round(len(train.frames) / 2)]
     assert fewer.splits["train"].cameras == train.cameras
-    assert len(fewer_views(capture, frames=0.001).splits["train"].frames) == 1
+    assert len(fewer_views(capture, footage_s=0.001).splits["train"].frames) == 1
+    assert fewer_views(capture, footage_s=1e6).splits == capture.splits
     assert {name: split for name, split in fewer.splits.items() if name != "train"} == {
         name: split for name, split in capture.splits.items() if name != "train"
     }

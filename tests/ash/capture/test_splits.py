@@ -80,7 +80,7 @@ def test_training_sees_the_pairs_and_nothing_else(capture):
         capture.splits["train"].views
     )
     for step in range(20):
-        drawn = sampled(images, presets.ci().training, 0, step)
+        drawn = sampled(images, presets.plus("ci").training, 0, step)
         assert set(drawn.views) <= set(capture.splits["train"].views) - set(images.reserved)
 
 

@@ -13,7 +13,7 @@ from ash.capture.dataset import Capture, Pose, image_path
 from ash.config import TemplateConfig
 from ash.files import write_image
 from ash.mesh.drawing import blend, draw_mesh, sample_texture, topology_of
-from ash.presets import named
+from ash.presets import plus
 from ash.template.template import skinned_template
 from ash.template_learning.refining import UNIT_M, MotionRefinement, Refinement, refined_template
 from baselines.ddc import DdcAvatar, ddc_config
@@ -94,7 +94,7 @@ def test_a_refined_template_is_the_old_one_moved_and_all_that_is_drawn_from_it_f
 
 
 def test_splats_of_a_refined_template_see_textures_redrawn_from_it(capture):
-    avatar = AshAvatar.from_capture(replace(named("ci"), model=tube_model_config(refine=True)), capture)
+    avatar = AshAvatar.from_capture(replace(plus("ci"), model=tube_model_config(refine=True)), capture)
     before = avatar._inputs_of(1)
     assert before.canonical.requires_grad and before.normals.requires_grad and not before.textures.requires_grad
     avatar.module.refinement.load_state_dict(moving_like(avatar, capture))
@@ -111,7 +111,7 @@ def moving_like(avatar: AshAvatar, capture: Capture) -> dict[str, torch.Tensor]:
 
 
 def ddc(capture: Capture, *, refine: str) -> DdcAvatar:
-    ash = named("ci")
+    ash = plus("ci")
     model = replace(ash.model, texels=16, width=4, levels=2, window=2)
     training = replace(ash.training, steps=120, warmup_steps=60, base_learning_rate=0.1)
     config = ddc_config(replace(ash, model=model, training=training), seed=0, template=TemplateConfig())
@@ -143,12 +143,12 @@ def test_without_refine_ddc_draws_the_template_it_was_given(capture):
 
 def test_an_exact_surface_is_not_refined():
     exact, off = (TemplateConfig(kind="exact", error_mm=mm) for mm in (0.0, 4.0))
-    assert ddc_config(named("ci"), seed=0, template=exact).refine == "none"
-    assert ddc_config(named("ci"), seed=0, template=off).refine == "static"
+    assert ddc_config(plus("ci"), seed=0, template=exact).refine == "none"
+    assert ddc_config(plus("ci"), seed=0, template=off).refine == "static"
 
 
 def test_splats_pull_at_the_template_where_refine_is_on(capture, tmp_path):
-    ash = named("ci")
+    ash = plus("ci")
     training = replace(ash.training, steps=100, warmup_steps=50, base_learning_rate=0.05)
     config = replace(ash, model=tube_model_config(refine=True, offset=False), training=training)
     learner = AshAvatar.from_capture(config, capture)

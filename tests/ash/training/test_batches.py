@@ -27,7 +27,7 @@ def test_where_a_mask_is_too_large_the_studio_explains_what_it_shows(capture):
     name, _ = capture.splits["train"].views[0]
     size = capture.cameras[name].height, capture.cameras[name].width
     plate = np.random.default_rng(0).integers(0, 255, (*size, 3), np.uint8)
-    training = replace(presets.ci().training, background="studio", views_per_step=1)
+    training = replace(presets.plus("ci").training, background="studio", views_per_step=1)
     with pytest.raises(InputError, match="pictures of the empty studio"):
         draw_batch(images, training, 0, 0)
     images = replace(images, backgrounds=dict.fromkeys(images.cameras, plate))

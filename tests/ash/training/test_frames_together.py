@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.captures import tiny_preset, write_tube_capture
+from helpers.captures import tiny_plus, write_tube_capture
 from helpers.numerics import relative_error
 
 import ash.trained_avatar
@@ -28,7 +28,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 def of_frames(count: int = FRAMES, *, noise: float = 0.0, **model: Any) -> AshConfig:
-    tiny = tiny_preset(steps=8, warmup_steps=2)
+    tiny = tiny_plus(steps=8, warmup_steps=2)
     training = replace(tiny.training, frames_per_step=count, texture_noise=noise)
     skinned = TemplateConfig(kind="skinned")
     return replace(tiny, model=replace(tiny.model, **model), training=training, template=skinned)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.captures import tiny_preset, write_tube_capture
+from helpers.captures import tiny_plus, write_tube_capture
 
 import ash.capture.dataset
 import ash.training.loop
@@ -45,7 +45,7 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     return counted
 
 
-TRAINING = replace(tiny_preset(steps=4, warmup_steps=0).training, views_per_step=2)
+TRAINING = replace(tiny_plus(steps=4, warmup_steps=0).training, views_per_step=2)
 
 
 def room_for(count: int, capture: Capture) -> int:
@@ -119,7 +119,7 @@ def test_what_a_reader_meets_reaches_the_training(
 ) -> None:
     shutil.copytree(capture.folder, tmp_path / "capture")
     copied = load_capture(tmp_path / "capture").training_only()
-    avatar = AshAvatar.from_capture(tiny_preset(steps=200, warmup_steps=0), copied)
+    avatar = AshAvatar.from_capture(tiny_plus(steps=200, warmup_steps=0), copied)
     images = load_training_images(copied, max_bytes=1)  # There is no room for any image.
     lost = image_path(copied.folder, "cam2", 3)
     lost.write_bytes(lost.read_bytes()[:100])

@@ -33,7 +33,7 @@ def capture(tmp_path_factory):
 
 
 def config(**changes) -> AshConfig:
-    training = replace(presets.ci().training, steps=12, warmup_steps=4, ema=0.0)
+    training = replace(presets.plus("ci").training, steps=12, warmup_steps=4, ema=0.0)
     return AshConfig(model=tube_model_config(), training=replace(training, **changes))
 
 

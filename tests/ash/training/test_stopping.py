@@ -20,7 +20,7 @@ from ash.training.stopping import (
     update,
 )
 
-CONFIG = replace(presets.ci().training, steps=20_000, warmup_steps=200, learning_rate=1e-3, ema=0.0)
+CONFIG = replace(presets.plus("ci").training, steps=20_000, warmup_steps=200, learning_rate=1e-3, ema=0.0)
 
 
 def train(curve, config: TrainingConfig, *, seconds_per_step: float = 0.0) -> tuple[ScheduleState, list[float]]:

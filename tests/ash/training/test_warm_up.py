@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.captures import tiny_preset, write_tube_capture
+from helpers.captures import tiny_plus, write_tube_capture
 
 import ash.avatar
 from ash.avatar import FITTED_EVERY, FITTED_GAIN, FITTED_LOOK, AshAvatar
@@ -25,7 +25,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 def avatar(capture: Capture, **training: Any) -> AshAvatar:
-    config = tiny_preset(steps=2, warmup_steps=2)
+    config = tiny_plus(steps=2, warmup_steps=2)
     settings = {"warmup": "fitted", **training}
     return AshAvatar.from_capture(replace(config, training=replace(config.training, **settings)), capture)
 

@@ -93,7 +93,7 @@ def test_a_report_says_what_was_compared_and_what_could_be_found() -> None:
     assert main.frame.index[0] == "DDC" and main.frame["verdict"].tolist() == ["better", "better"]
     assert more.frame.iloc[0, 0] == "none"
     said = detectable_sentence(many, "loose", ranked)
-    assert "Smallest detectable difference to ASH, median row: 0." in said and "3 captures, compared in pairs" in said
+    assert "Smallest detectable difference, median row: 0." in said and "3 captures, compared in pairs" in said
     one = RunTables(people({"ash": (20.0,), "ddc": (19.0,)}, seeds=(0.0, 0.1, 0.3)))
     (main,) = (b for b in difference_blocks(one, "loose", differences(one)) if isinstance(b, Table))
     assert list(main.frame.columns)[2] == "95 % interval [seeds, Welch]"

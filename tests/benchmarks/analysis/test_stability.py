@@ -133,18 +133,18 @@ def test_charts_are_svg_with_a_mark_where_a_method_breaks() -> None:
     assert breakdowns.frame.iloc[0, 0] == "50 (19.0 dB lost at worst)"
 
 
-def test_ash_that_knows_the_empty_studio_stands_beside_ash() -> None:
-    """A variant of a suite's file: named and placed as one of ours, and broken by itself."""
+def test_a_row_of_another_suite_stands_beside_ash() -> None:
+    """Named and placed as one of ours, and broken by itself."""
     results = [cell("nearest", 10.0)]
-    for method, worst in {"ash": 12.0, "ash_studio": 29.0}.items():
+    for method, worst in {"ash": 12.0, "ash_plus": 29.0}.items():
         results += [cell(method, 30.0), cell(method, worst, axis="mask_grown", severity=8.0)]
     (section,) = sections.stabilities(RunTables(results))
     breakdowns, reliability = (block for block in section.blocks if isinstance(block, Table))
-    assert list(breakdowns.frame.columns) == ["ASH", "ASH, known background"]
+    assert list(breakdowns.frame.columns) == ["ASH", "ASH+"]
     assert breakdowns.frame.iloc[0].tolist() == ["8 (18.0 dB lost at worst)", "none (1.0 dB lost at worst)"]
-    assert "ASH, known background" in reliability.frame.index
+    assert "ASH+" in reliability.frame.index
     mine = RunTables([*results, cell("mine", 20.0)])
-    assert mine.methods("loose") == ("mine", "nearest", "ash", "ash_studio"), "a user's own first"
+    assert mine.methods("loose") == ("mine", "nearest", "ash", "ash_plus"), "a user's own first"
 
 
 def test_the_studio_is_all_that_the_row_knows_more_and_a_dry_run_counts_it(tmp_path: Path) -> None:

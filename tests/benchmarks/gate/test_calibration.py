@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import fakes, planted_defects
-from helpers.captures import tiny_preset, write_tube_capture
+from helpers.captures import tiny_plus, write_tube_capture
 
 from ash.capture.dataset import Capture, Pose
 from ash.files import InputError, read_json
@@ -41,7 +41,7 @@ def trained_image(
     factory: Callable[..., Avatar], capture: Capture, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> np.ndarray:
     """What a method draws after a few steps of training on a tiny model."""
-    monkeypatch.setattr(planted_defects, "named", lambda _: tiny_preset(steps=6, warmup_steps=2))
+    monkeypatch.setattr(planted_defects, "named", lambda _: tiny_plus(steps=6, warmup_steps=2))
     avatar = factory(capture.training_only(), seed=0, preset="ci")
     avatar.fit(capture.training_only(), folder=folder)
     camera = next(iter(capture.cameras.values()))

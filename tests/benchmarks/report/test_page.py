@@ -303,7 +303,7 @@ def test_the_main_table_is_followed_by_what_training_saw_of_the_views() -> None:
     assert output == [
         "1/10 of cameras: training saw 2 of 20 cameras, 37 of 104 frames (paper: 12 of 120 cameras).",
         "1/2 of cameras: training saw 10 of 20 cameras, 97 to 98 of 104 frames (paper: 60 of 120 cameras).",
-        "w/o mot., 1/27 of frames: training saw 20 of 20 cameras, 4 of 104 frames (paper: 1,000 of 27,000 frames).",
+        "w/o mot., 40 s of footage: training saw 20 of 20 cameras, 4 of 104 frames (paper: 40 s of footage).",
     ]  # Of 1/4 of the cameras nothing is known.
     unknown = RunTables([scored("ash", view=27.0, pose=20.0), on("cams_12", 2, 37)])
     assert sentences.training_views(unknown, "loose") == []

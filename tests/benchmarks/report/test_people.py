@@ -76,7 +76,7 @@ def test_a_single_subject_and_a_method_that_failed_or_saw_other_subjects_have_no
 
 
 def test_of_many_rows_the_rivals_and_the_users_own_are_shown() -> None:
-    rows = ("ash", "ddc", "wo_disp", "wo_offset", "wo_mot", "mlp", "res_128", "res_512", "theirs")
+    rows = ("ash", "ddc", "wo_disp", "smpl", "wo_mot", "mlp", "res_128", "res_512", "theirs")
     table = blocks(cast({row: ((25.0,), (26.0,)) for row in rows}), Table)[0]
     assert list(table.frame.columns) == ["ASH [dB]", "minus theirs", "minus DDC", "minus w/o mot."]
 

@@ -14,7 +14,7 @@ from helpers.commands import refused
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture
 from ash.files import InputError, read_json
-from ash.presets import named
+from ash.presets import plus
 from ash.textures import TextureDrawer
 from ash.training.images import load_training_images
 from benchmarks import cli
@@ -66,7 +66,7 @@ def agreements(avatar: AshAvatar, capture: Capture, *, threads: tuple[int, ...] 
 def test_the_table_has_every_stage_and_fast_images_agree_with_the_definitions(capture, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(frames, "captured", lambda folder: capture)
     monkeypatch.setattr(
-        frames, "subjects", lambda: (Subject(name="ci", config=named("ci"), width=64, height=64, trains=True),)
+        frames, "subjects", lambda: (Subject(name="ci", config=plus("ci"), width=64, height=64, trains=True),)
     )
     before = torch.get_num_threads()
     assert frames.main(tmp_path / "rows.json") == 0
@@ -175,7 +175,7 @@ def test_an_agreement_has_the_least_weight_of_the_decoders(trained: Trained, mon
 
 
 def test_an_avatar_without_decoders_agrees_too(capture: Capture) -> None:
-    config = named("ci")
+    config = plus("ci")
     avatar = AshAvatar.from_capture(replace(config, model=replace(config.model, motion=False)), capture)
     for agreement in agreements(avatar, with_near_motion(capture)).values():
         assert agreement.least_decoder_weight == 1.0 and agreement.least_db > AGREES_DB
@@ -194,20 +194,29 @@ def test_a_scaled_camera_sees_the_same_window_in_the_middle(capture):
 
 def test_the_papers_resolutions_are_timed():
     texels = {subject.name: subject.config.model.texels for subject in subjects()}
-    assert texels == {"cpu@64": 64, "cpu@128": 128, "cpu": 256, "cpu@512": 512, "paper": 256}
+    assert texels == {
+        "ash cpu": 128,
+        "ash_plus cpu@64": 64,
+        "ash_plus cpu": 128,
+        "ash_plus cpu@256": 256,
+        "ash_plus cpu@512": 512,
+        "ash paper": 256,
+    }
     assert set(frames.PAPER_MS) <= set(texels.values())
 
 
 def test_the_parts_of_a_step_are_timed_and_make_up_the_whole(capture, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(profile, "captured", lambda folder: capture)
-    monkeypatch.setattr(profile, "SUBJECTS", (("ash", "ci", "float32"), ("ddc", "ci", "float32")))
+    monkeypatch.setattr(profile, "SUBJECTS", (("ash_plus", "ci", "float32"), ("ddc_plus", "ci", "float32")))
     monkeypatch.setattr(profile, "STEPS", 12)
     assert profile.main(tmp_path / "parts.json", None) == 0
     rows = read_json(tmp_path / "parts.json")["rows"]
-    for method in ("ash", "ddc"):
+    for method in ("ash_plus", "ddc_plus"):
         ms = {row["what"]: row["median_ms"] for row in rows if row["candidate"] == f"{method} ci float32"}
-        still = {"pose backward"} if method == "ddc" else set()  # most of its steps have no gradient in the vertices
-        more = {profile.STATIC} | ({profile.VERTICES} if method == "ddc" else set())
+        still = (
+            {"pose backward"} if method == "ddc_plus" else set()
+        )  # most of its steps have no gradient in the vertices
+        more = {profile.STATIC} | ({profile.VERTICES} if method == "ddc_plus" else set())
         assert set(ms) == {*profile.PARTS, *more, "train_step"}
         assert all(value > 0 for part, value in ms.items() if part not in still)
         assert sum(ms[part] for part in profile.PARTS) == pytest.approx(2 * ms["step"], rel=0.3)
@@ -215,7 +224,7 @@ def test_the_parts_of_a_step_are_timed_and_make_up_the_whole(capture, tmp_path, 
 
 
 def test_a_part_that_takes_longer_is_seen(capture, tmp_path):
-    avatar = AshAvatar.from_capture(named("ci"), capture)
+    avatar = AshAvatar.from_capture(plus("ci"), capture)
     decode, images = avatar._decode, load_training_images(capture)
 
     def slow(*arguments):

@@ -11,7 +11,7 @@ from ash.avatar import AshAvatar
 from ash.capture.dataset import Pose
 from ash.capture.formats import load_capture, read_template_truth
 from ash.capture.manifest import verify_capture
-from ash.presets import named
+from ash.presets import plus
 from ash.template.template import RestDeformation, Template
 from benchmarks.suites.captures import make_capture
 from benchmarks.suites.splats import CI_COUNT, draw_view, known_avatar
@@ -47,7 +47,7 @@ def test_the_known_gaussians_lose_nothing_but_the_quantisation(capture):
 
 
 def test_the_truth_is_none_of_the_methods_gaussians(capture):
-    avatar = AshAvatar.from_capture(named("ci"), capture.training_only())
+    avatar = AshAvatar.from_capture(plus("ci"), capture.training_only())
     known = known_avatar(avatar.template, count=CI_COUNT, seed=0)
     assert len(known.base_texels) > 1.5 * len(avatar.module.base_texels)
     rest = torch.from_numpy(capture.template.vertices).float()
@@ -63,7 +63,7 @@ def test_the_truth_is_none_of_the_methods_gaussians(capture):
 
 def test_ash_recovers_them_by_training(capture, tmp_path):
     avatar = AshAvatar.from_capture(
-        replace(named("ci"), model=replace(named("ci").model, motion=False, novelty_scale=0.0)), capture
+        replace(plus("ci"), model=replace(plus("ci").model, motion=False, novelty_scale=0.0)), capture
     )
     seen = capture.training_only()
     camera, frame = capture.splits["novel_pose"].views[0]
