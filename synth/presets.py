@@ -142,6 +142,8 @@ def tight(*, size: str, seed: int) -> Scene:
 def skinned(*, size: str, seed: int) -> Scene:
     """Articulation only: the template with the true skinning is exact. The scene that every factor scene adds to.
 
+    Light paths have `depth` 2: direct light, no bounce. `tight` and `loose` have one bounce.
+
     At size `ci` the body is the mannequin, so that all factor scenes together take minutes and need no body model.
     """
     amount = _size(size)
@@ -169,7 +171,7 @@ def factor_scene(name: str, *, size: str, seed: int = 0, strength: float = 1.0) 
 
 
 def still(*, size: str, seed: int) -> Scene:
-    """One pose: the textured body, path-traced. Static Gaussians suffice."""
+    """One pose: the textured body. Static Gaussians suffice. Direct light only (`depth` 2), as in all factor scenes."""
     base = skinned(size=size, seed=seed)
     train, test = (Clip(generator="stand", frames=frames) for frames in (4, 2))
     rig = replace(base.rig, cameras_per_frame=0)
