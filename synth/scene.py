@@ -18,6 +18,10 @@ MOTIONS = (
     "spin",
     "arms_up",
     "deep_squat",
+    "twist",
+    "wave",
+    "bow",
+    "clap",
 )  # as in `motion/generators.py`
 GIVEN = "given"  # the kind of a clip whose motion comes from a user's file
 UPS = ("auto", "x", "y", "z", "-x", "-y", "-z")
@@ -51,10 +55,19 @@ class Take:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Clip:
-    """A generator, how many frames of it to take, and where on the floor and facing where."""
+    """A motion, which frames of it are taken, which of these have images, and where on the floor and facing where.
+
+    A clip is one run of consecutive frames, or several runs that are spread over a longer motion. Each run is a
+    sequence of its own: its motion window and its cloth know nothing of the others. Held-out clips have images of the
+    frames `history`, `history + stride`, ... of every run; training clips have images of all frames.
+    """
 
     generator: str  # one of MOTIONS, or "given" for a motion from a file
-    frames: int
+    frames: int  # of a run
+    runs: int = 1
+    span: int = 0  # frames of the whole motion, over which runs are spread evenly (one: its middle); 0: those taken
+    history: int = 0  # frames at the start of a run that have no images: what came before
+    stride: int = 1
     yaw: float = 0.0  # radians that the whole clip is turned by about the vertical
     shift: tuple[float, float] = (0.0, 0.0)  # metres, x and z, that it is then moved by
     given: str = ""  # SHA-256 of a user's motion file, for "given"
@@ -68,6 +81,30 @@ class Clip:
             raise InputError("a clip of kind 'given' needs the SHA-256 of a motion file, and only such a clip has one")
         if not 2 <= self.frames <= 100_000:
             raise InputError(f"a clip of {self.frames} frames, expected 2 to 100000")
+        if not 0 <= self.history < self.frames or not 1 <= self.stride <= 100_000:
+            got = f"{self.history} frames of history and a stride of {self.stride}"
+            raise InputError(f"a clip with {got}, expected 0 to {self.frames - 1}, and 1 or more")
+        if not 1 <= self.runs <= 1000 or (self.runs > 1 and not self.span):
+            raise InputError(f"{self.runs} runs over {self.span} frames, expected one, or several with a span")
+        if self.span and (self.generator == GIVEN or not self.runs * self.frames <= self.span <= 100_000):
+            raise InputError(f"{self.runs} runs of {self.frames} frames do not fit into {self.span}, or are of a file")
+
+    @property
+    def count(self) -> int:
+        """Frames of all runs."""
+        return self.runs * self.frames
+
+    @property
+    def starts(self) -> tuple[int, ...]:
+        """The frame of the whole motion at which each run starts."""
+        last = max(0, self.span - self.frames)
+        return tuple(round(run * last / (self.runs - 1)) for run in range(self.runs)) if self.runs > 1 else (last // 2,)
+
+    @property
+    def shown(self) -> tuple[int, ...]:
+        """Which of its frames, counted over all runs, have images where the clip is held out."""
+        own = range(self.history, self.frames, self.stride)
+        return tuple(run * self.frames + frame for run in range(self.runs) for frame in own)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -161,8 +198,6 @@ class Scene:
     novel_view_stride: int  # novel views are judged on every so many training frames
     near: tuple[Clip, ...] = ()  # near novel poses: other takes of training's kinds
     far: tuple[Clip, ...] = ()  # far novel poses: unlike anything in training
-    near_stride: int = 1  # every so many-th frame of a near clip has images; the others are history
-    far_stride: int = 1  # the same of far clips
     scanner: Scanner = Scanner()
     fps: float = 12.0
     samples: int = 48  # per pixel, in two halves
@@ -175,8 +210,8 @@ class Scene:
             raise InputError(f"unknown body {self.body!r}, expected one of {', '.join(BODIES)}")
         if not self.train or not self.test:
             raise InputError("a scene needs at least one training and one test clip")
-        if not (1 <= self.near_stride <= 100_000 and 1 <= self.far_stride <= 100_000):
-            raise InputError(f"strides of {self.near_stride} and {self.far_stride} frames, expected 1 to 100000")
+        if any(clip.span or clip.history or clip.stride > 1 for clip in self.train):
+            raise InputError("training clips: expected one run, no history and a stride of 1")
         if self.frames > 1_000_000:
             raise InputError("a scene of more than a million frames")
         if not 2 <= self.samples <= 65536 or self.samples % 2:
@@ -192,7 +227,7 @@ class Scene:
     @property
     def frames(self) -> int:
         """Number of frames, training and held out."""
-        return sum(clip.frames for clip in self.clips)
+        return sum(clip.count for clip in self.clips)
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -206,10 +241,11 @@ class Scene:
         for name in ("near", "far"):
             if not parameters[name]:
                 del parameters[name]
-            if parameters[f"{name}_stride"] == 1:
-                del parameters[f"{name}_stride"]
         for clip in (clip for name in ("train", "test", "near", "far") for clip in parameters.get(name, ())):
             del clip["path"]
+            for name, default in (("runs", 1), ("span", 0), ("history", 0), ("stride", 1)):
+                if clip[name] == default:
+                    del clip[name]
             if clip["take"] == asdict(Take()):
                 del clip["take"]
                 continue

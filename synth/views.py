@@ -22,14 +22,14 @@ def splits(scene: Scene) -> dict[str, Split]:
     """Training views; novel views of some training frames; novel poses (near, new, far) from the novel-view cameras."""
     names = camera_names(scene.rig)
     apart = tuple(names[k] for k in held_out(scene.rig))
-    training = sum(clip.frames for clip in scene.train)
-    tested = training + sum(clip.frames for clip in scene.test)
-    nearby = tested + sum(clip.frames for clip in scene.near)
+    training = sum(clip.count for clip in scene.train)
+    tested = training + sum(clip.count for clip in scene.test)
+    nearby = tested + sum(clip.count for clip in scene.near)
     held_out_frames = {
         "novel_view": tuple(range(scene.novel_view_stride // 2, training, scene.novel_view_stride)),
-        "near_pose": _some(scene.near, first=tested, stride=scene.near_stride),
-        "novel_pose": tuple(range(training, tested)),
-        "far_pose": _some(scene.far, first=nearby, stride=scene.far_stride),
+        "near_pose": _shown(scene.near, first=tested),
+        "novel_pose": _shown(scene.test, first=training),
+        "far_pose": _shown(scene.far, first=nearby),
     }
     parts = _parts(scene, training)
     used = {name for part in parts for name in part} or set(names) - set(apart)  # Few frames do not come to all.
@@ -39,14 +39,10 @@ def splits(scene: Scene) -> dict[str, Split]:
     }
 
 
-def _some(clips: tuple[Clip, ...], *, first: int, stride: int) -> tuple[int, ...]:
-    """Every `stride`-th frame of each clip, of which the first one's begins at frame `first`; at least one of each."""
-    starts = np.cumsum([first, *(clip.frames for clip in clips)])[:-1]
-    return tuple(
-        int(start) + frame
-        for start, clip in zip(starts, clips, strict=True)
-        for frame in range(min(stride // 2, clip.frames - 1), clip.frames, stride)
-    )
+def _shown(clips: tuple[Clip, ...], *, first: int) -> tuple[int, ...]:
+    """The frames of clips that have images, where the first clip begins at frame `first`."""
+    starts = np.cumsum([first, *(clip.count for clip in clips)])[:-1]
+    return tuple(int(start) + frame for start, clip in zip(starts, clips, strict=True) for frame in clip.shown)
 
 
 def _parts(scene: Scene, frames: int) -> tuple[tuple[str, ...], ...]:

@@ -39,7 +39,7 @@ from benchmarks.cell.worker import MethodClient, MethodInfo, Timed, frame_times_
 
 TRAIN_VIEWS = 12
 VIEW_FRAMES = 12
-POSE_FRAMES = 24
+POSE_FRAMES = {"near_pose": 24, "novel_pose": 700, "far_pose": 24}
 WARM_UP_FRAMES = 3
 TIMED_FRAMES = 15
 GEOMETRY_FRAMES = 4
@@ -282,18 +282,27 @@ def _training_summary(training: TrainingOutcome | None, curve: tuple[CurvePoint,
 
 
 def _flicker_summary(cell: Cell, capture: Capture, scored: list[ViewScore]) -> tuple[Summary, ...]:
-    """Flicker over the test motion: the only split whose scored frames follow each other."""
-    views = [view for view in scored if view.split == "novel_pose"]
-    values = []
-    for camera in sorted({view.camera for view in views}):
-        frames = sorted(view.frame for view in views if view.camera == camera)
-        predicted = [
-            stored_prediction(cell, capture, View(split="novel_pose", camera=camera, frame=frame)) for frame in frames
+    """Flicker on held-out motion, of splits in which scored frames of one sequence follow each other."""
+    rows = []
+    for split in POSE_FRAMES:
+        shown = {(view.camera, view.frame) for view in scored if view.split == split}
+        sequence = capture.motion.sequence
+        pairs = [
+            (camera, frame)
+            for camera, frame in sorted(shown)
+            if (camera, frame + 1) in shown and sequence[frame] == sequence[frame + 1]
         ]
-        values.append(metrics.flicker(predicted, [metrics.on_black(capture.image(camera, frame)) for frame in frames]))
-    if not values:
-        return ()
-    return (Summary(split="novel_pose", region="foreground", metric="flicker", value=float(np.mean(values))),)
+        values = [_flicker(cell, capture, split, camera, frame) for camera, frame in pairs]
+        if values:
+            rows.append(Summary(split=split, region="foreground", metric="flicker", value=float(np.mean(values))))
+    return tuple(rows)
+
+
+def _flicker(cell: Cell, capture: Capture, split: str, camera: str, frame: int) -> float:
+    """`metrics.flicker` from a frame to the next."""
+    frames = (frame, frame + 1)
+    predicted = [stored_prediction(cell, capture, View(split=split, camera=camera, frame=f)) for f in frames]
+    return metrics.flicker(predicted, [metrics.on_black(capture.image(camera, f)) for f in frames])
 
 
 def _pose_geometry(client: MethodClient, described: MethodInfo, views: tuple[View, ...]) -> PosedFrames | None:
@@ -372,8 +381,8 @@ def evaluated_views(capture: Capture) -> tuple[View, ...]:
 
     - train_view: 12 training images, spread evenly over all.
     - novel_view: held-out cameras in at most 12 training frames, spread evenly.
-    - novel_pose: held-out cameras in the first 24 test frames, which follow each other, so that flicker can be seen.
-    - near_pose, far_pose: held-out cameras in at most 24 frames each, spread evenly over all clips.
+    - near_pose, novel_pose, far_pose: held-out cameras in at most 24, 700 and 24 frames, spread evenly over all clips;
+      700 are every tenth of the paper's test frames.
     """
     pairs: dict[str, list[tuple[str, int]]] = {split: [] for split in IMAGE_SPLITS}
     train = capture.splits["train"].views
@@ -382,13 +391,10 @@ def evaluated_views(capture: Capture) -> tuple[View, ...]:
         split = capture.splits["novel_view"]
         frames = [split.frames[i] for i in spread(len(split.frames), VIEW_FRAMES)]
         pairs["novel_view"] = [(camera, frame) for camera in split.cameras for frame in frames]
-    if "novel_pose" in capture.splits:
-        split = capture.splits["novel_pose"]
-        pairs["novel_pose"] = [(camera, frame) for camera in split.cameras for frame in split.frames[:POSE_FRAMES]]
-    for name in ("near_pose", "far_pose"):
+    for name, most in POSE_FRAMES.items():
         if name in capture.splits:
             split = capture.splits[name]
-            frames = [split.frames[i] for i in spread(len(split.frames), POSE_FRAMES)]
+            frames = [split.frames[i] for i in spread(len(split.frames), most)]
             pairs[name] = [(camera, frame) for camera in split.cameras for frame in frames]
     return tuple(View(split=s, camera=camera, frame=frame) for s in IMAGE_SPLITS for camera, frame in pairs[s])
 

@@ -27,7 +27,7 @@ import numpy as np
 
 from ash.files import InputError
 
-PROTOCOL = "2"
+PROTOCOL = "3"
 PSNR_CAP_DB = 100.0  # Identical images would be infinite, and JSON and means know no infinity.
 FLIP_MARGIN = 24  # Pixels around the subject that FLIP's widest filter (radius 16 at 67 pixels per degree) can reach.
 SSIM_MARGIN = 11  # Pixels, beyond which windows of 11x11 or 7x7, mirrored at the margin's edge, see nothing.

@@ -27,20 +27,20 @@ FLOOR = 1.2  # metres from the middle of the floor that a motion from a file may
 
 
 def make_motion(skeleton: Skeleton, clips: tuple[Clip, ...], *, fps: float, seed: int) -> Motion:
-    """Generate the clips in order, each a sequence of its own, each from its own random stream."""
-    dofs, sequence = [], []
+    """Generate the clips in order, each from its own random stream; each of their runs is a sequence of its own."""
+    runs = []
     for index, clip in enumerate(clips):
         if clip.generator == GIVEN:
             clip_dofs = _from_file(skeleton, clip, fps=fps)
         else:
             rng = np.random.default_rng([seed, index])
-            plan = GENERATORS[clip.generator](np.arange(clip.frames) / fps, rng)
+            plan = GENERATORS[clip.generator](np.arange(clip.span or clip.frames) / fps, rng)
             clip_dofs = solve(skeleton, plan if clip.generator == "stand" else in_a_manner(plan, rng))
         clip_dofs = turned(skeleton, clip_dofs, clip.yaw) if clip.yaw else clip_dofs
         clip_dofs[:, [0, 2]] += clip.shift
-        dofs.append(clip_dofs)
-        sequence.append(np.full(clip.frames, index))
-    return Motion(dofs=np.concatenate(dofs), sequence=np.concatenate(sequence), fps=fps)
+        runs += [clip_dofs[start : start + clip.frames] for start in clip.starts]
+    sequence = np.repeat(np.arange(len(runs)), [len(run) for run in runs])
+    return Motion(dofs=np.concatenate(runs), sequence=sequence, fps=fps)
 
 
 def clip_from_file(path: Path, skeleton: Skeleton, *, fps: float, most: int, take: Take = WHOLE) -> Clip:

@@ -263,6 +263,80 @@ def deep_squat(times: np.ndarray, rng: np.random.Generator) -> Plan:
     return plan
 
 
+def twist(times: np.ndarray, rng: np.random.Generator) -> Plan:
+    """Turn the torso from side to side over planted feet, the arms carried along."""
+    plan = standing(times)
+    beat = 2 * np.pi * (times - times[0]) / rng.uniform(1.5, 1.8) + rng.uniform(0, 2 * np.pi)
+    most = rng.uniform(0.55, 0.7)
+    plan.yaw += rng.uniform(-0.3, 0.3)
+    plan.bend[:, 1] = most * np.sin(beat)
+    plan.tilt[:, 1] = 0.15 * np.sin(beat)
+    plan.look[:, 1] = 0.3 * np.sin(beat)
+    plan.shift[:, 1] = -0.03 + 0.01 * np.cos(2 * beat)
+    plan.abduction += rng.uniform(0.5, 0.9)
+    plan.flexion = 0.35 * np.stack([-np.sin(beat - 0.5), np.sin(beat - 0.5)], axis=1)
+    plan.elbow += 0.3 + 0.3 * np.abs(np.sin(beat))[:, None]
+    _plant(plan, yaw=float(plan.yaw[0]), width=0.16, splay=0.15)
+    return plan
+
+
+def wave(times: np.ndarray, rng: np.random.Generator) -> Plan:
+    """Wave with one arm held high, the other hand on the hip, the weight going from foot to foot."""
+    plan = standing(times)
+    t = times - times[0]
+    beat, sway = 2 * np.pi * t / rng.uniform(0.8, 1.0), 2 * np.pi * t / rng.uniform(2.0, 2.6) + rng.uniform(0, 6)
+    high = int(rng.integers(2))
+    low, sign = 1 - high, SIGNS[high]
+    plan.yaw += rng.uniform(-0.4, 0.4)
+    plan.abduction[:, high] += rng.uniform(1.4, 1.6) + 0.1 * np.sin(beat)
+    plan.elbow[:, high] += 0.9 + 0.5 * np.sin(beat)
+    plan.abduction[:, low] += 0.55
+    plan.flexion[:, low] -= 0.3
+    plan.elbow[:, low] += 1.3
+    plan.bend[:, 2] = 0.1 * sign + 0.12 * np.sin(sway)
+    plan.look[:, 2] = -0.12 * np.sin(sway)
+    plan.tilt[:, 2] = 0.08 * np.sin(sway)
+    plan.shift[:, 0] = 0.05 * np.sin(sway)
+    plan.shift[:, 1] = -0.03
+    _plant(plan, yaw=float(plan.yaw[0]), width=0.13)
+    return plan
+
+
+def bow(times: np.ndarray, rng: np.random.Generator) -> Plan:
+    """Bow and straighten again and again, the arms sweeping back."""
+    plan = standing(times)
+    low = 0.5 - 0.5 * np.cos(2 * np.pi * (times - times[0]) / rng.uniform(1.9, 2.3) + rng.uniform(0, 2 * np.pi))
+    plan.yaw += rng.uniform(-0.5, 0.5)
+    plan.bend[:, 0] = rng.uniform(0.6, 0.75) * low
+    plan.tilt[:, 0] = 0.35 * low
+    plan.look[:, 0] = -0.2 * low
+    plan.abduction += (0.3 + 0.5 * low)[:, None]
+    plan.flexion += (0.2 - 0.5 * low)[:, None]
+    plan.elbow += 0.3
+    back = -0.07 * low
+    plan.shift[:, [0, 2]] = back[:, None] * np.stack([np.sin(plan.yaw), np.cos(plan.yaw)], axis=1)
+    plan.shift[:, 1] = -0.02 - 0.03 * low
+    _plant(plan, yaw=float(plan.yaw[0]), width=0.12)
+    return plan
+
+
+def clap(times: np.ndarray, rng: np.random.Generator) -> Plan:
+    """Open the arms wide and bring them together in front, the knees giving with every beat."""
+    plan = standing(times)
+    beat = 2 * np.pi * (times - times[0]) / rng.uniform(1.1, 1.3) + rng.uniform(0, 2 * np.pi)
+    apart = 0.5 + 0.5 * np.cos(beat)
+    plan.yaw += rng.uniform(-0.4, 0.4)
+    plan.flexion += (rng.uniform(1.2, 1.4) - 0.5 * apart)[:, None]
+    plan.abduction += (0.1 + 1.1 * apart)[:, None]
+    plan.elbow += (0.7 - 0.4 * apart)[:, None]
+    plan.bend[:, 0] = 0.18 * (1 - apart)
+    plan.bend[:, 1] = 0.15 * np.sin(beat / 2)
+    plan.look[:, 0] = -0.1 * (1 - apart)
+    plan.shift[:, 1] = -0.05 + 0.03 * np.cos(2 * beat)
+    _plant(plan, yaw=float(plan.yaw[0]), width=0.15, splay=0.12)
+    return plan
+
+
 def _plant(plan: Plan, *, yaw: float, width: float, splay: float = 0.08) -> None:
     side = np.array([np.cos(yaw), -np.sin(yaw)]) * width
     plan.stance = ((side[0], side[1], yaw + splay), (-side[0], -side[1], yaw - splay))
@@ -294,4 +368,8 @@ GENERATORS: dict[str, Callable[[np.ndarray, np.random.Generator], Plan]] = {
     "spin": spin,
     "arms_up": arms_up,
     "deep_squat": deep_squat,
+    "twist": twist,
+    "wave": wave,
+    "bow": bow,
+    "clap": clap,
 }

@@ -22,10 +22,8 @@ def rotating_scene() -> Scene:
     return replace(
         small_scene(),
         rig=Rig(cameras=5, held_out=1, cameras_per_frame=2, width=64, height=64),
-        near=(Clip(generator="walk", frames=4),),
-        near_stride=2,
-        far=(Clip(generator="arms_up", frames=4), Clip(generator="jump", frames=4)),
-        far_stride=4,
+        near=(Clip(generator="walk", frames=4, history=1, stride=2),),
+        far=tuple(Clip(generator=kind, frames=4, history=2, stride=4) for kind in ("arms_up", "jump")),
     )
 
 

@@ -173,7 +173,7 @@ def test_surface_distance_of_points_off_a_grid() -> None:
 
 def test_protocol_2_is_locked(pair) -> None:
     """Scores of fixed images, as protocol 2 gave them when it was set. Other numbers need another protocol version."""
-    assert metrics.PROTOCOL == "2"
+    assert metrics.PROTOCOL == "3"
     assert metrics.score_view(*pair) == pytest.approx(LOCKED, abs=2e-5)
 
 

@@ -67,6 +67,21 @@ def test_identical_predictions_pass_at_once() -> None:
     assert found[0].detail == "identical predictions"
 
 
+def test_lpips_is_judged_where_it_can_be_measured() -> None:
+    def scored(lpips: list[float]) -> list[CellResult]:
+        rows = [Summary(split="novel_view", region="full", metric="lpips", value=value) for value in lpips]
+        results = run([25.0 + 0.01 * value for value in range(len(lpips))])
+        return [replace(r, summary=(*r.summary, row)) for r, row in zip(results, rows, strict=True)]
+
+    base = summarise("ci", scored([12.0, 12.1, 11.9, 12.05]))
+    name = "novel_view/full/lpips"
+    for values, verdict in (([17.0, 17.1, 16.9], "fail"), ([12.0, 12.2, 11.9], "pass")):
+        checks = {check.what.split(": ")[1]: check.verdict for check in judge(base, summarise("ci", scored(values)))}
+        assert checks[name] == verdict
+    without = {check.what.split(": ")[1]: check for check in judge(base, summarise("ci", run([25.0, 25.2])))}
+    assert (without[name].verdict, without[name].detail) == ("not judged", "n/a: no weights for LPIPS here")
+
+
 def test_a_loss_beyond_margin_and_chance_fails_and_a_small_one_does_not() -> None:
     assert verdicts(run([24.4, 24.5, 24.45]))["novel_view/foreground/psnr"] == "fail"
     assert verdicts(run([24.97, 25.06, 24.93]))["novel_view/foreground/psnr"] == "pass"

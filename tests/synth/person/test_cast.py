@@ -12,7 +12,7 @@ from ash.files import InputError
 from synth import presets
 from synth.person import anny_body, cast, texture
 from synth.person.body import PARTS
-from synth.person.cast import BLOCK, FIRST, MOST, Print, Shape, subject
+from synth.person.cast import BLOCK, FIRST, MOST, VALIDATION, Print, Shape, subject
 from synth.person.dressing import EYES, FOOT, LEG, SLIT, Measures, _past_sleeve, _skirt
 from synth.person.mannequin import mannequin
 from synth.person.prints import PATTERNS, printed
@@ -55,6 +55,14 @@ def test_a_subject_follows_from_its_number_alone_and_is_part_of_the_scene():
 def test_subjects_differ_in_body_head_and_every_garment():
     for part in ("shape", "head", "shirt", "trousers", "skirt"):
         assert len({getattr(person, part) for person in CAST}) == len(CAST), part
+
+
+def test_people_for_validation_have_other_bodies_and_clothes_than_those_of_tables():
+    tables, validation = CAST[:32], [subject(number) for number in range(VALIDATION, VALIDATION + 12)]
+    for part in ("shape", "head", "shirt", "trousers", "skirt"):
+        assert not {getattr(person, part) for person in tables} & {getattr(person, part) for person in validation}, part
+    kinds = {person.loose.skirt.kind for person in validation}
+    assert kinds == {person.loose.skirt.kind for person in CAST}, "all kinds of loose clothes"
 
 
 def test_a_block_covers_the_range_of_every_trait():
