@@ -40,7 +40,7 @@ def installed_fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def tube_run(shared: Shared) -> Path:
-    """What `train` leaves: a bending tube as ash_plus and as ddc_plus, trained for a moment, colours seen from all sides."""
+    """What `train` leaves: a bending tube as ash_plus and as ddc_plus, trained for a moment."""
 
     def make(folder: Path) -> None:
         write_tube_capture(folder / "capture")

@@ -81,18 +81,21 @@ def learned(**changes) -> GraphDeformation:
     return deformation
 
 
-def test_learned_deformation_does_not_see_where_the_root_is_or_heads():
-    """The motion window is normalised: moving and turning the whole motion changes no canonical vertex."""
+def test_learned_deformation_does_not_see_where_the_root_is_and_if_asked_heads():
+    """Moving the whole motion changes no canonical vertex; nor does turning it, where the heading is normalised."""
     motion = tube_motion()
     motion.dofs[:, 3:6] = 0
     motion.dofs[:, 4] = 0.3 * np.arange(6)
-    deformation = learned()
-    before = deformation(Pose(motion, 4))
+    facing, turning = learned(), learned(yaw_normalise=True)
+    before = [deformation(Pose(motion, 4)) for deformation in (facing, turning)]
+    motion.dofs[:, :3] += [3.0, 0, -1.0]
+    torch.testing.assert_close(facing(Pose(motion, 4)), before[0], atol=1e-5, rtol=0)
     turn = Rotation.from_rotvec([0, 1.2, 0])
     head = tube_skeleton().heads[0]
-    motion.dofs[:, :3] = turn.apply(motion.dofs[:, :3] + head) - head + [3.0, 0, -1.0]
+    motion.dofs[:, :3] = turn.apply(motion.dofs[:, :3] + head) - head
     motion.dofs[:, 4] += 1.2
-    torch.testing.assert_close(deformation(Pose(motion, 4)), before, atol=1e-5, rtol=0)
+    torch.testing.assert_close(turning(Pose(motion, 4)), before[1], atol=1e-5, rtol=0)
+    assert not torch.allclose(facing(Pose(motion, 4)), before[0], atol=1e-3)
 
 
 def test_learned_deformation_sees_the_past():

@@ -82,8 +82,8 @@ def test_methods_truth_errors_and_joints_are_chosen(player: PlayServer, viewer: 
     viewer.press("Play or pause")
     other = player.avatars.titles[1]
     viewer.set("Avatar", other)
-    assert other == "DDC"
-    viewer.wait_for(lambda: "**DDC**" in viewer.words, PATIENCE)
+    assert other == "DDC+"
+    viewer.wait_for(lambda: "**DDC+**" in viewer.words, PATIENCE)
     viewer.set("Camera", "cam0")
     viewer.press("Truth beside it")
     viewer.wait_for(lambda: "Against the truth" in viewer.words and "dB, FLIP" in viewer.words, PATIENCE)

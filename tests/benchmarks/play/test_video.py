@@ -64,7 +64,7 @@ def test_a_film_shows_the_truth_and_each_avatar_side_by_side(tube_run: Path, tmp
 
 def test_a_rig_gives_a_row_per_avatar_and_a_spiral_turns(tube_run: Path, tmp_path: Path) -> None:
     rig, spiral = tmp_path / "rig.webp", tmp_path / "spiral.webp"
-    more = ["--methods", "ddc+steps=60+warmup_steps=10", "--motion", "train", "--height", str(SIZE)]
+    more = ["--methods", "ddc_plus+steps=60+warmup_steps=10", "--motion", "train", "--height", str(SIZE)]
     assert film(tube_run, rig, *more, "--camera", "rig", "--frames", "1") == cli.DONE
     with Image.open(rig) as image:
         assert image.size == (SIZE, CAPTION + SIZE), "the one held-out camera"

@@ -94,7 +94,7 @@ def test_the_table_of_a_trained_cell_has_every_stage_and_agrees_with_the_definit
     written = read_json(tmp_path / "rows.json")
     assert set(written) == {"rows", "agreements", "paper_ms"}
     (by,) = {row["candidate"].removesuffix("-naive") for row in written["rows"]}
-    assert by.startswith("ash+") and by.endswith(":ci new"), "the method with its changes, the preset, the motion"
+    assert by.startswith("ash_plus+") and by.endswith(":ci new"), "the method with its changes, the preset, the motion"
     sizes, stages = ("64x64", f"{SIZE}x{SIZE}"), ("stg1", "stg2", "stg3", "stg4", "frame")
     expected = {(what, size, n, by) for size in sizes for what in stages for n in (1, 2)}
     expected |= {("frame", size, 1, f"{by}-naive") for size in sizes}

@@ -41,7 +41,7 @@ def capture(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def run(capture: Path, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run")
-    short = ["--training.steps", "60", "--row", "static"]
+    short = ["--training.steps", "60", "--training.background", "random", "--row", "static"]
     for method, more in (("static", short), ("nearest", [])):
         command = ["train", method, str(capture), "--preset", "ci", "--out", str(folder)]
         assert cli.main([*command, *more]) == arguments.DONE
