@@ -85,7 +85,7 @@ def remarks(tables: RunTables, scene: str) -> list[str]:
     if failed := [method for method in tables.methods(scene) if tables.failed(scene, method)]:
         lines.append(sentence(f"Failed, and scored with the worst value: {titles(failed)}"))
     if not tables.unit(scene):
-        lines.append("One seed: a difference of a few tenths of a dB may be chance; --seeds 3 gives intervals.")
+        lines.append("One value per row: no verdicts. --seeds 3 gives intervals over seeds, --subjects 8 over people.")
     elif tables.captures(scene) == 1:
         lines.append("One capture: intervals are over seeds and hold for this subject; --subjects 8 adds others.")
     return [remark for remark in lines if remark]

@@ -35,7 +35,10 @@ def cost_columns(metrics: Sequence[str]) -> list[Quantity]:
 def build(
     tables: RunTables, scene: str, quantities: Sequence[Quantity], *, title: str, exposed: Collection[str] = ()
 ) -> Table:
-    """The table of a scene without the quantities that no method has. `exposed`: methods that were not isolated."""
+    """The table of a scene without the quantities that no method has. `exposed`: methods that were not isolated.
+
+    Best and second best are marked where rows have several values; of one value each none is known to be better.
+    """
     methods = sorted(tables.methods(scene), key=is_oracle)  # Stable: the order of methods within each half.
     columns = {q: [tables.get(scene, method, q) for method in methods] for q in quantities}
     columns = {q: rows for q, rows in columns.items() if any(row is not None for row in rows)}
@@ -51,7 +54,8 @@ def build(
         means = {
             i: row.value for i, row in enumerate(rows) if row is not None and not lost[i] and not is_oracle(methods[i])
         }
-        marks |= {(i, column): mark for i, mark in _marks(means, measure).items()}
+        if tables.unit(scene):
+            marks |= {(i, column): mark for i, mark in _marks(means, measure).items()}
     frame = pd.DataFrame(texts, index=names)
     return Table(title=title, frame=frame, marks=marks, below=sum(map(is_oracle, methods)))
 
@@ -87,7 +91,7 @@ def text_of(row: Any, measure: Metric) -> str:
 
 
 def plain(table: Table) -> str:
-    """Aligned columns for a terminal, units in a line of their own; the best is starred."""
+    """Aligned columns for a terminal, units in a line of their own; the best is starred where rows have several values."""
     parts = [UNIT.split(title) for _, title in table.heads]  # "PSNR [dB] ↑" -> "PSNR", "dB", " ↑"
     heads = ["", *(part[0] + part[-1] * (len(part) > 1) for part in parts)]
     units = ["", *(part[1] if len(part) > 1 else "" for part in parts)]

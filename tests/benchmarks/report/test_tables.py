@@ -93,7 +93,7 @@ def test_results_csv_has_the_stable_columns_and_all_digits(tmp_path: Path) -> No
     header = "scene,method,seed,split,region,metric,value,unit,direction,protocol,subject,capture"
     assert ",".join(table.columns) == header == ",".join(COLUMNS)
     row = table[(table.method == "ash") & (table.metric == "psnr")].iloc[0]
-    assert (row["value"], row["unit"], row["direction"], str(row["protocol"])) == (1 / 3, "dB", "up", "2")
+    assert (row["value"], row["unit"], row["direction"], str(row["protocol"])) == (1 / 3, "dB", "up", "3")
     assert set(table.metric) <= set(METRICS)
     failed = table[table.method == "ddc"]
     assert failed[failed.metric == "failed"]["value"].item() == 1
