@@ -27,9 +27,9 @@ class Size:
     rig: Rig
     repeats: int  # rounds of the training clips
     frames: int  # per training clip
-    new: dict[str, int]
-    near: dict[str, int]
-    far: dict[str, int]
+    new: dict[str, Any]
+    near: dict[str, Any]
+    far: dict[str, Any]
     stride: int  # of novel views
     samples: int  # per pixel; halves of n n or n (n + 1) samples fill the strata of the sampler
     texture: int

@@ -91,7 +91,7 @@ def text_of(row: Any, measure: Metric) -> str:
 
 
 def plain(table: Table) -> str:
-    """Aligned columns for a terminal, units in a line of their own; the best is starred where rows have several values."""
+    """Aligned columns for a terminal, units in a line of their own; a mark for the best becomes a star."""
     parts = [UNIT.split(title) for _, title in table.heads]  # "PSNR [dB] ↑" -> "PSNR", "dB", " ↑"
     heads = ["", *(part[0] + part[-1] * (len(part) > 1) for part in parts)]
     units = ["", *(part[1] if len(part) > 1 else "" for part in parts)]
