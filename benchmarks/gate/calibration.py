@@ -2,8 +2,8 @@
 
 `python -m benchmarks.gate.calibration --help`; it needs a checkout, because the defects lie in tests/helpers.
 
-Baseline: three seeds of ASH on the suite `ci`. A rerun of unchanged code is three other seeds. A defect is three
-seeds of a method of `planted_defects.py` under ASH's name.
+Baseline: three seeds of `ash_plus` on the suite `ci`. A rerun of unchanged code is three other seeds. A defect is three
+seeds of a method of `planted_defects.py` under its name.
 """
 
 import argparse
@@ -26,9 +26,9 @@ from benchmarks.suites.progress import Progress
 from benchmarks.suites.runs import RunOptions
 
 SEEDS = 3
-SOUND = "ash"
+SOUND = "ash_plus"
 DEFECTS = "helpers.planted_defects"  # below tests/
-SOUND_FOR = {"sh_frame": f"{DEFECTS}:sound_sh"}  # the sound method of a defect, where it is not ASH
+SOUND_FOR = {"sh_frame": f"{DEFECTS}:sound_sh"}  # the sound method of a defect, where it is not `ash_plus`
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -20,7 +20,7 @@ import ash.textures
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Camera, Capture
 from ash.config import AshConfig
-from ash.presets import named
+from ash.presets import plus
 from ash.rotations import RigidTransforms
 from ash.template.skinning import SkinWeights
 
@@ -32,7 +32,7 @@ _held: list[torch.Tensor] = []
 
 def _ash(capture: Capture, seed: int, preset: str, *, model: Any = None, training: Any = None) -> AshAvatar:
     """ASH with some fields of its configuration replaced."""
-    config = named(preset)
+    config = plus(preset)
     return AshAvatar.from_capture(
         AshConfig(
             model=replace(config.model, **(model or {})),
@@ -74,12 +74,12 @@ def ssim_dropped(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
 
 def half_offset(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
     """Offsets are scaled by one half on the way to the posed Gaussian."""
-    return _ash(capture, seed, preset, model={"offset_unit_m": 0.5 * named(preset).model.offset_unit_m})
+    return _ash(capture, seed, preset, model={"offset_unit_m": 0.5 * plus(preset).model.offset_unit_m})
 
 
 def triple_learning_rate(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
     """Both learning rates are three times as large."""
-    training = named(preset).training
+    training = plus(preset).training
     rates = {name: 3 * getattr(training, name) for name in ("learning_rate", "base_learning_rate")}
     return _ash(capture, seed, preset, training=rates)
 
@@ -91,7 +91,7 @@ def warm_up_dropped(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
 
 def half_the_steps(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
     """Training ends after half its steps."""
-    return _ash(capture, seed, preset, training={"steps": named(preset).training.steps // 2})
+    return _ash(capture, seed, preset, training={"steps": plus(preset).training.steps // 2})
 
 
 def _turned(camera: Camera, pixels: float) -> Camera:
@@ -115,7 +115,7 @@ class _Miscalibrated(AshAvatar):
 
 def one_camera_off(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
     """The extrinsics of one training camera are off by about 2 pixels."""
-    return _Miscalibrated.from_capture(replace(named(preset), seed=seed), capture)
+    return _Miscalibrated.from_capture(replace(plus(preset), seed=seed), capture)
 
 
 def normals_flipped(capture: Capture, *, seed: int, preset: str) -> AshAvatar:

@@ -41,7 +41,7 @@ def trained_image(
     factory: Callable[..., Avatar], capture: Capture, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> np.ndarray:
     """What a method draws after a few steps of training on a tiny model."""
-    monkeypatch.setattr(planted_defects, "named", lambda _: tiny_plus(steps=6, warmup_steps=2))
+    monkeypatch.setattr(planted_defects, "plus", lambda _: tiny_plus(steps=6, warmup_steps=2))
     avatar = factory(capture.training_only(), seed=0, preset="ci")
     avatar.fit(capture.training_only(), folder=folder)
     camera = next(iter(capture.cameras.values()))
