@@ -171,8 +171,8 @@ def test_surface_distance_of_points_off_a_grid() -> None:
     assert metrics.surface_distance_mm(beside, vertices, np.array(faces)) == pytest.approx(50, abs=1e-9)
 
 
-def test_protocol_2_is_locked(pair) -> None:
-    """Scores of fixed images, as protocol 2 gave them when it was set. Other numbers need another protocol version."""
+def test_protocol_3_is_locked(pair) -> None:
+    """Scores of fixed images, as protocol 3 gave them when it was set. Other numbers need another protocol version."""
     assert metrics.PROTOCOL == "3"
     assert metrics.score_view(*pair) == pytest.approx(LOCKED, abs=2e-5)
 
