@@ -42,7 +42,7 @@ def _size(name: str) -> Size:
         some = {"frames": 4, "history": 1, "stride": 2}
         clips: dict[str, Any] = {"frames": 4, "new": {"frames": 3}, "near": some, "far": some}
         return Size(rig=rig, repeats=1, **clips, stride=3, samples=16, texture=512)
-    # New motion is seen twice per clip, 4.7 s apart, which is no multiple of a beat; near motion in pairs of frames, for flicker.
+    # New motion is seen twice per clip, 4.7 s apart, which is no multiple of a beat; near motion in pairs of frames.
     twice = {"frames": 4, "history": 3, "runs": 2}
     if name == "factor":  # Novel views lie between cameras, and pixels show what a factor adds.
         rig = Rig(cameras=20, held_out=4, cameras_per_frame=8, width=192, height=192)
