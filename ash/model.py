@@ -73,19 +73,17 @@ class AshModel(MovingModule):
             posed = self.template.pose_uncached(pose) if learns else self.template.pose(pose)
         with stage(clock, "stg2", device):
             canonical, normals, transforms = sample_surface(self.lattice, posed, self.config.anchor, threads=threads)
-            textures = self._textures(pose)
+            textures, config = self._textures(pose), self.config
+            motion = normalised_motion(pose, window=config.window, yaw_normalise=config.yaw_normalise)
             return FrameInputs(
                 textures=textures,
                 decoder_weight=1.0 if self.textures is None else self.textures.decoder_weight(textures),
-                motion=self._motion_window(pose).to(device),
+                motion=motion.to(device),
                 root_translation=torch.from_numpy(pose.dofs[:3]).float().to(device),
                 canonical=canonical,
                 normals=normals,
                 transforms=transforms,
             )
-
-    def _motion_window(self, pose: Pose) -> Float[Tensor, "k d"]:
-        return normalised_motion(pose, window=self.config.window, yaw_normalise=self.config.yaw_normalise)
 
     def _textures(self, pose: Pose) -> Float[Tensor, "c r r"]:
         return self.base_texels.new_zeros(0, 1, 1) if self.textures is None else self.textures(self.template, pose)

@@ -37,6 +37,9 @@ from ash.training.batches import over
 from ash.training.images import TrainingImages
 from baselines.display import MeshDisplay, texture_gain
 
+# Texture pixels per texel of ASH's lattice, per side: the mesh must not be starved. At 256x256 a body's pixel is 9 mm
+# wide; 512 texture pixels are 3 mm apart, and more shows nothing.
+TEXTURE_FACTOR = 4
 GREY = 0.5  # Of a texture that starts from nothing.
 
 
@@ -69,16 +72,14 @@ class DdcConfig:
         return self.texture // self.model.decoded_texels
 
 
-def ddc_config(ash: AshConfig, *, seed: int, template: TemplateConfig, texture_factor: int = 4) -> DdcConfig:
+def ddc_config(ash: AshConfig, *, seed: int, template: TemplateConfig) -> DdcConfig:
     """DDC with the budget and the conditions of an ASH configuration.
 
     Where ASH learns static texels, it learns a static texture; it has no Gaussians that could be fitted to frames.
-    `texture_factor`: texture pixels per texel of ASH's lattice, per side: the mesh must not be starved. At 256x256 a
-    body's pixel is 9 mm wide; 512 texture pixels are 3 mm apart, and more shows nothing.
     """
     static = ash.training.warmup == "static"
     return DdcConfig(
-        texture=texture_factor * ash.model.texels,
+        texture=TEXTURE_FACTOR * ash.model.texels,
         model=AtlasConfig(**{field.name: getattr(ash.model, field.name) for field in fields(AtlasConfig)}),
         training=ash.training if static else replace(ash.training, warmup="none", warmup_steps=0),
         template=template,

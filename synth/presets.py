@@ -42,18 +42,13 @@ def _size(name: str) -> Size:
         some = {"frames": 4, "history": 1, "stride": 2}
         clips: dict[str, Any] = {"frames": 4, "new": {"frames": 3}, "near": some, "far": some}
         return Size(rig=rig, repeats=1, **clips, stride=3, samples=16, texture=512)
-    # New motion is seen twice per clip, 4.7 s apart, which is no multiple of a beat; near motion in pairs of frames.
-    twice = {"frames": 4, "history": 3, "runs": 2}
     if name == "factor":  # Novel views lie between cameras, and pixels show what a factor adds.
         rig = Rig(cameras=20, held_out=4, cameras_per_frame=8, width=192, height=192)
-        clips = {"frames": 10, "new": twice | {"span": 60}, "near": _pair(10), "far": _middle(10)}
-        return Size(rig=rig, repeats=2, **clips, stride=10, samples=50, texture=1024)
+        return Size(rig=rig, repeats=2, **_few(10), stride=10, samples=50, texture=1024)
     if name == "quick":  # 104 training frames, and fewer than 550 images.
-        clips = {"frames": 13, "new": twice | {"span": 60}, "near": _pair(13), "far": _middle(13)}
-        return Size(rig=ROTATING, repeats=2, **clips, stride=13, samples=60, texture=2048)
+        return Size(rig=ROTATING, repeats=2, **_few(13), stride=13, samples=60, texture=2048)
     if name == "long":  # `quick` with three times the training motion.
-        clips = {"frames": 10, "new": twice | {"span": 60}, "near": _pair(10), "far": _middle(10)}
-        return Size(rig=ROTATING, repeats=8, **clips, stride=30, samples=60, texture=2048)
+        return Size(rig=ROTATING, repeats=8, **_few(10), stride=30, samples=60, texture=2048)
     if name == "table":
         rig = Rig(cameras=34, held_out=4, cameras_per_frame=10, width=512, height=512)
         clips = {
@@ -76,14 +71,18 @@ def _size(name: str) -> Size:
     raise InputError(f"unknown size {name!r}, expected one of {', '.join(SIZES)}")
 
 
-def _pair(span: int) -> dict[str, int]:
-    """Two frames that follow each other, in the middle of a motion of so many frames."""
-    return {"frames": 5, "history": 3, "span": span}
+def _few(frames: int) -> dict[str, Any]:
+    """Training clips of so many frames, and few images of held-out ones.
 
-
-def _middle(span: int) -> dict[str, int]:
-    """Two frames in the middle of a motion of so many frames, where it is most itself."""
-    return {"frames": 6, "history": 2, "stride": 2, "span": span}
+    New motion twice per clip, 4.7 s apart, which is no multiple of a beat; near motion in two frames that follow each
+    other, far motion in two others, both from the middle of a motion as long as a training clip.
+    """
+    return {
+        "frames": frames,
+        "new": {"frames": 4, "history": 3, "runs": 2, "span": 60},
+        "near": {"frames": 5, "history": 3, "span": frames},
+        "far": {"frames": 6, "history": 2, "stride": 2, "span": frames},
+    }
 
 
 def _base(name: str, size: str, seed: int, *, body: str, outfit: Outfit) -> Scene:

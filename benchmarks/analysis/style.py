@@ -29,6 +29,18 @@ class SplitName:
     words: str
 
 
+ADDED = (  # by `ash_plus`: name, title, colour
+    ("base", "static texels", "#5b8c2a"),
+    ("light", "light", "#b8860b"),
+    ("standardise", "standardised textures", "#c2415c"),
+    ("heading", "heading normalised", "#8d6e63"),
+    ("anchor", "texels on triangles", "#a0522d"),
+    ("background", "random background", "#2a9d8f"),
+    ("loss", "more L1 in the loss", "#9b59b6"),
+    ("dilation", "less dilation", "#008fb3"),
+    ("matt", "SH 0", "#7a869a"),
+    ("coarse", "one coarse U-Net", "#dd6b20"),
+)
 STYLES = {
     "ash": MethodStyle(title="ASH", colour="#2f6fde"),
     "ash_plus": MethodStyle(title="ASH+", colour="#12b5cb"),
@@ -55,6 +67,7 @@ STYLES = {
     "window_1": MethodStyle(title="window 1", colour="#008fb3"),
     "unlearned": MethodStyle(title="skinned template", colour="#b8860b"),
     "wo_phi": MethodStyle(title="w/o Phi", colour="#c2415c"),
+    "plus_window_1": MethodStyle(title="ASH+, window 1", colour="#7a869a", reference="ash_plus"),
     "wo_phi_and_light": MethodStyle(title="ASH+ w/o Phi and light", colour="#5b8c2a", reference="ash_plus"),
     "sh_0": MethodStyle(title="SH 0", colour="#008fb3"),
     "sh_1": MethodStyle(title="SH 1", colour="#a0522d"),
@@ -75,25 +88,8 @@ STYLES = {
     "noisy_textures": MethodStyle(title="ASH+, noise on textures", colour="#7a869a", reference="ash_plus"),
     "last_weights": MethodStyle(title="no weight averaging", colour="#a0522d"),
     # Suite `plus`: one addition to `ash`, and all up to one.
-    "plus_base": MethodStyle(title="+ static texels", colour="#5b8c2a"),
-    "plus_light": MethodStyle(title="+ light", colour="#b8860b"),
-    "plus_standardise": MethodStyle(title="+ standardised textures", colour="#c2415c"),
-    "plus_heading": MethodStyle(title="+ heading normalised", colour="#8d6e63"),
-    "plus_anchor": MethodStyle(title="+ texels on triangles", colour="#a0522d"),
-    "plus_background": MethodStyle(title="+ random background", colour="#2a9d8f"),
-    "plus_loss": MethodStyle(title="+ more L1 in the loss", colour="#9b59b6"),
-    "plus_dilation": MethodStyle(title="+ less dilation", colour="#008fb3"),
-    "plus_matt": MethodStyle(title="+ SH 0", colour="#7a869a"),
-    "plus_coarse": MethodStyle(title="+ one coarse U-Net", colour="#dd6b20"),
-    "to_light": MethodStyle(title="up to light", colour="#b8860b"),
-    "to_standardise": MethodStyle(title="up to standardised textures", colour="#c2415c"),
-    "to_heading": MethodStyle(title="up to heading normalised", colour="#8d6e63"),
-    "to_anchor": MethodStyle(title="up to texels on triangles", colour="#a0522d"),
-    "to_background": MethodStyle(title="up to random background", colour="#2a9d8f"),
-    "to_loss": MethodStyle(title="up to more L1 in the loss", colour="#9b59b6"),
-    "to_dilation": MethodStyle(title="up to less dilation", colour="#008fb3"),
-    "to_matt": MethodStyle(title="up to SH 0", colour="#7a869a"),
-    "to_coarse": MethodStyle(title="up to one coarse U-Net", colour="#dd6b20"),
+    **{f"plus_{name}": MethodStyle(title=f"+ {title}", colour=colour) for name, title, colour in ADDED},
+    **{f"to_{name}": MethodStyle(title=f"up to {title}", colour=colour) for name, title, colour in ADDED},
     # Rows that differ in what the template is learned from.
     "by_scans": MethodStyle(title="template from scans", colour="#2a9d8f"),
     "ddc_by_scans": MethodStyle(title="DDC, template from scans", colour="#b8860b"),

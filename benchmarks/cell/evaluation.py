@@ -282,27 +282,33 @@ def _training_summary(training: TrainingOutcome | None, curve: tuple[CurvePoint,
 
 
 def _flicker_summary(cell: Cell, capture: Capture, scored: list[ViewScore]) -> tuple[Summary, ...]:
-    """Flicker on held-out motion, of splits in which scored frames of one sequence follow each other."""
+    """Flicker on held-out motion: per split, the mean over pairs of scored frames that follow each other."""
     rows = []
     for split in POSE_FRAMES:
-        shown = {(view.camera, view.frame) for view in scored if view.split == split}
-        sequence = capture.motion.sequence
-        pairs = [
-            (camera, frame)
-            for camera, frame in sorted(shown)
-            if (camera, frame + 1) in shown and sequence[frame] == sequence[frame + 1]
-        ]
-        values = [_flicker(cell, capture, split, camera, frame) for camera, frame in pairs]
+        runs = _runs(capture, sorted((view.camera, view.frame) for view in scored if view.split == split))
+        values = [_flicker(cell, capture, split, run) for run in runs if len(run) > 1]
         if values:
-            rows.append(Summary(split=split, region="foreground", metric="flicker", value=float(np.mean(values))))
+            mean = np.average(values, weights=[len(run) - 1 for run in runs if len(run) > 1])
+            rows.append(Summary(split=split, region="foreground", metric="flicker", value=float(mean)))
     return tuple(rows)
 
 
-def _flicker(cell: Cell, capture: Capture, split: str, camera: str, frame: int) -> float:
-    """`metrics.flicker` from a frame to the next."""
-    frames = (frame, frame + 1)
-    predicted = [stored_prediction(cell, capture, View(split=split, camera=camera, frame=f)) for f in frames]
-    return metrics.flicker(predicted, [metrics.on_black(capture.image(camera, f)) for f in frames])
+def _runs(capture: Capture, views: list[tuple[str, int]]) -> list[list[tuple[str, int]]]:
+    """Views of one camera whose frames follow each other in one sequence; `views`: camera and frame, sorted."""
+    runs: list[list[tuple[str, int]]] = []
+    for camera, frame in views:
+        sequence = capture.motion.sequence
+        if runs and runs[-1][-1] == (camera, frame - 1) and sequence[frame] == sequence[frame - 1]:
+            runs[-1].append((camera, frame))
+        else:
+            runs.append([(camera, frame)])
+    return runs
+
+
+def _flicker(cell: Cell, capture: Capture, split: str, run: list[tuple[str, int]]) -> float:
+    """`metrics.flicker` over a run of views."""
+    predicted = [stored_prediction(cell, capture, View(split=split, camera=c, frame=f)) for c, f in run]
+    return metrics.flicker(predicted, [metrics.on_black(capture.image(camera, frame)) for camera, frame in run])
 
 
 def _pose_geometry(client: MethodClient, described: MethodInfo, views: tuple[View, ...]) -> PosedFrames | None:

@@ -29,10 +29,8 @@ def avatar(capture, *, steps: int = 120) -> DdcAvatar:
     ash = plus("ci")
     small = replace(ash.model, texels=16, width=4, levels=2, window=2)
     training = replace(ash.training, steps=steps, warmup_steps=steps // 2)
-    return DdcAvatar.from_capture(
-        ddc_config(replace(ash, model=small, training=training), seed=0, template=TemplateConfig(), texture_factor=2),
-        capture,
-    )
+    config = ddc_config(replace(ash, model=small, training=training), seed=0, template=TemplateConfig())
+    return DdcAvatar.from_capture(replace(config, texture=32), capture)
 
 
 def test_samples_hit_texture_pixels_where_the_atlas_says():
