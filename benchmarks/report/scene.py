@@ -31,8 +31,8 @@ SHEETS = {"pictures": "Truth, methods and errors", "pictures_people": "All subje
 COLOURS = ("blue", "orange", "red", "ochre", "grey")  # of the regions
 SMOKE_TESTS = ("ci",)  # sizes and presets
 QUALITY_NOTE = (
-    "Quality on the foreground, LPIPS on the whole frame. Best and second best are marked among "
-    "the methods that see only training views."
+    "Quality on the foreground, LPIPS on the whole frame. Where rows have several values, best and second best are "
+    "marked among the methods that see only training views."
 )
 APART_NOTE = "Those below the line were given the exact surface, and are not ranked."
 VALUES_NOTE = (
@@ -45,9 +45,10 @@ COST_NOTE = (
     "time measured from outside. Memory: the peak of the cell's process, Python and libraries included."
 )
 DIFFERENCES_NOTE = (
-    "Foreground PSNR. p: Holm's correction over all rows of the table. Verdict on ASH: better or worse if p is below "
-    f"5 % and the difference above {METRICS['psnr'].abs_tol:g} dB; equivalent if the interval lies within that margin; "
-    "unclear otherwise. Detectable: the smallest true difference that this design finds with 80 % power."
+    "Foreground PSNR. p: Holm's correction over all rows of the table. Verdict on the method in the corner: better or "
+    f"worse if p is below 5 % and the difference above {METRICS['psnr'].abs_tol:g} dB; equivalent if the interval lies "
+    "within that margin; unclear otherwise. Detectable: the smallest true difference that this design finds with 80 % "
+    "power."
 )
 DETECTABLE_NOTE = (
     "The smallest true difference that so many captures (subjects in this outfit) show with 80 % power, from the "
