@@ -46,7 +46,7 @@ def rotate_sh(quats: Float[Tensor, "n 4"], sh: Float[Tensor, "n k 3"]) -> Float[
     """
     turned, matrices = [sh[:, :1]], unitquat_to_rotmat(quats)
     for degree in range(1, _degree_of(sh.shape[1]) + 1):
-        directions, fit = _sampling(degree)
+        directions, fit = sampling(degree)
         directions, fit = directions.to(sh), fit.to(sh)
         count = 2 * degree + 1
         basis = sh_basis(directions @ matrices, degree)[..., -count:]  # d R = R^-1 d
@@ -59,7 +59,7 @@ def _degree_of(count: int) -> int:
 
 
 @cache
-def _sampling(degree: int) -> tuple[Tensor, Tensor]:
+def sampling(degree: int) -> tuple[Tensor, Tensor]:
     """Directions on a Fibonacci sphere, and the matrix from values there to the coefficients of one degree."""
     count = 2 * (2 * degree + 1)
     index = torch.arange(count, dtype=torch.float64, device="cpu") + 0.5

@@ -107,7 +107,8 @@ def pose(
     contiguous = tuple(tensor.contiguous() for tensor in constants)
     means, quats, scales, opacities, sh = ash.native.texels.pose(raw.contiguous(), light, contiguous, options)
     if canonical_frame and sh.shape[1] > 1:
-        sh = rotate_sh(transforms.quats, sh)  # Lit first: a gain turns nothing, and the constant is the same turned.
+        # Lit first: a gain turns nothing, and the constant is the same turned.
+        sh = ash.native.texels.turn_sh(contiguous[2], sh, threads=threads)
     return Gaussians(means=means, quats=quats, scales=scales, opacities=opacities, sh=sh)
 
 

@@ -117,6 +117,13 @@ struct AdamArgs {
     float inverse_root;  // 1 / sqrt(1 - beta2^t)
 };
 
+struct TurnArgs {
+    const float *quats, *sh;          // [n, 4], [n, coefficients, 3]
+    const float *directions, *fits;   // of degree 1, 2, ...: [4 l + 2, 3] fixed directions, [2 l + 1, 4 l + 2] from values to coefficients
+    int coefficients, inverse;        // inverse: turned back
+    float* turned;                    // [n, coefficients, 3]
+};
+
 struct ShadeArgs {
     const float *texture, *light, *weights;  // [3, height, width], [9, 3] or null, [n, 3]
     const float *uvs, *normals;              // [u, 2], [v, 3]
@@ -191,6 +198,7 @@ struct Kernels {
     void (*place_texels)(const PlaceArgs&, int64_t first, int64_t last);
     void (*pose)(const PoseArgs&, int64_t first, int64_t last);
     void (*pose_backward)(const PoseArgs&, int64_t first, int64_t last, double* grad_light);  // adds to [9, 3]
+    void (*turn_sh)(const TurnArgs&, int64_t first, int64_t last);
     bool (*adam)(const AdamArgs&, int64_t first, int64_t last);  // false: a gradient is NaN or infinite
     void (*shade)(const ShadeArgs&, int64_t first, int64_t last);
     void (*shade_backward)(const ShadeArgs&, int64_t first, int64_t last, double* grad_light);  // adds to [9, 3]

@@ -52,6 +52,7 @@ _SIGNATURES: dict[str, tuple[type | None, list[type]]] = {
     "ash_place_texels": (None, [_P, _P, _P, c_int64, c_int, *[_P] * 4]),
     "ash_pose": (None, [*[_P] * 6, c_int64, c_int, c_float, c_int, c_int, *[_P] * 5]),
     "ash_pose_backward": (c_int, [*[_P] * 4, c_int64, c_int, c_float, c_int, c_int, *[_P] * 6, POINTER(c_double)]),
+    "ash_turn_sh": (None, [*[_P] * 4, c_int64, c_int, c_int, c_int, _P]),
     "ash_rasterize": (c_int, [_P, _P, c_int64, c_int, c_int, c_double, c_int, _P, _P, _P]),
 }
 

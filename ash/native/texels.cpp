@@ -30,6 +30,12 @@ void ash_pose(const float* raw, const float* canonical, const float* normals, co
     in_ranges(threads, count, RANGE, [&](int64_t, int64_t first, int64_t last) { kernels().pose(args, first, last); });
 }
 
+void ash_turn_sh(const float* quats, const float* sh, const float* directions, const float* fits, int64_t count, int coefficients,
+                 int inverse, int threads, float* turned) {
+    const TurnArgs args{quats, sh, directions, fits, coefficients, inverse, turned};
+    in_ranges(threads, count, RANGE, [&](int64_t, int64_t first, int64_t last) { kernels().turn_sh(args, first, last); });
+}
+
 // grad_light: [9, 3], written; null without light. Returns 0, or 1 if memory is short.
 int ash_pose_backward(const float* raw, const float* normals, const float* turns, const float* light, int64_t count, int coefficients,
                       float offset_unit, int canonical_frame, int threads, const float* grad_means, const float* grad_quats,
