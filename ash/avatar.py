@@ -70,11 +70,6 @@ class AshAvatar(TrainedAvatar):
         """Raw parameters per texel, `[n, o]`."""
         return self.module.base_texels
 
-    @property
-    def fallback(self) -> nn.Parameter | None:
-        """The same of a static avatar."""
-        return self.module.fallback_texels if isinstance(self.module, AshPlusModel) else None
-
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Networks, and what is learned directly: static texels, light, a displacement of the template."""
         training, module = self.config.training, self.module
@@ -97,10 +92,6 @@ class AshAvatar(TrainedAvatar):
             return drawn.rgb if flat else over(drawn.rgb, drawn.alpha, background)
         except InputError as error:  # Cameras and background come from the capture: the Gaussians are at fault.
             raise FloatingPointError(f"Gaussians that cannot be drawn ({error})") from error
-
-    def _draw_fallback(self, inputs: FrameInputs, cameras: list[Camera], background: Tensor) -> Tensor:
-        assert self.fallback is not None
-        return self._draw(self.fallback, inputs, cameras, background, 0)
 
     def _inputs_of(self, frame: int) -> FrameInputs:
         if self.module.refinement is None:
@@ -174,14 +165,9 @@ class AshAvatar(TrainedAvatar):
         return self.gaussians(pose).means.cpu().numpy()
 
     @torch.no_grad()
-    def gaussians(self, pose: Pose) -> Gaussians:
-        """The posed Gaussians: world, metres, on its device; of a blend, the component with the largest weight."""
-        return max(self.pose_components(pose), key=lambda component: component[0])[1]
-
-    @torch.no_grad()
-    def pose_components(self, pose: Pose, *, clock: StageClock | None = None) -> list[tuple[float, Gaussians]]:
-        """All sets of posed Gaussians whose renders are blended, and their weights (`ash.model.blend_renders`)."""
-        return self.module.pose_components(pose, clock)
+    def gaussians(self, pose: Pose, *, clock: StageClock | None = None) -> Gaussians:
+        """The posed Gaussians: world, metres, on its device."""
+        return self.module.posed_gaussians(pose, clock)
 
     @property
     def dilation(self) -> float:

@@ -11,10 +11,7 @@ from ash.files import InputError
 
 OLD_NAMES = {  # in checkpoints of version 0.2
     "base": "base_texels",
-    "static": "fallback_texels",
     "texture": "base_texture",
-    "static_texture": "fallback_texture",
-    "textures.seen": "textures.training_poses",
 }
 
 

@@ -33,8 +33,6 @@ class AtlasConfig:
     norm: str = "none"  # of the U-Nets: "batch-as-released" (always on the statistics of its batch of 1), or "instance"
     shuffle: int = 1  # decode at 1/shuffle of the lattice's resolution and shuffle pixels up; not in the paper
     standardise: bool = False  # decoders see deviations from the mean training texture, in its units; not in the paper
-    # novelty of a pose, in spreads, at which half of its picture is a static avatar's; 0: never; not in the paper
-    novelty_scale: float = 0.0
     light: bool = False  # colour times exp(SH2 of the posed normal), 27 numbers; not in the paper
     base: bool = False  # learned static texels with the decoders as residual; not in the paper
     global_features: bool = True  # Phi, from the root translation, at the bottleneck of the U-Net that makes colours
@@ -54,12 +52,6 @@ class AtlasConfig:
             raise InputError(f"texels: expected a multiple of {unit}, got {self.texels}")
         if min(self.window, self.width) < 1:
             raise InputError(f"window and width: expected at least 1, got {self.window} and {self.width}")
-        if not 0 <= self.novelty_scale < math.inf:
-            raise InputError(f"novelty_scale: expected a finite novelty of at least 0, got {self.novelty_scale}")
-        if self.novelty_scale and not (self.standardise and self.decoded_texels % 4 == 0):
-            raise InputError("novelty_scale compares standardised textures: it needs standardise=True and 4 texels")
-        if self.novelty_scale and not self.base:
-            raise InputError("novelty_scale mixes in a static avatar: it needs base=True")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

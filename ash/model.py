@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -53,7 +52,6 @@ class AshModel(MovingModule):
                 window=config.window,
                 yaw_normalise=config.yaw_normalise,
                 standardise=config.standardise,
-                novelty_scale=config.novelty_scale,
             )
         self.decoders = decoders
         self._add_texels(initial)
@@ -73,11 +71,10 @@ class AshModel(MovingModule):
             posed = self.template.pose_uncached(pose) if learns else self.template.pose(pose)
         with stage(clock, "stg2", device):
             canonical, normals, transforms = sample_surface(self.lattice, posed, self.config.anchor, threads=threads)
-            textures, config = self._textures(pose), self.config
+            config = self.config
             motion = normalised_motion(pose, window=config.window, yaw_normalise=config.yaw_normalise)
             return FrameInputs(
-                textures=textures,
-                decoder_weight=1.0 if self.textures is None else self.textures.decoder_weight(textures),
+                textures=self._textures(pose),
                 motion=motion.to(device),
                 root_translation=torch.from_numpy(pose.dofs[:3]).float().to(device),
                 canonical=canonical,
@@ -114,47 +111,22 @@ class AshModel(MovingModule):
 
     def forward(self, pose: Pose, camera: Camera, clock: StageClock | None = None) -> Splatted:
         """Motion and camera to image: the whole of ASH, over black, on as many threads as torch is given."""
-        components = self.pose_components(pose, clock)
+        gaussians = self.posed_gaussians(pose, clock)
         with stage(clock, "stg4", self.base_texels.device):
-            threads = torch.get_num_threads()
-            return blend_renders(
-                [(weight, self.rasterize(gaussians, [camera], None, threads)) for weight, gaussians in components]
-            )
+            return self.rasterize(gaussians, [camera], None, torch.get_num_threads())
 
-    def pose_components(self, pose: Pose, clock: StageClock | None = None) -> list[tuple[float, Gaussians]]:
-        """Motion to posed Gaussians: all that does not depend on the camera; one set per component of the picture."""
+    def posed_gaussians(self, pose: Pose, clock: StageClock | None = None) -> Gaussians:
+        """Motion to posed Gaussians: all that does not depend on the camera."""
         threads = torch.get_num_threads()
         inputs = self.frame_inputs(pose, clock, threads)  # Stg. 1 and 2
         with stage(clock, "stg3", self.base_texels.device):
-            components = self.components(self.decode([inputs])[0], inputs)
+            (raw,) = self.decode([inputs])
         with stage(clock, "stg4", self.base_texels.device):
-            return [(weight, self.gaussians(raw, inputs, threads)) for weight, raw in components]
-
-    def components(
-        self, decoded: Float[Tensor, "n o"], inputs: FrameInputs
-    ) -> list[tuple[float, Float[Tensor, "n o"]]]:
-        """Raw parameters whose renders make the picture, and their weights: here the decoded ones alone."""
-        return [(1.0, decoded)]
+            return self.gaussians(raw, inputs, threads)
 
     def direct_parameters(self) -> list[nn.Parameter]:
         """What is learned directly, not through a network."""
         return [self.base_texels] if self.base_texels.requires_grad else []
-
-
-def blend_renders(drawn: Sequence[tuple[float, Splatted]]) -> Splatted:
-    """The weighted mean of renders; weights sum to 1.
-
-    Renders are blended, not parameters: two avatars that learned apart err apart, so that their mean is nearer to the
-    truth than either, while Gaussians halfway between theirs are worse than both (docs/tuning.md).
-    """
-    if len(drawn) == 1:
-        return drawn[0][1]
-    shares, pictures = zip(*drawn, strict=True)
-
-    def mean(name: str) -> Tensor:
-        return torch.stack([s * getattr(picture, name) for s, picture in zip(shares, pictures, strict=True)]).sum(0)
-
-    return replace(pictures[0], rgb=mean("rgb"), alpha=mean("alpha"), depth=mean("depth"))
 
 
 def image_of(drawn: Splatted) -> np.ndarray:

@@ -78,7 +78,7 @@ def ci() -> AshConfig:
         base.training,
         steps=250,
         views_per_step=2,
-        warmup_steps=300,
+        warmup_steps=150,
         fitted_steps=60,
         learning_rate=2e-3,
         schedule="open",
@@ -96,7 +96,7 @@ def cpu() -> AshConfig:
     """
     base = ci()
     training = replace(
-        base.training, steps=4000, warmup_steps=1000, fitted_steps=200, learning_rate=1e-3, base_learning_rate=2e-2
+        base.training, steps=4000, warmup_steps=500, fitted_steps=200, learning_rate=1e-3, base_learning_rate=2e-2
     )
     return replace(
         base,
@@ -121,7 +121,7 @@ def budget() -> AshConfig:
 def brief() -> AshConfig:
     """`cpu` for 400 steps, far from its plateau: tables with three seeds within an hour on two cores."""
     base = cpu()
-    return replace(base, training=replace(base.training, steps=400, warmup_steps=400))
+    return replace(base, training=replace(base.training, steps=400, warmup_steps=200))
 
 
 PRESETS = {
@@ -151,13 +151,13 @@ def named(name: str) -> AshConfig:
     return PRESETS[name]()
 
 
-# What `ash_plus` adds to `ash`. Each works alone but `blend`, which needs `base` and `standardise`.
+# What `ash_plus` adds to `ash`. Each works alone.
 ADDITIONS: dict[str, Mapping[str, Any]] = {
     # Static texels are learned first, then the decoders as their residual.
     "base": {
         "model.base": True,
         "training.warmup": "static",
-        "training.warmup_steps": lambda config: config.training.warmup_steps // 5,
+        "training.warmup_steps": lambda config: 2 * config.training.warmup_steps // 5,
     },
     "light": {"model.light": True},
     "standardise": {"model.standardise": True},
@@ -169,7 +169,6 @@ ADDITIONS: dict[str, Mapping[str, Any]] = {
     # Less: colours that are the same from everywhere; one U-Net that decodes at half the resolution.
     "matt": {"model.sh_degree": 0},
     "coarse": {"model.shared_trunk": True, "model.shuffle": 2},
-    "blend": {"model.novelty_scale": 0.7},
 }
 
 

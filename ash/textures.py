@@ -23,9 +23,7 @@ from ash.template.skinning import blend_transforms
 from ash.template.template import Template
 
 NOISE_GRID = 4
-POOL = 4  # Texels per side that are one when frames are compared: poses differ over limbs, not over texels.
 BOUND = 3.0  # Spreads at which standardised textures are cut off: what lies farther out was hardly ever learned from.
-COMPARED_FRAMES = 512  # Training frames, evenly taken, that a new frame is compared with.
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -83,7 +81,6 @@ class DecoderInputs:
     """What U-Nets see of one frame; nothing in it is learned with the avatar."""
 
     textures: Float[Tensor, "c r r"]  # motion-aware textures
-    decoder_weight: float  # in 0..1: the share of the frame's picture that is decoded
     root_translation: Float[Tensor, " 3"]  # metres
 
 
@@ -168,8 +165,7 @@ class TextureDrawer(MovingModule):
     """Stg.2 as a network sees it: the motion-aware textures of a frame, standardised if asked.
 
     What is standardised is a deviation from the mean training texture, in units of its channel's spread, cut
-    off at `BOUND` of them (not in the paper). Mean, spread and the frames that others are compared with are part of a
-    checkpoint.
+    off at `BOUND` of them (not in the paper). Mean and spread are part of a checkpoint.
     """
 
     def __init__(
@@ -179,28 +175,19 @@ class TextureDrawer(MovingModule):
         window: int,
         yaw_normalise: bool,
         standardise: bool,
-        novelty_scale: float = 0.0,
     ) -> None:
-        """`novelty_scale`: see `decoder_weight`; 0: the decoders' weight is always 1."""
         super().__init__()
         self.lattice, self.window, self.yaw_normalise, self.standardise = lattice, window, yaw_normalise, standardise
-        self.novelty_scale = novelty_scale
         self.mean: Tensor
         self.spread: Tensor
-        self.training_poses: Tensor  # [t, d]: the newest frame's textures of training frames, coarse
         if standardise:
             self.register_buffer("mean", torch.zeros(6 * window, lattice.resolution, lattice.resolution))
             self.register_buffer("spread", torch.ones(6 * window, 1, 1))
-        if novelty_scale:
-            self.register_buffer("training_poses", torch.zeros(0, 6 * (lattice.resolution // POOL) ** 2))
 
     def fit_normalization(self, template: Template, motion: Motion, frames: tuple[int, ...]) -> None:
         """Take mean and spread from the frames of a training motion."""
         if self.standardise:
             self.mean, self.spread = texture_statistics(self._draw(template, Pose(motion, frame)) for frame in frames)
-        if self.novelty_scale:
-            some = frames[:: -(-len(frames) // COMPARED_FRAMES)]
-            self.training_poses = torch.stack([self._coarse(self(template, Pose(motion, frame))) for frame in some])
 
     def forward(self, template: Template, pose: Pose) -> Float[Tensor, "c r r"]:
         """The textures of a frame, `c = 6 window` channels."""
@@ -208,27 +195,6 @@ class TextureDrawer(MovingModule):
         if not self.standardise:
             return textures
         return ((textures - self.mean) / self.spread).clamp(-BOUND, BOUND)
-
-    @torch.no_grad()
-    def novelty(self, textures: Float[Tensor, "c r r"]) -> float:
-        """How far a frame lies from the nearest training frame: root mean square over the body, in spreads."""
-        covered = self.lattice.texels.numel() / self.lattice.resolution**2
-        nearest = (self.training_poses - self._coarse(textures)).square().mean(1).min()
-        return float((nearest / covered).sqrt())
-
-    def decoder_weight(self, textures: Float[Tensor, "c r r"]) -> float:
-        """Weight of the decoded render in the blend with a static avatar: 1 in training frames. Not in the paper.
-
-        1 / (1 + (novelty / novelty_scale)^2): far from the training poses decoders are no better than a static avatar,
-        and the errors of the two differ.
-        """
-        if not self.novelty_scale:
-            return 1.0
-        ratio = self.novelty(textures) / self.novelty_scale
-        return 1 / (1 + ratio * ratio)  # A power would overflow where a product is infinite.
-
-    def _coarse(self, textures: Float[Tensor, "c r r"]) -> Float[Tensor, " d"]:
-        return nn.functional.avg_pool2d(textures[:6], POOL).flatten()
 
     def _draw(self, template: Template, pose: Pose) -> Float[Tensor, "c r r"]:
         return motion_aware_textures(template, self.lattice, pose, window=self.window, yaw_normalise=self.yaw_normalise)

@@ -25,7 +25,6 @@ from ash.training.images import TrainingImages, load_training_images, training_p
 from ash.training.loop import Trainer
 from ash.training.losses import view_loss
 
-FALLBACK_EVERY = 2  # Steps, of which one also trains what is blended in far from the training motion.
 SPREAD_FRAMES = 40  # Training frames, evenly taken, over which the decoders' output is averaged and compared.
 
 Own = TypeVar("Own", bound="TrainedAvatar")
@@ -35,8 +34,7 @@ class TrainedAvatar(ABC):
     """An avatar on a template whose module is learned from images.
 
     The protocols `ash.protocol.Avatar` and `ash.training.loop.Trainable`, but for how a frame is decoded and drawn.
-    What decoders make of a frame is added to a static `base`; a second static one, `fallback`, may be blended in far
-    from the training motion.
+    What decoders make of a frame is added to a static `base`.
     """
 
     module: Any  # everything that a checkpoint holds; has `template`, `decode(inputs)` and `residual(inputs)`
@@ -67,11 +65,6 @@ class TrainedAvatar(ABC):
     def base(self) -> nn.Parameter:
         """What the decoders add to."""
 
-    @property
-    @abstractmethod
-    def fallback(self) -> nn.Parameter | None:
-        """What is blended in far from the training motion; None: nothing."""
-
     @abstractmethod
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Adam's groups, each with its own `lr`."""
@@ -83,10 +76,6 @@ class TrainedAvatar(ABC):
     @abstractmethod
     def _draw(self, decoded: Tensor, inputs: Any, cameras: list[Camera], background: Tensor, step: int) -> Tensor:
         """Rgb `[c, h, w, 3]` over `background`, for cameras of one size; gradients as this step has them."""
-
-    @abstractmethod
-    def _draw_fallback(self, inputs: Any, cameras: list[Camera], background: Tensor) -> Tensor:
-        """The same of `fallback`."""
 
     @abstractmethod
     def template_vertices(self, pose: Pose) -> np.ndarray:
@@ -108,33 +97,24 @@ class TrainedAvatar(ABC):
         self._outcome = replace(outcome, precision=self._precision, correction_spread=spread)
         self.template.clear_cache()
 
-    def losses(self, batches: Sequence[Batch], step: int) -> list[Tensor]:
-        """ASH Eq. 9 of the decoded frames; in one of `FALLBACK_EVERY` steps after the warm-up also of the fallback.
+    def loss(self, batches: Sequence[Batch], step: int) -> Tensor:
+        """ASH Eq. 9 of the decoded frames.
 
         Raises:
             FloatingPointError: what the weights make cannot be drawn, because it holds NaN or infinity, say.
         """
-        training, fallback = self.config.training, self.fallback
-        if step == training.static_steps and fallback is not None:
-            with torch.no_grad():
-                fallback.copy_(self.base)  # It starts from what the warm-up made.
         inputs = [self._inputs_of(batch.frame) for batch in batches]
         drawn = [
             self._draw(decoded, of_frame, batch.cameras, batch.background, step)
             for decoded, of_frame, batch in zip(self._decode_step(inputs, step), inputs, batches, strict=True)
         ]
-        losses = [view_loss(drawn, batches, training)]
-        if fallback is not None and step >= training.static_steps and step % FALLBACK_EVERY == 0:
-            # Inputs anew: each loss is differentiated by itself, and frees its graph.
-            static = [self._draw_fallback(self._inputs_of(b.frame), b.cameras, b.background) for b in batches]
-            losses.append(view_loss(static, batches, training))
-        return losses
+        return view_loss(drawn, batches, self.config.training)
 
     def render_views(self, frame: int, cameras: list[Camera], background: Tensor) -> Tensor:
-        """Rgb `[c, h, w, 3]` of a training frame over `background`, as it was learned: nothing is blended in.
+        """Rgb `[c, h, w, 3]` of a training frame over `background`.
 
         Raises:
-            FloatingPointError: as `losses`.
+            FloatingPointError: as `loss`.
         """
         inputs = self._inputs_of(frame)
         (decoded,) = self._decode([inputs])

@@ -109,7 +109,6 @@ class DdcModel(MovingModule):
         self.uvs = torch.from_numpy(mesh.uvs).float()
         self.topology = topology_of(template.faces)
         self.base_texture = nn.Parameter(initial.clone(), requires_grad=config.model.base)
-        self.fallback_texture = nn.Parameter(initial.clone()) if config.model.novelty_scale else None
         self.refinement: Refinement | MotionRefinement | None = None
         if config.refine == "motion":
             self.refinement = MotionRefinement(config.template, mesh, template.skeleton)
@@ -133,10 +132,8 @@ class DdcModel(MovingModule):
         with stage(clock, "stg1", device):
             posed = self.template.pose(pose)
         with stage(clock, "stg2", device):
-            textures = self.textures(self.template, pose)
             return MeshInputs(
-                textures=textures,
-                decoder_weight=self.textures.decoder_weight(textures),
+                textures=self.textures(self.template, pose),
                 root_translation=torch.from_numpy(pose.dofs[:3]).float().to(device),
                 window=self.refinement.window(pose) if isinstance(self.refinement, MotionRefinement) else [],
                 posed=posed,
@@ -153,12 +150,6 @@ class DdcModel(MovingModule):
     def residual(self, inputs: Sequence[MeshInputs]) -> Float[Tensor, "b 3 t t"]:
         """What the network adds to the base."""
         return nn.functional.pixel_shuffle(self.network(*batched_inputs(inputs, self.phi)), self.config.shuffle)
-
-    def blended_texture(self, inputs: MeshInputs) -> Float[Tensor, "3 t t"]:
-        """The texture of a frame, blended with the fallback by `TextureDrawer.decoder_weight`."""
-        (texture,) = self.decode([inputs])
-        fallback = self.fallback_texture
-        return texture if fallback is None else fallback.lerp(texture, inputs.decoder_weight)
 
     def see(self, posed: PosedTemplate, cameras: list[Camera]) -> list[MeshView]:
         """What cameras of one size see of the posed mesh, whatever its texture."""
@@ -179,7 +170,7 @@ class DdcModel(MovingModule):
         posed = inputs.posed
         if self.refinement is None:
             return posed
-        moving = (inputs.window, inputs.decoder_weight) if isinstance(self.refinement, MotionRefinement) else ()
+        moving = (inputs.window,) if isinstance(self.refinement, MotionRefinement) else ()
         canonical = posed.canonical + self.refinement(*moving)
         return replace(posed, canonical=canonical, vertices=posed.transforms.apply(canonical))
 
@@ -201,12 +192,10 @@ class DdcAvatar(TrainedAvatar):
             window=config.model.window,
             yaw_normalise=config.model.yaw_normalise,
             standardise=config.model.standardise,
-            novelty_scale=config.model.novelty_scale,
         )
         textures.fit_normalization(template, capture.motion, capture.splits["train"].frames)
         self.module = DdcModel(config, capture.template, template, textures, initial).to(self.device)
         self.template = self.module.template
-        self._drawn_last: tuple[Tensor, list[Camera], list[MeshView]] = (torch.empty(0), [], [])  # vertices, ...
         # The template is frozen: each training frame is posed once, as far as there is room.
         self._inputs: BoundedCache[int, MeshInputs] = BoundedCache(
             lambda frame: self.module.frame_inputs(Pose(capture.motion, frame))
@@ -217,18 +206,11 @@ class DdcAvatar(TrainedAvatar):
         """A texture, `[3, t, t]`."""
         return self.module.base_texture
 
-    @property
-    def fallback(self) -> nn.Parameter | None:
-        """The same for poses far from training; the vertices are shared."""
-        return self.module.fallback_texture
-
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Networks, and what is learned directly: texture, light, a displacement of the vertices; as ASH has it."""
         training, module = self.config.training, self.module
         nets = [*module.network.parameters(), *(module.phi.parameters() if module.phi is not None else ())]
-        static = [
-            p for p in (module.base_texture, module.fallback_texture, module.light) if p is not None and p.requires_grad
-        ]
+        static = [p for p in (module.base_texture, module.light) if p is not None and p.requires_grad]
         if isinstance(module.refinement, MotionRefinement):
             nets += module.refinement.nets.networks()
             static.append(module.refinement.shared.rough)
@@ -249,18 +231,7 @@ class DdcAvatar(TrainedAvatar):
         with torch.set_grad_enabled(torch.is_grad_enabled() and step % self.config.vertices_every == 0):
             posed = self.module.refined(inputs)
         views = self.module.see(posed, cameras)
-        self._drawn_last = posed.vertices.detach(), cameras, [replace(v, corners=v.corners.detach()) for v in views]
         return self._rasterize(decoded, posed, views, background)
-
-    def _draw_fallback(self, inputs: MeshInputs, cameras: list[Camera], background: Tensor) -> Tensor:
-        """Its gradient leaves the vertices alone: they are not its own."""
-        assert self.fallback is not None
-        with torch.no_grad():
-            posed = self.module.refined(inputs)
-        vertices, by, views = self._drawn_last
-        if by is not cameras or not torch.equal(vertices, posed.vertices):
-            views = self.module.see(posed, cameras)
-        return self._rasterize(self.fallback, posed, views, background)
 
     def _rasterize(self, texture: Tensor, posed: PosedTemplate, views: list[MeshView], background: Tensor) -> Tensor:
         behind = background if background.ndim == 1 else background.new_zeros(3)
@@ -284,7 +255,8 @@ class DdcAvatar(TrainedAvatar):
         """
         inputs = self.module.frame_inputs(pose, clock)
         with stage(clock, "stg3", self.device):
-            return self.module.refined(inputs), self.module.blended_texture(inputs).clamp(min=0)
+            (texture,) = self.module.decode([inputs])
+            return self.module.refined(inputs), texture.clamp(min=0)
 
     @torch.no_grad()
     def dressed_mesh(self, pose: Pose) -> DressedMesh:

@@ -44,7 +44,7 @@ class OracleTexture(DdcAvatar):
 
 def _on_exact(preset: str) -> DdcConfig:
     mesh = ddc_config(plus(preset), seed=0, template=TemplateConfig(kind="exact"))
-    return replace(mesh, model=replace(mesh.model, novelty_scale=0.0, global_features=False))
+    return replace(mesh, model=replace(mesh.model, global_features=False))
 
 
 # One texture, at the preset's budget.

@@ -14,7 +14,6 @@ OLD_COMMANDS: dict[str, tuple[str, ...]] = {  # old command -> what is typed in 
 OLD_FORMATS = {"glb": "gltf"}  # of `export`, for avatars
 
 OLD_FIELDS = {  # of configurations and scenes, as flags and as keys of a suite's file
-    "model.fade": "model.novelty_scale",
     "rig.part": "rig.cameras_per_frame",
 }
 OLD_METHODS = {  # rows that are others now

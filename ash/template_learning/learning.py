@@ -1,8 +1,13 @@
-"""Which template a method stands on. A learned one is made once per capture, configuration and seed, and kept."""
+"""Which template a method stands on. A learned one is made once per capture, configuration and seed, and kept.
+
+So is what it is learned from, the template tracked through the training frames: configurations share it.
+"""
 
 import time
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import safetensors.torch
 import torch
@@ -70,17 +75,19 @@ def learned_template(config: TemplateConfig, capture: Capture, *, seed: int, dev
 
 def template_key(config: TemplateConfig, capture: Capture, *, seed: int, device: torch.device = CPU) -> str:
     """Hash of everything that decides a learned template, sources included."""
-    train = capture.splits["train"]
-    views = {"train": asdict(train) if config.supervision == "images" else train.frames}
     drawn = seed if config.network == "graph" else 0  # Else nothing is random.
-    decisive = {
+    return _key(config, capture, device, {"config": asdict(config), "seed": drawn})
+
+
+def _key(config: TemplateConfig, capture: Capture, device: torch.device, decisive: dict[str, Any]) -> str:
+    train = capture.splits["train"]
+    seen = {
         "capture": capture.identity,
-        "config": asdict(config),
-        "seed": drawn,
+        "train": asdict(train) if config.supervision == "images" else train.frames,
         "device": device.type,
         "sources": hash_sources(Path(__file__).parents[1]),
     }
-    return hash_of(decisive | views)[:16]
+    return hash_of(decisive | seen)[:16]
 
 
 def _around(deformation: Deformation, graph: EmbeddedGraph, config: TemplateConfig, capture: Capture) -> Template:
@@ -91,11 +98,10 @@ def _around(deformation: Deformation, graph: EmbeddedGraph, config: TemplateConf
 def _learn(
     deformation: Deformer, config: TemplateConfig, capture: Capture, seed: int, device: torch.device
 ) -> dict[str, str]:
-    """Learn in place: on the device, and back."""
-    start = time.perf_counter()
-    at_rest = _around(RestDeformation(capture.template), deformation.graph, config, capture).to(device)
+    """Learn in place: on the device, and back. The seconds include those of a tracking that was found in the store."""
     deformation.to(device)
-    tracked = _track(config, capture, at_rest, deformation.graph)
+    tracked, seconds = _tracked_once(deformation.graph, config, capture, device)
+    start = time.perf_counter()
     if isinstance(deformation, LinearDeformation):
         choice = fit_linear(deformation, capture.motion, tracked)
         choices = f"static displacement {'kept' if choice.static else 'refused'}, ridge {choice.ridge:g}"
@@ -103,13 +109,38 @@ def _learn(
         step = fit_graph(deformation, capture.motion, tracked, steps=config.steps, seed=seed)
         choices = f"step {step} of {config.steps}"
     deformation.to(CPU)
-    return {"seconds": repr(time.perf_counter() - start), "summary": f"learned from {config.supervision}: {choices}"}
+    seconds += time.perf_counter() - start
+    return {"seconds": repr(seconds), "summary": f"learned from {config.supervision}: {choices}"}
 
 
-def _track(config: TemplateConfig, capture: Capture, at_rest: Template, graph: EmbeddedGraph) -> Tracked:
-    if config.supervision == "images":
-        return track_images(capture, at_rest, graph)
-    return track_scans(capture, at_rest)
+def _tracked_once(
+    graph: EmbeddedGraph, config: TemplateConfig, capture: Capture, device: torch.device
+) -> tuple[Tracked, float]:
+    """The template in the training frames and the seconds that tracking took, from the store where it lies there."""
+    frames = capture.splits["train"].frames
+    if capture.store is None:
+        return _track(graph, config, capture, device)
+    decisive = {"tracked": config.supervision, "nodes": config.nodes, "released": config.released}
+    path = capture.store / f"tracked-{_key(config, capture, device, decisive)}.safetensors"
+    with file_lock(path):
+        if not path.exists():
+            tracked, seconds = _track(graph, config, capture, device)
+            tensors = {"canonical": tracked.canonical.cpu().contiguous()}
+            write_atomic(path, safetensors.torch.save(tensors, metadata={"seconds": repr(seconds)}))
+        tensors, facts = read_safetensors(path)
+    shape = (len(frames), len(capture.template.vertices), 3)
+    if "seconds" not in facts or "canonical" not in tensors or tensors["canonical"].shape != shape:
+        raise InputError(f"{path}: expected the template in {len(frames)} training frames; remove it")
+    return Tracked(frames=frames, canonical=tensors["canonical"].to(device)), float(facts["seconds"])
+
+
+def _track(
+    graph: EmbeddedGraph, config: TemplateConfig, capture: Capture, device: torch.device
+) -> tuple[Tracked, float]:
+    start = time.perf_counter()
+    at_rest = _around(RestDeformation(capture.template), graph, config, capture).to(device)
+    track = partial(track_images, graph=graph) if config.supervision == "images" else track_scans
+    return track(capture, at_rest), time.perf_counter() - start
 
 
 def _state(deformation: Deformer) -> dict[str, torch.Tensor]:

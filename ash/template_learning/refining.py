@@ -48,9 +48,9 @@ class MotionRefinement(nn.Module):
         """What the networks see of a frame."""
         return self.nets.window_transforms(pose)
 
-    def forward(self, window: list[RigidTransforms], decoder_weight: float = 1.0) -> Float[Tensor, "v 3"]:
-        """Metres, canonical; of what follows the motion, `decoder_weight` in 0..1 counts."""
-        return self.shared() + decoder_weight * (self.nets.deform(window) - self.nets.rest)
+    def forward(self, window: list[RigidTransforms]) -> Float[Tensor, "v 3"]:
+        """Metres, canonical."""
+        return self.shared() + self.nets.deform(window) - self.nets.rest
 
 
 class RefinedDeformation:

@@ -64,8 +64,8 @@ class Trainable(Protocol):
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Adam's groups, each with its own `lr`."""
 
-    def losses(self, batches: Sequence[Batch], step: int) -> Sequence[Tensor]:
-        """What a step minimises, scalars; each is differentiated by itself, and the first is logged.
+    def loss(self, batches: Sequence[Batch], step: int) -> Tensor:
+        """What a step minimises, a scalar.
 
         Raises:
             FloatingPointError: what the weights make cannot be drawn, because it holds NaN or infinity, say.
@@ -75,7 +75,7 @@ class Trainable(Protocol):
         """Rgb of a training frame over `background`, for cameras of one size.
 
         Raises:
-            FloatingPointError: as `losses`.
+            FloatingPointError: as `loss`.
         """
 
 
@@ -149,13 +149,12 @@ class Trainer:
             group["lr"] = rate * factor
         self.optimiser.zero_grad()
         try:
-            losses = self.learner.losses(batches, self.steps)
+            loss = self.learner.loss(batches, self.steps)
         except FloatingPointError as error:
             self._roll_back(str(error))
             return
-        for loss in losses:
-            loss.backward()  # type: ignore[no-untyped-call]
-        if not (math.isfinite(losses[0].item()) and self.optimiser.step()):
+        loss.backward()  # type: ignore[no-untyped-call]
+        if not (math.isfinite(loss.item()) and self.optimiser.step()):
             self._roll_back("loss or gradient not finite")
             return
         if self.average:
@@ -163,7 +162,7 @@ class Trainer:
             weight = 1 - min(self.config.ema, (1 + self.steps) / (10 + self.steps))
             torch._foreach_lerp_(list(self.average.values()), self.averaged, weight)
         self.steps += 1
-        self._look(losses[0])
+        self._look(loss)
 
     def _look(self, loss: Tensor) -> None:
         """Score the reserved views where it is time to, decide what follows from it, and write the log."""

@@ -25,7 +25,7 @@ from ash.capture.formats import load_capture
 from ash.files import InputError, link_or_copy
 from ash.gaussians.gaussians import Gaussians
 from ash.gaussians.splatting import Splatted, splat
-from ash.model import blend_renders, image_of, views_of
+from ash.model import image_of, views_of
 from ash.protocol import Avatar, PosedGeometry, PosesGaussians, StageClock
 from benchmarks.analysis.style import style_of
 from benchmarks.cell.registry import is_oracle
@@ -35,7 +35,6 @@ from benchmarks.play.motions import motion_clip
 from benchmarks.suites.runs import RUN_FILE, read_run
 
 Colour = tuple[int, int, int]  # 0 to 255
-Components = list[tuple[float, Gaussians]]  # sets of Gaussians whose pictures are blended, and their weights
 
 CACHED_POSES = 48  # A short motion that is repeated, or a camera that turns, decodes nothing twice.
 NOT_FINITE = "the rendered image holds NaN or infinity"
@@ -48,7 +47,7 @@ class LoadedAvatar:
         self.cell, self.title = cell, title
         self.avatar = avatar  # the method's object; `ash.protocol` says what it can do
         self.capture = capture  # what it was trained on, test splits included
-        self._cache: OrderedDict[tuple[bytes, int], Components] = OrderedDict()
+        self._cache: OrderedDict[tuple[bytes, int], Gaussians] = OrderedDict()
 
     @property
     def motion(self) -> Motion:
@@ -85,18 +84,18 @@ class LoadedAvatar:
         """The picture that is scored: premultiplied RGBA, float32 `[h, w, 4]`."""
         if not isinstance(self.avatar, PosesGaussians):
             return self.avatar.render(pose, camera, clock=clock)
-        components = self._components(pose, clock)
+        gaussians = self._gaussians(pose, clock)
         with clock.stage("stg4"):
-            return image_of(self._splat(components, camera, None))
+            return image_of(self._splat(gaussians, camera, None))
 
     @torch.no_grad()
     def on_colour(self, pose: Pose, camera: Camera, clock: StageClock, background: Colour) -> np.ndarray:
         """The picture over a colour, uint8 `[h, w, 3]`, at less cost than the one that is scored."""
         if not isinstance(self.avatar, PosesGaussians):
             return composite(self.premultiplied(pose, camera, clock), background)
-        components = self._components(pose, clock)
+        gaussians = self._gaussians(pose, clock)
         with clock.stage("stg4"):
-            rgb = self._splat(components, camera, torch.tensor(background) / 255).rgb[0]
+            rgb = self._splat(gaussians, camera, torch.tensor(background) / 255).rgb[0]
             if not math.isfinite(float(rgb.sum())):
                 raise FloatingPointError(NOT_FINITE)
             return rgb.mul_(255).add_(0.5).clamp_(0, 255).to(torch.uint8).cpu().numpy()
@@ -106,26 +105,23 @@ class LoadedAvatar:
         vertices = self.avatar.template_vertices(pose) if isinstance(self.avatar, PosedGeometry) else ()
         return np.asarray(vertices) if len(vertices) else None
 
-    def _components(self, pose: Pose, clock: StageClock) -> Components:
+    def _gaussians(self, pose: Pose, clock: StageClock) -> Gaussians:
         assert isinstance(self.avatar, PosesGaussians)
         key = (pose.motion.dofs[pose.window(8)].tobytes(), pose.frame)
         if key not in self._cache:
             if isinstance(self.avatar, AshAvatar):
-                posed = self.avatar.pose_components(pose, clock=clock)
+                self._cache[key] = self.avatar.gaussians(pose, clock=clock)
             else:
-                posed = [(1.0, self.avatar.gaussians(pose))]
-            self._cache[key] = posed
+                self._cache[key] = self.avatar.gaussians(pose)
             if len(self._cache) > CACHED_POSES:
                 self._cache.popitem(last=False)
         self._cache.move_to_end(key)
         return self._cache[key]
 
-    def _splat(self, components: Components, camera: Camera, background: torch.Tensor | None) -> Splatted:
+    def _splat(self, gaussians: Gaussians, camera: Camera, background: torch.Tensor | None) -> Splatted:
         assert isinstance(self.avatar, PosesGaussians)
         options = {**views_of([camera]), "dilation": self.avatar.dilation, "threads": torch.get_num_threads()}
-        return blend_renders(
-            [(weight, splat(gaussians, background=background, **options)) for weight, gaussians in components]
-        )
+        return splat(gaussians, background=background, **options)
 
 
 def composite(premultiplied: np.ndarray, background: Colour) -> np.ndarray:

@@ -20,7 +20,7 @@ from ash.devices import CPU, moved
 from ash.files import InputError, write_json
 from ash.gaussians.splatting import Splatted, splat_naive
 from ash.gaussians.texels import pose_naive, sample_surface_naive
-from ash.model import AshModel, blend_renders, image_of, views_of
+from ash.model import AshModel, image_of, views_of
 from ash.plus import AshPlusModel
 from ash.presets import named, plus
 from ash.protocol import Avatar, StageClock
@@ -88,7 +88,6 @@ class Agreement:
     size: str
     gaussians: int
     frames: int
-    least_decoder_weight: float  # 0..1
     least_db: float  # foreground PSNR of the worst frame on any number of threads
     median_db: float  # over the frames
 
@@ -96,8 +95,7 @@ class Agreement:
         """In one line."""
         return (
             f"{self.candidate}, {self.size}: {self.gaussians:,} Gaussians; agrees with the definitions"
-            f" to {self.least_db:.1f} dB at least, {self.median_db:.1f} dB in the median of {self.frames} frames,"
-            f" decoder weight {self.least_decoder_weight:.2f} or more"
+            f" to {self.least_db:.1f} dB at least, {self.median_db:.1f} dB in the median of {self.frames} frames"
         )
 
 
@@ -193,10 +191,8 @@ def frame_by_definition(model: AshModel, pose: Pose, camera: Camera) -> np.ndarr
     posed = model.template.pose(pose)
     canonical, normals, transforms = sample_surface_naive(model.lattice, posed, model.config.anchor)
     inputs = replace(model.frame_inputs(pose), canonical=canonical, normals=normals, transforms=transforms)
-    components = model.components(model.decode([inputs])[0], inputs)
-    return image_of(
-        blend_renders([(weight, _splat_by_definition(model, raw, inputs, [camera])) for weight, raw in components])
-    )
+    (raw,) = model.decode([inputs])
+    return image_of(_splat_by_definition(model, raw, inputs, [camera]))
 
 
 def _splat_by_definition(
@@ -259,17 +255,10 @@ def time_clip(
         size=clip.size,
         gaussians=avatar.gaussian_count(),
         frames=len(worst),
-        least_decoder_weight=min(decoder_weight(model, pose_of(number)) for number in agreed),
         least_db=min(worst),
         median_db=statistics.median(worst),
     )
     yield rows_of("frame", clip.size, "forward", samples, avatar.device)
-
-
-@torch.no_grad()
-def decoder_weight(model: AshModel, pose: Pose) -> float:
-    """The weight of the decoded picture in a pose, 0..1."""
-    return model.frame_inputs(pose).decoder_weight
 
 
 def _arrive(model: AshModel, pose: Pose, threads: int) -> None:
@@ -327,7 +316,7 @@ def _step(avatar: AshAvatar, batch: Batch, optimiser: Adam, *, naive: bool) -> N
         ]
         loss = torch.stack(by_view).mean()
     else:
-        loss = avatar.losses([batch], 2 * training.steps + 1)[0]  # Odd: the fallback does not learn.
+        loss = avatar.loss([batch], training.steps)
     optimiser.zero_grad()
     loss.backward()  # type: ignore[no-untyped-call]
     optimiser.step()

@@ -2,8 +2,8 @@
 
 The step is the loop's own. Its parts are timed from outside: a part's forward pass as it is called, its backward pass
 from the moment when the gradients of all that it returned are there until those of the part before it are. Parts are
-CPU time of the thread, in which waiting for a core does not count; "train_step" is wall time. A step that also draws
-static views or learns vertices is timed as a whole, and its parts are not.
+CPU time of the thread, in which waiting for a core does not count; "train_step" is wall time. A step that also learns
+vertices is timed as a whole, and its parts are not.
 """
 
 import math
@@ -46,7 +46,7 @@ from benchmarks.speed.timing import (
     torch_threads_restored,
 )
 
-STATIC, VERTICES = "step with static views", "step with vertices"  # Both at once in the mesh: the latter.
+VERTICES = "step with vertices"  # of the mesh
 FORWARD = ("batch", "decode", "pose", "draw", "loss")
 BACKWARD = ("loss backward", "draw backward", "pose backward", "decode backward")
 PARTS = (*FORWARD, *BACKWARD, "adam", "rest", "step")  # "step": the whole; "rest": what no other part holds
@@ -134,8 +134,8 @@ def profiled(learner: AshAvatar | DdcAvatar, images: TrainingImages, name: str, 
         with _timed_parts(parts, learner, trainer):
             trainer.step([parts.timed("batch", draw_batch)(images, config, 0, trainer.steps)])
         whole = parts.now() - start
-        if kind := _extra_work(learner, first + number):
-            return {kind: 1e3 * whole}
+        if isinstance(learner, DdcAvatar) and (first + number) % learner.config.vertices_every == 0:
+            return {VERTICES: 1e3 * whole}
         parts.split_backward()
         seconds = parts.spent | {"rest": whole - sum(parts.spent.values()), "step": whole}
         return {part: 1e3 * seconds[part] for part in PARTS if part in seconds}
@@ -143,13 +143,6 @@ def profiled(learner: AshAvatar | DdcAvatar, images: TrainingImages, name: str, 
     for number in range(epoch):
         step(number)
     return Candidate(name=name, threads=1, call=lambda number: step(epoch + number))
-
-
-def _extra_work(learner: AshAvatar | DdcAvatar, step: int) -> str:
-    """What a step does besides; empty: nothing."""
-    if isinstance(learner, DdcAvatar) and step % learner.config.vertices_every == 0:
-        return VERTICES
-    return STATIC if step % ash.trained_avatar.FALLBACK_EVERY == 0 else ""
 
 
 @contextmanager

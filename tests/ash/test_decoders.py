@@ -24,7 +24,6 @@ LATTICE = build_lattice(tube_mesh(), 16)
 def frame_inputs(textures: torch.Tensor) -> FrameInputs:
     nothing = torch.zeros(0, 3)
     return FrameInputs(
-        decoder_weight=1.0,
         textures=textures,
         motion=torch.zeros(2, 9),
         root_translation=torch.zeros(3),

@@ -166,15 +166,15 @@ def seen_by_steps(capture, tmp_path, **training) -> list[tuple]:
     """What the steps of a training are given: sizes of the images, and the learning rate."""
     config = small(plus("ci"), steps=6, **training)
     avatar = AshAvatar.from_capture(config, capture)
-    seen, losses = [], avatar.losses
+    seen, loss_of = [], avatar.loss
 
     def watch(batches, step):
         for b in batches:
             size = b.cameras[0].width, b.cameras[0].height
             seen.append((b.frame, [c.name for c in b.cameras], *size, b.background.tolist()))
-        return losses(batches, step)
+        return loss_of(batches, step)
 
-    avatar.losses = watch
+    avatar.loss = watch
     images = replace(load_training_images(capture), reserved=())
     Trainer(avatar, config.training, images, seed=0, folder=tmp_path).fit()
     return seen
@@ -245,6 +245,6 @@ def test_noise_without_standardised_textures_is_refused(model):
     with pytest.raises(InputError, match="texture_noise"):
         replace(
             base,
-            model=replace(base.model, novelty_scale=0.0, **model),
+            model=replace(base.model, **model),
             training=replace(base.training, texture_noise=0.5),
         )

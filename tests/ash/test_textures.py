@@ -169,37 +169,3 @@ def test_what_was_never_seen_is_not_far_from_what_was(template):
     drawer.fit_normalization(template, motion, (0, 0))  # One pose: every other one is infinitely unusual.
     assert not drawer(template, Pose(motion, 0)).any()
     assert drawer(template, Pose(motion, 5)).abs().max() == 3
-
-
-def test_trust_is_whole_in_training_frames_and_fades_with_novelty(template):
-    """Novelty is a distance in spreads: a motion that is moved away little by little is trusted less and less."""
-    motion, frames = tube_motion(6), (0, 1, 2, 3)
-    drawer = TextureDrawer(
-        build_lattice(template.mesh, RESOLUTION), window=1, yaw_normalise=True, standardise=True, novelty_scale=0.5
-    )
-    drawer.fit_normalization(template, motion, frames)
-    assert [drawer.decoder_weight(drawer(template, Pose(motion, frame))) for frame in frames] == [1.0] * 4
-    bends = []
-    for bend in (0.0, 0.05, 0.2, 0.8):
-        dofs = motion.dofs.copy()
-        dofs[3, 6:] += bend
-        textures = drawer(template, Pose(Motion(dofs=dofs, sequence=motion.sequence, fps=motion.fps), 3))
-        novelty = drawer.novelty(textures)
-        assert drawer.decoder_weight(textures) == pytest.approx(1 / (1 + (novelty / 0.5) ** 2))
-        bends.append(novelty)
-    assert bends[0] == 0 and sorted(bends) == bends and bends[-1] > 0.5
-    drawer.novelty_scale = bends[-1]
-    assert drawer.decoder_weight(textures) == pytest.approx(0.5)
-    drawer.novelty_scale = 1e-300  # A ratio whose power is beyond floats.
-    assert drawer.decoder_weight(textures) == 0
-    always = TextureDrawer(build_lattice(template.mesh, RESOLUTION), window=1, yaw_normalise=True, standardise=True)
-    always.fit_normalization(template, motion, frames)
-    assert always.decoder_weight(textures) == 1.0
-
-
-def test_novelty_is_the_distance_to_the_nearest_training_frame_over_the_body(template):
-    lattice = build_lattice(template.mesh, RESOLUTION)
-    drawer = TextureDrawer(lattice, window=1, yaw_normalise=True, standardise=True, novelty_scale=1.0)
-    drawer.fit_normalization(template, tube_motion(4), (0, 1))
-    shifted = drawer(template, Pose(tube_motion(4), 1)) + 0.7 * lattice.to_texture(torch.ones(len(lattice.texels), 6))
-    assert 0.55 < drawer.novelty(shifted) <= 0.7  # Texels at the atlas' border are averaged with empty ones.

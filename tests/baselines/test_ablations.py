@@ -79,7 +79,7 @@ def test_the_mlp_tells_frames_apart_and_learns_no_texels_beneath(
     outcome = avatar.outcome()
     assert outcome is not None and outcome.carries_nothing == dead
     assert (outcome.correction_spread == 0) == dead
-    assert avatar.fallback is None and not avatar.module.base_texels.requires_grad
+    assert not avatar.module.base_texels.requires_grad
     assert id(avatar.module.base_texels) not in learned and torch.equal(avatar.module.base_texels, started)
     assert (started == started[0]).all(), "grey texels, all alike"
     assert {id(p) for p in avatar.module.decoders.parameters()} <= learned

@@ -8,8 +8,7 @@ from helpers.captures import write_tube_capture
 from helpers.figures import front_camera, tube_motion
 from helpers.learning import training_views
 
-import ash.mesh.drawing
-from ash.capture.dataset import Camera, Pose, image_path
+from ash.capture.dataset import Pose, image_path
 from ash.capture.formats import load_capture
 from ash.config import TemplateConfig
 from ash.fields import apply_overrides
@@ -115,45 +114,3 @@ def test_the_network_is_sized_as_the_presets_decoders_and_fills_its_texture():
         apply_overrides(config, {"width": 8}, of="ddc")
     with pytest.raises(InputError, match=r"unknown key 'model\.sh_degree'"):  # A mesh has none.
         apply_overrides(config, {"model.sh_degree": 1}, of="ddc")
-
-
-def test_far_from_training_a_static_texture_is_what_counts(capture, tmp_path):
-    mesh = avatar(capture, steps=40)
-    mesh.fit(capture, folder=tmp_path)
-    module, inputs = mesh.module, mesh._inputs[1]
-    with torch.no_grad():
-        near = module.blended_texture(inputs)
-        torch.testing.assert_close(near, module.base_texture + module.residual([inputs])[0])
-        assert not torch.equal(module.fallback_texture, module.base_texture), (
-            "each has learned for itself since the warm-up"
-        )
-        for decoder_weight in (0.0, 0.25):
-            expected = (1 - decoder_weight) * module.fallback_texture + decoder_weight * near
-            torch.testing.assert_close(module.blended_texture(replace(inputs, decoder_weight=decoder_weight)), expected)
-
-
-def test_static_views_are_drawn_into_what_the_training_views_saw(capture, monkeypatch):
-    mesh, cameras, background = avatar(capture, steps=40), [*capture.cameras.values()][:2], torch.full((3,), 0.5)
-    seen: list[int] = []
-    find = ash.mesh.drawing.rasterize_mesh
-    monkeypatch.setattr(ash.mesh.drawing, "rasterize_mesh", lambda *a, **k: (seen.append(1), find(*a, **k))[1])
-
-    def static_and_gradient(by: list[Camera]) -> tuple[torch.Tensor, torch.Tensor]:
-        drawn = mesh._draw_fallback(mesh._inputs_of(1), by, background)
-        mesh.module.zero_grad()
-        drawn.square().sum().backward()
-        assert mesh.module.refinement.rough.grad is None
-        return drawn, mesh.module.fallback_texture.grad
-
-    assert training_views(mesh, 1, cameras, background, step=0).requires_grad
-    assert mesh.module.refinement is not None
-    shared = static_and_gradient(cameras)
-    assert len(seen) == 2, "the two views are found once"
-    anew = static_and_gradient(list(cameras))
-    assert len(seen) == 4
-    assert all(map(torch.equal, shared, anew))
-    with torch.no_grad():
-        mesh.module.refinement.rough += 0.05
-    moved = static_and_gradient(cameras)
-    assert len(seen) == 6, "other vertices are other views"
-    assert not torch.equal(moved[0], shared[0])

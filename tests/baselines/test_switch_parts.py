@@ -118,15 +118,12 @@ CHANGED_BY_ADDITION = {
     "dilation": {"drawing"},
     "matt": DECODERS | {"spread"},
     "coarse": DECODERS | {"textures"},
-    "blend": {"decoder_weight", "rates", "turns"},
 }
-NEEDED = {"blend": ("base", "standardise")}  # additions that another one needs
 
 
 @pytest.mark.parametrize("name", ADDITIONS)
 def test_an_addition_changes_what_it_names_and_nothing_else(name: str, apart: Apart) -> None:
-    below = {key: value for other in NEEDED.get(name, ()) for key, value in ADDITIONS[other].items()}
-    assert differing(apart("ash", below), apart("ash", {**below, **ADDITIONS[name]})) == CHANGED_BY_ADDITION[name]
+    assert differing(apart("ash", {}), apart("ash", ADDITIONS[name])) == CHANGED_BY_ADDITION[name]
 
 
 def test_the_rows_of_the_suite_are_the_additions() -> None:
@@ -139,22 +136,20 @@ def test_the_rows_of_the_suite_are_the_additions() -> None:
         for row, wanted in rows.items():
             if row in suite:
                 assert configured("ash", "cpu", suite[row].changes) == apply_overrides(presets.cpu(), wanted, of=row)
-        assert f"plus_{name}" in suite or name == "blend"
-        assert f"to_{name}" in suite or name in ("base", "blend")
+        assert f"plus_{name}" in suite
+        assert f"to_{name}" in suite or name in ("base", "coarse")
     assert apply_overrides(presets.cpu(), merged, of="all") == presets.plus("cpu")
 
 
 CAMERAS = {"batches"}
 NO_MOTION = DECODERS | {
     "textures",
-    "decoder_weight",
     "rates",
     "warm_up",
-    "turns",
 }  # no decoders, nothing that they would see
-STATIC = (NO_MOTION - {"turns"}) | {"start"}  # `ash` learns no texels, but for this.
+STATIC = NO_MOTION | {"start"}  # `ash` learns no texels, but for this.
 LATTICE = {"places", "start", "textures", "decoding", "posing"}  # other texels: all that is one per texel
-UNLEARNED = {"start", "decoder_weight", "rates", "warm_up", "turns"}  # no learned texels
+UNLEARNED = {"start", "rates", "warm_up"}  # no learned texels
 CHANGED_BY_ROW = {
     "wo_disp": {"posing"},
     "wo_mot": STATIC,
@@ -192,7 +187,6 @@ class Case:
     on: Changes = field(default_factory=dict)
 
 
-ALWAYS_DECODED = {"model.novelty_scale": 0.0}
 FITTED = {"training.warmup": "fitted"}
 PLANTED = {
     "template.kind": "exact",
@@ -215,12 +209,11 @@ OF_BOTH = {
     "model.width": Case(8, DECODERS),
     "model.levels": Case(1, DECODERS),
     "model.shuffle": Case(1, DECODERS | {"textures"}),
-    "model.standardise": Case(False, {"textures"}, ALWAYS_DECODED),
-    "model.novelty_scale": Case(0.35, {"decoder_weight"}),
-    "model.base": Case(False, {"start", "rates"}, {**ALWAYS_DECODED, "training.warmup": "none"}),
+    "model.standardise": Case(False, {"textures"}),
+    "model.base": Case(False, {"start", "rates"}, {"training.warmup": "none"}),
     "training.steps": Case(9, {"course"}),
     "training.views_per_step": Case(1, {"batches"}),
-    "training.warmup_steps": Case(5, {"warm_up", "turns"}),
+    "training.warmup_steps": Case(5, {"warm_up"}),
     "training.l1_weight": Case(0.5, {"loss"}),
     "training.ssim_weight": Case(0.5, {"loss"}),
     "training.learning_rate": Case(1e-3, {"rates"}),
@@ -257,7 +250,7 @@ OF_THE_MESH = {
     "model.light": Case(False, {"light", "drawing", "rates"}),
     "model.global_features": Case(False, DECODERS | {"rates"}),
     "model.global_mlp": Case("released", DECODERS),
-    "training.warmup": Case("none", {"warm_up", "turns"}),
+    "training.warmup": Case("none", {"warm_up"}),
     "training.ema": Case(0.0, {"average"}),
     "training.texture_noise": Case(0.5, {"noise"}),
     "training.camera_share": Case(0.5, {"batches", "start"}),

@@ -2,13 +2,10 @@
 
 import pytest
 
-from ash.presets import plus
 from benchmarks import cli
-from benchmarks.aliases import OLD_COMMANDS, OLD_FIELDS
-from benchmarks.cell.registry import configured
+from benchmarks.aliases import OLD_COMMANDS
 from benchmarks.commands.arguments import read_command
 from benchmarks.commands.captures import SynthCommand
-from benchmarks.commands.runs import TrainCommand
 from benchmarks.suites.scenes import scene_of
 
 
@@ -19,14 +16,6 @@ def test_an_old_command_is_the_new_one_and_says_so(old: str, capsys: pytest.Capt
     printed = capsys.readouterr()
     assert f"{old} is now: {' '.join(OLD_COMMANDS[old])}" in printed.err
     assert f"ash-bench {OLD_COMMANDS[old][0]}" in printed.out
-
-
-def test_an_old_field_of_a_method_is_read_as_a_flag_and_in_a_suite() -> None:
-    assert OLD_FIELDS["model.fade"] == "model.novelty_scale"
-    value = plus("ci").model.novelty_scale / 2
-    assert configured("ash_plus", "ci", {"model.fade": value}).model.novelty_scale == value
-    command = read_command(TrainCommand, "train", ["ash_plus", "data/x", "--preset", "ci", "--model.fade", str(value)])
-    assert command.changes == (("model.novelty_scale", value),)
 
 
 def test_an_old_field_of_a_scene_is_read_as_a_flag_and_in_a_suite() -> None:

@@ -53,8 +53,7 @@ def step_of(avatar: Any, capture: Capture, device: torch.device) -> list[Tensor]
     training = avatar.config.training
     batch = draw_batch(load_training_images(capture, device), training, 0, 0)
     optimiser = Adam(avatar.parameter_groups(), eps=1e-15)
-    for loss in avatar.losses([batch], 0):
-        loss.backward()
+    avatar.loss([batch], 0).backward()
     assert optimiser.step()
     return [parameter for parameter in optimiser.parameters if parameter.grad is not None]
 
@@ -66,7 +65,6 @@ def without_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ash.model, "splat", _shapes_of_images)
     monkeypatch.setattr(ash.mesh.drawing, "_view_of", _some_samples)
     monkeypatch.setattr(ash.mesh.drawing, "_outlines", _no_outlines)
-    monkeypatch.setattr(ash.textures.TextureDrawer, "decoder_weight", lambda drawer, textures: 0.5)
     monkeypatch.setattr(ash.training.adam, "_all_finite", lambda gradients: True)
     equal = torch.equal
     monkeypatch.setattr(torch, "equal", lambda a, b: a.device == b.device == META or equal(a, b))

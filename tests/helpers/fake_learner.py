@@ -48,10 +48,10 @@ class FakeLearner:
     def parameter_groups(self) -> list[dict[str, Any]]:
         return self.groups
 
-    def losses(self, batches: Sequence[Batch], step: int) -> list[Tensor]:
+    def loss(self, batches: Sequence[Batch], step: int) -> Tensor:
         self.step = step
         self.rates.append(self.groups[0]["lr"])
-        return [self.module.weight.mean()]
+        return self.module.weight.mean()
 
     def render_views(self, frame: int, cameras: list[Camera], background: Tensor) -> Tensor:
         return self.module.weight.reshape(()).expand(len(cameras), cameras[0].height, cameras[0].width, 3)

@@ -116,7 +116,6 @@ def fixed_frame(s: Subject) -> Any:
     model = s.avatar.config.model
     seen: dict[str, Any] = {
         "textures": numbers(6 * model.window, model.decoded_texels, model.decoded_texels, seed=1),
-        "decoder_weight": 1.0,
         "root_translation": numbers(3, seed=2),
     }
     if s.is_mesh:
@@ -194,11 +193,6 @@ def textures(s: Subject) -> str:
     drawer, last = s.avatar.module.textures, len(s.capture.motion.dofs) - 1
     unseen = None if drawer is None else drawer(s.avatar.template, Pose(s.capture.motion, last))
     return fingerprint(s.inputs(2).textures, unseen)
-
-
-def decoder_weight(s: Subject) -> str:
-    drawer = s.avatar.module.textures
-    return fingerprint(None if drawer is None else drawer.novelty_scale)
 
 
 def weights(s: Subject) -> str:
@@ -298,22 +292,6 @@ def warm_up(s: Subject) -> str:
     return fingerprint(*taught, left_out)
 
 
-def turns(s: Subject) -> str:
-    """In which steps the fallback starts from the base, and in which it learns."""
-    fallback, noted = s.avatar.fallback, []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(s.avatar, "_decode", lambda inputs: [s.static] * len(inputs))
-        for name in ("_draw", "_draw_fallback"):
-            patch.setattr(s.avatar, name, lambda *_: torch.zeros(0))
-        patch.setattr(ash.trained_avatar, "view_loss", lambda *_: torch.zeros(()))
-        for step in range(STEPS):
-            if fallback is not None:
-                fallback.data.fill_(7.0)
-            losses = len(s.avatar.losses(s.fake_learner.shown[:1], step))
-            noted.append((losses, fallback is not None and not bool((fallback == 7.0).all())))
-    return fingerprint(noted)
-
-
 def rates(s: Subject) -> str:
     """What learns, and how fast."""
     kinds = {id(p): name.split(".")[0] for name, p in s.avatar.module.named_parameters()}
@@ -340,9 +318,9 @@ def average(s: Subject) -> str:
 
 # Those that give weights away come first, and those that set them last.
 SHARED = (
-    weights, template, skinning, deformation, textures, decoder_weight, start, light, drawing, batches, loss, noise,
+    weights, template, skinning, deformation, textures, start, light, drawing, batches, loss, noise,
     precision,
-    warm_up, turns, rates, course, files, average, decoding, refinement,
+    warm_up, rates, course, files, average, decoding, refinement,
 )  # fmt: skip
 PARTS = {
     False: {part.__name__: part for part in (places, spread, posing, *SHARED)},

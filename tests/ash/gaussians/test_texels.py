@@ -27,7 +27,6 @@ def posed_tube(motion: Motion | None = None) -> PosedTemplate:
 def frame_inputs(lattice: TexelLattice = LATTICE) -> FrameInputs:
     canonical, normals, transforms = sample_surface_naive(lattice, posed_tube())
     return FrameInputs(
-        decoder_weight=1.0,
         textures=torch.zeros(0, 1, 1),
         motion=torch.zeros(2, 9),
         root_translation=torch.zeros(3),

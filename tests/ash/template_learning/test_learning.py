@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 import trimesh
 from helpers.captures import write_tube_capture
@@ -14,11 +15,11 @@ from helpers.figures import tube_mesh, tube_motion, tube_skeleton
 from ash.capture.dataset import Capture, Pose, scan_path, surface_path
 from ash.capture.formats import load_capture, read_scan, read_surface_mesh_truth, read_template_truth
 from ash.config import TemplateConfig
-from ash.files import InputError, write_arrays
+from ash.files import InputError, write_arrays, write_atomic
 from ash.rotations import RigidTransforms
 from ash.template.skinning import SkinWeights, dual_quaternion_skinning
 from ash.template.template import RestDeformation, Template, skinned_template, vertex_normals
-from ash.template_learning import tracking
+from ash.template_learning import learning, tracking
 from ash.template_learning.deforming import LinearDeformation, joint_reach
 from ash.template_learning.graph_nets import GraphDeformation
 from ash.template_learning.learning import learned_template, template_key, template_of
@@ -176,7 +177,7 @@ def test_an_equal_template_is_read_and_not_learned_again(capture, tmp_path):
     stored = replace(capture, store=tmp_path / "templates")
     config = TemplateConfig(**SMALL)
     first = learned_template(config, stored, seed=0)
-    (file,) = (tmp_path / "templates").glob("*.safetensors")
+    (file,) = (tmp_path / "templates").glob("[!t]*.safetensors")
     written = file.stat().st_mtime_ns
     again = learned_template(config, stored, seed=0)
     assert file.stat().st_mtime_ns == written and again.learned == first.learned
@@ -271,6 +272,29 @@ def test_a_method_learns_its_template_from_what_it_is_given_and_leaves_it_for_th
         assert not (seen.folder / "truth").exists()
     with seen_by_method(whole, tmp_path / "other", oracle=False, store=tmp_path / "store") as seen:
         assert learned_template(config, seen, seed=1).learned == learned.learned
-    assert len(list((tmp_path / "store").glob("*.safetensors"))) == 1
+    assert len(list((tmp_path / "store").glob("[!t]*.safetensors"))) == 1
     frames = whole.splits["train"].frames
     assert rms_mm(learned, whole, frames) < rms_mm(skinned_template(whole), whole, frames)
+
+
+def test_configurations_share_what_is_tracked(capture: Capture, tmp_path: Path, monkeypatch) -> None:
+    calls = []
+
+    def counted(*arguments: object, **options: object) -> Tracked:
+        calls.append(arguments)
+        return track_scans(*arguments, **options)
+
+    monkeypatch.setattr(learning, "track_scans", counted)
+    configs = [TemplateConfig(**SMALL, window=window) for window in (1, 2)]
+    kept = replace(capture, store=tmp_path)
+    shared = [learned_template(config, kept, seed=0) for config in configs]
+    assert len(calls) == 1
+    for config, template in zip(configs, shared, strict=True):
+        alone = learned_template(config, capture, seed=0)
+        pose = Pose(capture.motion, 5)
+        assert torch.equal(alone.pose(pose).vertices, template.pose(pose).vertices)
+    assert shared[0].learned.seconds > 0
+    (tracks,) = tmp_path.glob("tracked-*.safetensors")
+    write_atomic(tracks, safetensors.torch.save({"canonical": torch.zeros(1)}, metadata={"seconds": "1"}))
+    with pytest.raises(InputError, match="expected the template in 18 training frames"):
+        learned_template(TemplateConfig(**SMALL, window=3), kept, seed=0)

@@ -8,7 +8,6 @@ import torch
 from helpers.captures import tiny_plus, write_tube_capture
 from helpers.numerics import relative_error
 
-import ash.trained_avatar
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture
 from ash.config import AshConfig, TemplateConfig
@@ -57,10 +56,9 @@ def test_steps_of_several_frames_show_what_as_many_steps_of_one_frame_do(capture
 
 
 def gradients(avatar: AshAvatar | DdcAvatar, batches: list[Batch], step: int) -> dict[str, torch.Tensor]:
-    """Of the loss of a step's views, and of its static views."""
+    """Of the loss of a step's views."""
     avatar.module.zero_grad()
-    for loss in avatar.losses(batches, step):
-        loss.backward()
+    avatar.loss(batches, step).backward()
     return {n: p.grad.clone() for n, p in avatar.module.named_parameters() if p.grad is not None}
 
 
@@ -85,7 +83,6 @@ def test_the_gradient_of_a_step_is_the_mean_of_its_frames(
 ) -> None:
     if not natively:  # As on a GPU: the frames are one batch of the U-Nets.
         monkeypatch.setattr(UNet, "_can_use_native", lambda net, texture: False)
-    monkeypatch.setattr(ash.trained_avatar, "FALLBACK_EVERY", 1)
     avatar = LEARNERS[learner](capture)
     for net in avatar.module.modules():
         if isinstance(net, UNet):

@@ -12,7 +12,6 @@ import torch
 from helpers.captures import tube_model_config, write_tube_capture
 from helpers.learning import training_views
 
-import ash.trained_avatar
 from ash import presets
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Pose
@@ -68,14 +67,14 @@ def test_known_gaussians_are_recovered_from_their_images(capture, tmp_path):
 
 def stop_before_end_of(avatar: AshAvatar, step: int) -> None:
     """Send SIGTERM while the given step is drawn."""
-    losses = avatar.losses
+    loss_of = avatar.loss
 
     def losses_then_signal(batches, at):
         if at == step:
             os.kill(os.getpid(), signal.SIGTERM)
-        return losses(batches, at)
+        return loss_of(batches, at)
 
-    avatar.losses = losses_then_signal
+    avatar.loss = losses_then_signal
 
 
 @pytest.mark.parametrize("frames", [1, 2])
@@ -157,71 +156,16 @@ def test_without_decoders_there_is_nothing_to_carry(capture, tmp_path):
     assert not avatar.outcome().carries_nothing
 
 
-def test_the_static_avatar_learns_in_every_so_many_steps_after_the_warm_up(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(ash.trained_avatar, "FALLBACK_EVERY", 3)
-    settings = config(steps=12, warmup_steps=4)
-    avatar = AshAvatar.from_capture(
-        replace(settings, model=replace(settings.model, standardise=True, novelty_scale=0.5)), capture
-    )
-    move, learned = Adam.step, []
-
-    def step(optimiser):
-        learned.append(avatar.module.fallback_texels.grad is not None)
-        return move(optimiser)
-
-    monkeypatch.setattr(Adam, "step", step)
-    avatar.fit(capture, folder=tmp_path)
-    assert [number for number, did in enumerate(learned) if did] == [6, 9]
-
-
-def test_far_from_training_a_static_avatar_has_its_share_of_the_picture(capture, tmp_path, monkeypatch):
-    """Pictures are mixed by decoder_weight, not parameters; of training frames all is decoded."""
-    settings = config(steps=60)
-    model = replace(settings.model, standardise=True, novelty_scale=0.5)
-    avatar = AshAvatar.from_capture(replace(settings, model=model), capture)
-    avatar.fit(capture, folder=tmp_path)
-    with torch.no_grad():
-        added = [avatar.module.residual([avatar._inputs_of(frame)])[0] for frame in range(4)]
-        static, camera = avatar.module.fallback_texels, next(iter(capture.cameras.values()))
-        for frame in range(4):
-            pose = Pose(capture.motion, frame)
-            near = avatar.module.frame_inputs(pose)
-            assert near.decoder_weight == 1
-            (decoded,) = avatar.module.decode([near])
-            torch.testing.assert_close(decoded, avatar.module.base_texels + added[frame])
-            sets = [avatar.module.gaussians(raw, near) for raw in (decoded, static)]
-            alone = [avatar.module.rasterize(gaussians, [camera], None) for gaussians in sets]
-            assert not torch.equal(alone[0].rgb, alone[1].rgb)
-            for decoder_weight, larger in ((1.0, 0), (0.75, 0), (0.25, 1)):
-                with monkeypatch.context() as patched:
-                    patched.setattr(
-                        avatar.module.textures,
-                        "decoder_weight",
-                        lambda textures, decoder_weight=decoder_weight: decoder_weight,
-                    )
-                    drawn, kept = avatar.module(pose, camera), avatar.gaussians(pose)
-                for name in ("rgb", "alpha", "depth"):
-                    wanted = decoder_weight * getattr(alone[0], name) + (1 - decoder_weight) * getattr(alone[1], name)
-                    torch.testing.assert_close(getattr(drawn, name), wanted)
-                assert torch.equal(kept.means, sets[larger].means), "one set alone: that of the larger share"
-    assert not torch.equal(added[0], added[2])
-    assert not torch.equal(static, avatar.module.base_texels), "each has learned for itself since the warm-up"
-    avatar.save(tmp_path / "weights.safetensors")
-    other = AshAvatar.from_capture(replace(settings, model=model), capture)
-    other.load(tmp_path / "weights.safetensors")
-    assert torch.equal(other.module.fallback_texels, static)
-
-
 def test_the_average_of_the_weights_is_the_result_and_nothing_else_changes(capture, tmp_path):
     last, averaged = AshAvatar.from_capture(config(), capture), AshAvatar.from_capture(config(ema=0.5), capture)
     passed = []
-    losses = last.losses
+    loss_of = last.loss
 
     def note_weights(*arguments):
         passed.append(last.module.base_texels.detach().clone())
-        return losses(*arguments)
+        return loss_of(*arguments)
 
-    last.losses = note_weights
+    last.loss = note_weights
     last.fit(capture, folder=tmp_path / "last")
     averaged.fit(capture, folder=tmp_path / "averaged")
     expected = passed[0]
@@ -254,14 +198,14 @@ def test_equal_seeds_give_equal_bits_and_other_seeds_do_not(capture, tmp_path):
 
 def test_nan_rolls_back_once_and_then_ends_the_run(capture, tmp_path):
     avatar = AshAvatar.from_capture(config(), capture)
-    losses, spoiled = avatar.losses, []
+    loss_of, spoiled = avatar.loss, []
 
     def spoil(batches, step):
         spoiled.append(step == 6)
         factor = float("nan") if step == 6 and sum(spoiled) <= times else 1.0
-        return [factor * loss for loss in losses(batches, step)]
+        return factor * loss_of(batches, step)
 
-    avatar.losses = spoil
+    avatar.loss = spoil
     times = 1
     avatar.fit(capture, folder=tmp_path / "once")
     assert all(torch.isfinite(value).all() for value in weights(avatar).values())
@@ -273,16 +217,16 @@ def test_nan_rolls_back_once_and_then_ends_the_run(capture, tmp_path):
 
 def poison(avatar: AshAvatar, *, at: set[int], times: int) -> None:
     """Spoil a weight before the given steps are decoded, `times` times in all."""
-    losses, left = avatar.losses, [times]
+    loss_of, left = avatar.loss, [times]
 
     def poisoned(batches, step):
         if step in at and left[0] > 0:
             left[0] -= 1
             with torch.no_grad():
                 avatar.module.base_texels[0, 3] = float("nan")
-        return losses(batches, step)
+        return loss_of(batches, step)
 
-    avatar.losses = poisoned
+    avatar.loss = poisoned
 
 
 def test_a_weight_that_is_nan_rolls_back_once_and_then_ends_the_run_as_diverged(capture, tmp_path):

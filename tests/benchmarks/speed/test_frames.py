@@ -15,7 +15,6 @@ from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture
 from ash.files import InputError, read_json
 from ash.presets import plus
-from ash.textures import TextureDrawer
 from ash.training.images import load_training_images
 from benchmarks import cli
 from benchmarks.play.avatars import open_avatars
@@ -23,7 +22,7 @@ from benchmarks.speed import frames, profile
 from benchmarks.speed.frames import Agreement, Clip, Subject, held_out_clips, scaled_camera, subjects, time_clip
 
 NEAR, NEW = (1, 2, 3), (4, 5)  # Training frames of the tube serve as near motion.
-AGREES_DB = 80
+AGREES_DB = 60  # A splat whose opacity is 1/255 is drawn or skipped by rounding.
 Trained = tuple[AshAvatar, Capture]
 
 
@@ -103,7 +102,7 @@ def test_the_table_of_a_trained_cell_has_every_stage_and_agrees_with_the_definit
     for agreement in written["agreements"]:
         assert agreement["frames"] == len(NEW)
         assert AGREES_DB < agreement["least_db"] <= agreement["median_db"]
-    assert f"median of {len(NEW)} frames, decoder weight" in capsys.readouterr().out
+    assert f"median of {len(NEW)} frames" in capsys.readouterr().out
 
 
 def test_another_method_and_several_avatars_are_refused(tube_run: Path, tube_cells: dict[str, Path], capsys) -> None:
@@ -164,21 +163,11 @@ def test_an_empty_image_does_not_agree(trained: Trained, monkeypatch: pytest.Mon
     assert agreements(avatar, capture)["near"].median_db < 30
 
 
-def test_an_agreement_has_the_least_weight_of_the_decoders(trained: Trained, monkeypatch: pytest.MonkeyPatch) -> None:
-    avatar, capture = trained
-    monkeypatch.setattr(
-        TextureDrawer, "decoder_weight", lambda self, textures: 0.7 if self.novelty(textures) > 1e-3 else 1.0
-    )
-    new = agreements(avatar, capture)["new"]
-    assert new.least_decoder_weight == 0.7
-    assert f"of {len(NEW)} frames, decoder weight 0.70 or more" in new.line()
-
-
 def test_an_avatar_without_decoders_agrees_too(capture: Capture) -> None:
     config = plus("ci")
     avatar = AshAvatar.from_capture(replace(config, model=replace(config.model, motion=False)), capture)
     for agreement in agreements(avatar, with_near_motion(capture)).values():
-        assert agreement.least_decoder_weight == 1.0 and agreement.least_db > AGREES_DB
+        assert agreement.least_db > AGREES_DB
 
 
 def test_a_scaled_camera_sees_the_same_window_in_the_middle(capture):
@@ -216,7 +205,7 @@ def test_the_parts_of_a_step_are_timed_and_make_up_the_whole(capture, tmp_path, 
         still = (
             {"pose backward"} if method == "ddc_plus" else set()
         )  # most of its steps have no gradient in the vertices
-        more = {profile.STATIC} | ({profile.VERTICES} if method == "ddc_plus" else set())
+        more = {profile.VERTICES} if method == "ddc_plus" else set()
         assert set(ms) == {*profile.PARTS, *more, "train_step"}
         assert all(value > 0 for part, value in ms.items() if part not in still)
         assert sum(ms[part] for part in profile.PARTS) == pytest.approx(2 * ms["step"], rel=0.3)
@@ -236,5 +225,4 @@ def test_a_part_that_takes_longer_is_seen(capture, tmp_path):
     avatar._decode = slow
     candidate = profile.profiled(avatar, images, "it", tmp_path)
     parts = {part: ms for number in range(3) for part, ms in candidate.call(number).items()}
-    slowed = ("decode", "step", profile.STATIC)
-    assert parts["decode"] > 500 and max(ms for part, ms in parts.items() if part not in slowed) < 500
+    assert parts["decode"] > 500 and max(ms for part, ms in parts.items() if part not in ("decode", "step")) < 500

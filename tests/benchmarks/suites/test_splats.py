@@ -62,9 +62,7 @@ def test_the_truth_is_none_of_the_methods_gaussians(capture):
 
 
 def test_ash_recovers_them_by_training(capture, tmp_path):
-    avatar = AshAvatar.from_capture(
-        replace(plus("ci"), model=replace(plus("ci").model, motion=False, novelty_scale=0.0)), capture
-    )
+    avatar = AshAvatar.from_capture(replace(plus("ci"), model=replace(plus("ci").model, motion=False)), capture)
     seen = capture.training_only()
     camera, frame = capture.splits["novel_pose"].views[0]
     before = foreground_psnr(avatar, capture, [(camera, frame)])
