@@ -42,6 +42,7 @@ COMMANDS = {
     "report": "runs:ReportCommand",
     "compare": "runs:CompareCommand",
     "eval": "runs:EvalCommand",
+    "score": "runs:ScoreCommand",
     "verify": "captures:VerifyCommand",
     "motions": "captures:MotionsCommand",
     "check-method": "methods:CheckMethodCommand",

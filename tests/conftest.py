@@ -30,6 +30,7 @@ def pytest_sessionstart() -> None:
 LONG = (
     "test_kill", "test_cli", "test_cli_help", "test_readers", "test_isolation", "test_launcher", "test_conformance",
     "test_rates", "test_plugin", "test_in_a_browser", "test_engine", "test_switch_parts", "test_ci_suite",
+    "test_predictions",
 )  # fmt: skip
 
 

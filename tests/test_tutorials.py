@@ -10,7 +10,7 @@ import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-TUTORIALS = ("ablation", "gate", "truth")
+TUTORIALS = ("ablation", "gate", "predictions", "truth")
 
 
 def run_tutorial(name: str, folder: Path) -> None:
@@ -49,6 +49,7 @@ def run_command(line: str, folder: Path) -> None:
     assert done.returncode == int(comment or 0), f"{line}\n{done.stdout}\n{done.stderr}"
 
 
+@pytest.mark.timeout(900)  # Commands of minutes where other work runs beside them.
 @pytest.mark.parametrize("name", TUTORIALS)
 def test_a_tutorial_runs_as_it_is_written(name: str, tmp_path: Path) -> None:
     run_tutorial(name, tmp_path)

@@ -227,6 +227,7 @@ class RunTables:
         self.all_rows = load(results, captures)
         self.rows = self.all_rows[self.all_rows["axis"] == ""]  # of unperturbed captures
         self.images, self.outcomes = load_images(results), load_outcomes(results)
+        self.brought = frozenset(result.config.method for result in results if result.brought is not None)
         self.curves, self.snapshots = load_curves(results), load_snapshots(results)
         self.summary = summarise(self.rows)
         self.scenes = tuple(self.rows["scene"].unique())

@@ -197,13 +197,22 @@ def _agreement(shown: np.ndarray, scored: np.ndarray) -> float:
     return metrics.psnr(shown[..., :3], scored[..., :3], region if region.any() else None)
 
 
-def scored_views(cell: Cell, capture: Capture, views: Sequence[View]) -> list[ViewScore]:
-    """Every stored picture against the truth, with how far its pose lies from the nearest that training shows."""
+def scored_views(cell: Cell, capture: Capture, views: Sequence[View], *, alpha: bool = True) -> list[ViewScore]:
+    """Every stored picture against the truth, with how far its pose lies from the nearest that training shows.
+
+    `alpha`: whether the pictures have any; without, only colours of the whole frame are scored.
+    """
     frames = sorted({view.frame for view in views})
     far = novelty_deg(capture.motion, train=capture.splits["train"].frames, test=frames)
     novelty = dict(zip(frames, far, strict=True))
     scored = [_score(cell, capture, view, stored_prediction(cell, capture, view)) for view in views]
+    if not alpha:
+        scored = [replace(each, scores=_of_whole_frame(each.scores)) for each in scored]
     return [replace(each, scores=each.scores | {NOVELTY: novelty[each.frame]}) for each in scored]
+
+
+def _of_whole_frame(scores: dict[tuple[str, str], float]) -> dict[tuple[str, str], float]:
+    return {name: value for name, value in scores.items() if name[0] == "full" and name != ("full", "iou")}
 
 
 def _score(cell: Cell, capture: Capture, view: View, prediction: np.ndarray) -> ViewScore:
@@ -243,7 +252,8 @@ def _perceptual(device: str) -> Callable[[np.ndarray, np.ndarray], float | None]
 def quality_summary(cell: Cell, capture: Capture, scored: list[ViewScore]) -> tuple[Summary, ...]:
     """What follows from the stored pictures: means over images, the gap to training views, flicker."""
     means = _image_summary(scored)
-    return means + _gap_summary(means) + _flicker_summary(cell, capture, scored)
+    with_alpha = all(("foreground", "psnr") in view.scores for view in scored)
+    return means + _gap_summary(means) + (_flicker_summary(cell, capture, scored) if with_alpha else ())
 
 
 def _image_summary(scored: list[ViewScore]) -> tuple[Summary, ...]:

@@ -39,6 +39,8 @@ WRONG_BY_MM = {
 # Who may look at truth/ is decided here, not by the method: these get the whole capture, all others its training part.
 ORACLES = frozenset().union(*WRONG_BY_MM.values())
 
+BROUGHT = "predictions"  # the source of a cell whose pictures were rendered elsewhere; of a row, `predictions:DIR`
+
 ROW_NAME = re.compile(r"[\w.:]*")  # what a row's name begins with; how it differs from that method follows
 
 
@@ -79,6 +81,12 @@ def named_method(row: str) -> str:
     """The method whose name a row's name begins with; of `package.module:factory`, the factory."""
     matched = ROW_NAME.match(row)
     return (matched.group() if matched else row).rpartition(":")[2]
+
+
+def brought_folder(of: str) -> Path | None:
+    """DIR of `predictions:DIR`, pictures that were rendered elsewhere; None for a method."""
+    prefix = f"{BROUGHT}:"
+    return Path(of.removeprefix(prefix)) if of.startswith(prefix) else None
 
 
 def methods() -> dict[str, Method]:

@@ -26,7 +26,8 @@ from ash.files import InputError, disk_problem
 from ash.protocol import Avatar
 from benchmarks import provenance
 from benchmarks.cell.evaluation import MethodOutputs, draw_all, quality_summary, score_outputs, scored_views
-from benchmarks.cell.registry import ORACLES, code_version, find_method, make_avatar, offered
+from benchmarks.cell.predictions import open_predictions, score_predictions
+from benchmarks.cell.registry import BROUGHT, ORACLES, code_version, find_method, make_avatar, offered
 from benchmarks.cell.sandbox import WORK, add_method_paths, adopt_orphans, seen_by_method, watched
 from benchmarks.cell.schema import (
     CHECKPOINT,
@@ -102,7 +103,8 @@ def run_cell(cell: Cell) -> CellResult:
     _clear(cell)
     resumed = _has_left(cell)
     try:
-        result = _train_and_evaluate(cell, capture)
+        brought = cell.config.source == BROUGHT
+        result = _score_brought(cell, capture) if brought else _train_and_evaluate(cell, capture)
     except MethodFailed as error:
         # What an earlier attempt left may be damaged, and a whole training ends the same.
         if resumed and not isinstance(error, CaptureModifiedError):
@@ -129,6 +131,8 @@ def evaluate_cell(cell: Cell, *, device: str | None = None) -> CellResult:
         InputError: the cell is unfinished, or its method does not load or draw any more.
     """
     before = _finished(cell)
+    if before.brought is not None:
+        raise InputError(f"{cell.folder}: its pictures were brought; `eval --scores-only` scores them again")
     capture = _capture_of(cell)
     spent = _spent_before(before)
     try:
@@ -182,7 +186,7 @@ def rescore_cell(cell: Cell) -> CellResult:
     before = _finished(cell)
     capture = _capture_of(cell)
     views = [View(split=view.split, camera=view.camera, frame=view.frame) for view in before.views]
-    scored = scored_views(cell, capture, views)
+    scored = scored_views(cell, capture, views, alpha=before.has_alpha)
     for old, new in zip(before.views, scored, strict=True):
         if old.prediction != new.prediction:
             name = prediction_path(cell.folder, View(split=new.split, camera=new.camera, frame=new.frame))
@@ -204,6 +208,20 @@ def _train_and_evaluate(cell: Cell, capture: Capture) -> CellResult:
         drawn = draw_all(cell, capture, client)
     stage_out(cell)
     return score_outputs(cell, capture, drawn, _training_time(cell, made, drawn))
+
+
+def _score_brought(cell: Cell, capture: Capture) -> CellResult:
+    """Check the brought pictures again, and score them.
+
+    Raises:
+        InputError: they are not what they were when the cell was planned.
+    """
+    if cell.predictions is None:
+        raise InputError(f"{cell.folder}: expected the folder of its predictions in config.json")
+    predictions = open_predictions(cell.predictions, capture, info=cell.info)
+    if predictions.digest != cell.config.code:
+        raise InputError(f"{cell.predictions}: the pictures changed since the run began; start it again")
+    return score_predictions(cell, capture, predictions)
 
 
 def _training_time(cell: Cell, made: TrainingTime, drawn: MethodOutputs) -> TrainingTime:

@@ -31,8 +31,16 @@ from benchmarks.cell.metrics import IMAGE_SPLITS, LPIPS_SCORES, METRICS, PROTOCO
 DrawnBy = Literal["method", "display", "trainer"]  # a timed frame; "trainer": the display did not open there
 Status = Literal["done", "crashed", "diverged", "timeout", "out of memory"]
 VARIED = ("factory", "changes", "subject")
-PRINTED = ("reason", "training", "provenance", "drawn_on", "evaluated_code")  # texts of a result, for people to read
+PRINTED = (
+    "reason",
+    "training",
+    "provenance",
+    "drawn_on",
+    "evaluated_code",
+    "brought",
+)  # texts of a result, for people to read
 CHECKPOINT = "model.safetensors"
+BROUGHT_NOTE = "brought pictures; what it saw is not known"  # of rows whose pictures were rendered elsewhere
 RETIRED = ("choice", "search_seconds")
 
 
@@ -190,6 +198,18 @@ class Provenance:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class Brought:
+    """What the authors of brought pictures say of them; none of it was measured here, and none is compared."""
+
+    alpha: Literal["straight", "premultiplied", "none"] = "straight"  # none: RGB, scored on the whole frame only
+    training_s: float | None = None  # seconds
+    frame_ms: float | None = None  # milliseconds per frame
+    device: str | None = None
+    parameters: int | None = None
+    commit: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class CellResult:
     """What came out of a cell. A failed cell has the worst score in every row, never a missing row."""
 
@@ -206,6 +226,12 @@ class CellResult:
     drawn_on: str = ""  # device of its pictures: `eval` may take another than the one that learned; empty: unknown
     evaluated_code: str = ""  # of `eval`, where it is not the code of the config, which trained; empty: the same code
     isolated: bool | None = None  # whether the method ran in a sandbox; None: an oracle, a failure, an old result
+    brought: Brought | None = None  # of pictures that were rendered elsewhere: what the method saw is not known
+
+    @property
+    def has_alpha(self) -> bool:
+        """Whether its pictures have alpha: those of methods do, brought ones may have none."""
+        return self.brought is None or self.brought.alpha != "none"
 
     def value(self, split: str, region: str, metric: str) -> float | None:
         """One number of the summary."""
@@ -215,11 +241,17 @@ class CellResult:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Cell:
-    """A config and where it lives: the cell's own folder, and the folder of its capture on this machine."""
+    """A config and where it lives: the cell's own folder, and the folder of its capture on this machine.
+
+    Where pictures are brought that were rendered elsewhere: their folder, and the file that says what they are, if it
+    does not lie there.
+    """
 
     config: CellConfig
     folder: Path
     capture_folder: Path = field(default=Path())
+    predictions: Path | None = None
+    info: Path | None = None
 
 
 def failed_result(
@@ -250,6 +282,8 @@ def write_config(cell: Cell) -> None:
         "key": cell.config.key,
         "capture_folder": str(cell.capture_folder.resolve()),
     }
+    places = {"predictions": cell.predictions, "info": cell.info}
+    content |= {name: str(place.resolve()) for name, place in places.items() if place is not None}
     write_json(cell.folder / "config.json", content)
 
 
@@ -263,7 +297,8 @@ def read_cell(folder: Path) -> Cell:
         if config.key != content["key"]:
             raise ValueError("its key does not fit its content")
         capture_folder = _find_capture(Path(content["capture_folder"]), folder, identity=config.capture)
-        return Cell(config=config, folder=folder, capture_folder=capture_folder)
+        places = {name: Path(content[name]) for name in ("predictions", "info") if name in content}
+        return Cell(config=config, folder=folder, capture_folder=capture_folder, **places)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: expected the config of a cell ({error})") from error
 

@@ -51,8 +51,8 @@ def on_device(suite: "Suite", device: str) -> "Suite":
 
 
 def _moved(row: "MethodSpec", preset: str, device: str) -> "MethodSpec":
-    from benchmarks.cell.registry import offered
+    from benchmarks.cell.registry import brought_folder, offered
 
-    if not hasattr(offered(row.of or row.name, preset), "device"):
+    if brought_folder(row.of) is not None or not hasattr(offered(row.of or row.name, preset), "device"):
         return row
     return replace(row, changes=tuple(sorted({**dict(row.changes), "device": device}.items())))

@@ -14,6 +14,7 @@ from benchmarks.commands.arguments import (
     DONE,
     FAILED,
     INTERRUPTED,
+    WRONG_INPUT,
     Argument,
     Count,
     CountIfAny,
@@ -172,6 +173,11 @@ class ReportCommand:
     out: Folder | None = None  # where the report goes; default: the run's own folder, for several runs/report
     publish: Folder | None = None  # copy it there, to be committed: all but the page, and every cell's numbers
     chosen_on: Folder | None = None  # a run of the same rows with --validation: how what suffices there does here
+    # write its tables alone: a suite of ours or FILE.toml with [[table]]; default: the table of the run's suite
+    table: Annotated[str, Argument(metavar="FILE")] = ""
+    latex: File | None = None  # where these tables go as LaTeX, which compiles alone and in a paper
+    markdown: File | None = None  # and as Markdown
+    csv: File | None = None  # and as numbers
 
     def __call__(self) -> int:
         """Write it, and copy it where that is asked for."""
@@ -187,6 +193,8 @@ class ReportCommand:
             run = read_run(out)
         else:
             run = gathered(self.runs, self.out or Path("runs/report"), command=typed())
+        if self.table or self.latex or self.markdown or self.csv:
+            return self._tables(run)
         if self.chosen_on is None:
             code = _report(run)
         else:  # The report says so; the run that --publish leaves is as it was.
@@ -198,6 +206,19 @@ class ReportCommand:
 
             publish(run, self.publish)
         return code
+
+    def _tables(self, run: "RunOnDisk") -> int:
+        from benchmarks.report.page import write_tables
+        from benchmarks.suites.files import suite_file
+
+        if self.publish or self.chosen_on:
+            raise InputError(
+                "--table, --latex, --markdown, --csv: expected no --publish and no --chosen-on beside them"
+            )
+        file = suite_file(self.table) if self.table else None
+        lines = write_tables(run, file, latex=self.latex, markdown=self.markdown, csv=self.csv)
+        print("\n".join(lines))
+        return DONE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,7 +273,7 @@ class TrainCommand:
         from benchmarks.suites.captures import require_intact
         from benchmarks.suites.engine import plan_cells
         from benchmarks.suites.runs import cell_for
-        from benchmarks.suites.suites import CaptureSpec, CellSpec, varied_name
+        from benchmarks.suites.suites import AS_GIVEN, CaptureSpec, CellSpec, varied_name
 
         changes, device = self.changes, chosen_device(self.device)
         if device != CPU:
@@ -263,7 +284,7 @@ class TrainCommand:
         require_intact(self.capture)
         row = self.row or varied_name(self.method, changes)
         spec = CellSpec(
-            capture=CaptureSpec(scene=capture.scene, size="as given", seed=capture.manifest.seed),
+            capture=CaptureSpec(scene=capture.scene, size=AS_GIVEN, seed=capture.manifest.seed),
             method=row,
             factory="" if row == self.method else self.method,
             preset=self.preset,
@@ -279,6 +300,55 @@ class TrainCommand:
         else:
             write_config(cell)
             print(f"training {cell.config.title} in {cell.folder}", file=sys.stderr)
+        return _tell(cell.folder, run_cell(cell))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoreCommand:
+    """Score pictures that were rendered elsewhere: PNG files, named as `export --format test-views` says.
+
+    They become a cell like any other, for `report` and `compare`. Missing, extra, wrongly sized and damaged files are
+    named, a line each, and then nothing is scored. docs/predictions.md goes through it.
+    """
+
+    pictures: Positional[Path]  # the folder that holds images/SPLIT/CAMERA/FRAME.png
+    capture: Positional[Path]  # the capture's folder
+    name: str  # what the row is called in tables
+    info: File | None = None  # alpha, cost and device as the authors report them; default: info.json in the folder
+    out: Folder = Path("runs/train")  # where cells go
+
+    def __call__(self) -> int:
+        """One cell of brought pictures."""
+        from ash.capture.formats import load_capture
+        from ash.files import require_plain
+        from benchmarks.cell.predictions import BadPredictions
+        from benchmarks.cell.registry import BROUGHT
+        from benchmarks.cell.run import run_cell
+        from benchmarks.cell.schema import write_config
+        from benchmarks.suites.captures import require_intact
+        from benchmarks.suites.runs import cell_for
+        from benchmarks.suites.suites import AS_GIVEN, CaptureSpec, CellSpec, MethodSpec
+
+        try:
+            row = MethodSpec(name=require_plain(self.name, what="row"), of=f"{BROUGHT}:{self.pictures}")
+        except ValueError as error:
+            raise InputError(f"--name: {error}") from error
+        capture = load_capture(self.capture)
+        require_intact(self.capture)
+        spec = CellSpec(
+            capture=CaptureSpec(scene=capture.scene, size=AS_GIVEN, seed=capture.manifest.seed),
+            method=row.name,
+            factory=row.of,
+            preset=AS_GIVEN,
+            seed=0,
+        )
+        try:
+            cell = cell_for(spec, self.capture, self.out, info=self.info)
+        except BadPredictions as error:
+            for line in error.lines:
+                print(f"ash-bench: {line}", file=sys.stderr)
+            return WRONG_INPUT
+        write_config(cell)
         return _tell(cell.folder, run_cell(cell))
 
 
@@ -373,12 +443,18 @@ def _tell(folder: Path, result: Any) -> int:
     if result.status != "done":
         print(f"{result.config.title}: {result.status}: {result.reason}", file=sys.stderr)
         return FAILED
-    parts = []
+    from benchmarks.cell.schema import BROUGHT_NOTE
+
+    parts, region = [], "foreground" if result.has_alpha else "full"
     for split in ("novel_view", "near_pose", "novel_pose", "far_pose"):
-        if (value := result.value(split, "foreground", "psnr")) is not None:
+        if (value := result.value(split, region, "psnr")) is not None:
             parts.append(f"{split.replace('_', ' ')} {value:.2f} dB")
-    parts.append(f"{result.value('speed', '', 'frame_ms'):.1f} ms per frame")
+    if (value := result.value("speed", "", "frame_ms")) is not None:
+        parts.append(f"{value:.1f} ms per frame")
+    if result.brought is not None:
+        parts.append(BROUGHT_NOTE)
     if result.evaluated_code:
         parts.append(f"scored by code {result.evaluated_code}, trained by {result.config.code}")
-    print(f"{result.config.title}: {', '.join(parts)} (foreground PSNR) in {folder}")
+    where = "foreground PSNR" if result.has_alpha else "PSNR of the whole frame, for there is no alpha"
+    print(f"{result.config.title}: {', '.join(parts)} ({where}) in {folder}")
     return DONE

@@ -169,6 +169,8 @@ def _predictions(cells: list[tuple[Cell, CellResult]]) -> set[tuple[int, int, st
 def _worst_frames(before: tuple[Cell, CellResult], after: tuple[Cell, CellResult], album: Album) -> Iterator[Strip]:
     """The worst views of each run that the other has as well, of the first seed; none where pictures are missing."""
     shown = [Shown(cell=cell, result=result) for cell, result in (before, after)]
+    if not all(each.result.has_alpha for each in shown):
+        return
     views = [{(view.split, view.camera, view.frame): view for view in each.result.views} for each in shown]
     shared = [key for key in views[0] if key in views[1] and key[0] in RANKED_SPLITS]  # not training views
     chosen: dict[tuple[str, str, int], str] = {}

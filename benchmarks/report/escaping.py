@@ -34,6 +34,7 @@ TEX = str.maketrans(
         "↑": r"$\uparrow$",
         "↓": r"$\downarrow$",
         "±": r"$\pm$",
+        "\N{MINUS SIGN}": "$-$",
         "\u2009": r"\,",
     }
 )

@@ -24,7 +24,8 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
     for split in RANKED_SPLITS:
         panel = SPLIT_NAMES[split].words.capitalize()
         samples = samples_of(tables.of(scene), foreground(split))
-        spans = intervals({m: samples[m] for m in frames if m in samples}) if samples else {}
+        timed = {m: samples[m] for m in frames if m in samples}  # Brought pictures have no time.
+        spans = intervals(timed) if timed else {}
         floor = max((span.mean for span in spans.values()), default=0.0) - SPAN_DB
         shown = {m: span for m, span in spans.items() if span.mean >= floor}
         competing = [each for each in pareto.candidates(tables, scene, split)]

@@ -3,7 +3,7 @@
 Everything comes from the results of the run's cells; the page needs no network and no other file.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -15,10 +15,11 @@ from ash.files import InputError, write_atomic
 from benchmarks.analysis.results import RunTables, csv_of
 from benchmarks.analysis.style import titles_of
 from benchmarks.cell.schema import printable
-from benchmarks.report import content, escaping, glossary, sections, sentences, tables, vega
+from benchmarks.report import author_table, content, escaping, glossary, sections, sentences, tables, vega
+from benchmarks.report.author_table import AuthorTable
 from benchmarks.report.content import Report, Section
 from benchmarks.report.pictures import Album
-from benchmarks.report.scene import FEW_WORST, MANY, WORST, SceneData, SceneReport, scene_report
+from benchmarks.report.scene import FEW_WORST, MANY, WORST, SceneData, scene_report
 from benchmarks.report.vega import Figure
 from benchmarks.suites.archive import write_archive
 from benchmarks.suites.runs import Run, results_of
@@ -27,7 +28,6 @@ PUBLISHED = ("report.md", "results.csv", "tables.tex", "chart_*.svg", "pictures_
 PICTURE_SUFFIXES = (".svg", ".png")
 CELLS = "cells.zip"
 PICTURE_BYTES = 10_000_000  # of all pictures that are stepped through; worst frames come on top
-LATEX_HEAD = "% Needs booktabs and colortbl, and \\definecolor{antiquebrass}{rgb}{0.98, 0.92, 0.84}\n"
 
 
 def write_report(run: Run, chosen_on: Run | None = None) -> list[str]:
@@ -45,6 +45,8 @@ def write_report(run: Run, chosen_on: Run | None = None) -> list[str]:
 def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
     results = results_of(run)
     run_tables = RunTables(results, {cell.config.key: printable(cell.capture_folder.name) for cell in run.cells})
+    own = author_table.of_tables(run_tables, run.table)
+    default = author_table.by_default(run_tables)
     album = Album()
     many = sum(len(run_tables.methods(scene)) for scene in run_tables.scenes) > MANY
     scenes = [
@@ -67,6 +69,7 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
         title=f"Report of suite {run.suite}",
         sections=(
             Section(title="", blocks=(content.Text(text=run.about[:1].upper() + run.about[1:] + "."),)),
+            *([Section(title="Tables of the suite", blocks=_blocks(own))] if own else []),
             *sections.ablations(run_tables, None if chosen_on is None else RunTables(results_of(chosen_on))),
             *sections.stabilities(run_tables),
             *curves,
@@ -82,13 +85,45 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
     files |= {name: png for scene in scenes for name, png in scene.sheets.items()}
     files |= {
         "results.csv": csv_of(_without_formulas(run_tables.all_rows)).encode(),
-        "tables.tex": _latex(scenes).encode(),
+        "tables.tex": author_table.latex(own or author_table.of_tables(run_tables, default)).encode(),
         "report.md": render(report, "md").encode(),
         "report.html": render(report, "html", album).encode(),
     }
     for name, data in files.items():
         write_atomic(run.folder / name, data)
-    return [*_terminal(run_tables, [*curves, *novelty]), f"report: {run.folder / 'report.html'}"]
+    shown = [line for table in own for line in (tables.plain(table.shown), table.caption, "")]
+    return [*(shown or _terminal(run_tables, [*curves, *novelty])), f"report: {run.folder / 'report.html'}"]
+
+
+def write_tables(
+    run: Run,
+    file: Path | None = None,
+    *,
+    latex: Path | None = None,
+    markdown: Path | None = None,
+    csv: Path | None = None,
+) -> list[str]:
+    """Write the tables that `file` describes, by default those of the run's suite; returns lines for the terminal.
+
+    Raises:
+        InputError: see `author_table.of_run`; nothing is written then.
+    """
+    made = author_table.of_run(run, file)
+    numbers = author_table.numbers_of(made)
+    texts = {name: numbers[name].map(escaping.csv_text) for name in ("row", "method", "scene", "text")}
+    if latex is not None:
+        write_atomic(latex, author_table.latex(made).encode())
+    if markdown is not None:
+        page = render(Report(title="Tables", sections=(Section(title="", blocks=_blocks(made)),)), "md")
+        write_atomic(markdown, page.encode())
+    if csv is not None:
+        write_atomic(csv, numbers.assign(**texts).to_csv(lineterminator="\n").encode())
+    lines = [line for table in made for line in (tables.plain(table.shown), "", table.caption, "")]
+    return [*lines, *(str(path) for path in (latex, markdown, csv) if path is not None)]
+
+
+def _blocks(made: Sequence[AuthorTable]) -> tuple[content.Block, ...]:
+    return tuple(block for table in made for block in (table.shown, content.Text(text=table.caption, note=True)))
 
 
 def publish(run: Run, folder: Path) -> None:
@@ -152,11 +187,6 @@ def environment(form: Literal["html", "md"]) -> Environment:
 
 def _without_formulas(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(**{name: rows[name].map(escaping.csv_text) for name in ("scene", "method", "capture")})
-
-
-def _latex(scenes: Iterable[SceneReport]) -> str:
-    main_tables = [table for scene in scenes for table in scene.tables]
-    return LATEX_HEAD + "\n\n".join(f"% {escaping.one_line(t.title)}\n{tables.latex(t)}" for t in main_tables) + "\n"
 
 
 def _terminal(run_tables: RunTables, curves: list[Section]) -> list[str]:

@@ -123,13 +123,16 @@ def what_was_compared(data: SceneData, capture: Capture | None) -> str:
     run_tables, scene, config = data.tables, data.scene, data.results[0].config
     rows = run_tables.of(scene)
     methods = run_tables.methods(scene)
-    presets = ", ".join(dict.fromkeys(result.config.preset for result in data.results))
+    presets = ", ".join(dict.fromkeys(result.config.preset for result in data.results if result.brought is None))
     folders, subjects = (list(map(str, rows[name].unique())) for name in ("capture", "subject"))
     shown = f"capture {folders[0]}" if len(folders) == 1 else f"{len(folders)} captures, {folders[0]} to {folders[-1]}"
     who = f"subject{'s' if subjects[1:] else ''} {', '.join(subjects)}"
-    names = "; ".join(style_of(method).title for method in methods)
-    text = f"{_count(len(methods), 'method')} ({names}) were trained with preset {presets} on scene {scene}"
-    text += f" ({shown}; {who})"
+    here, elsewhere = ([m for m in methods if (m in run_tables.brought) is brought] for brought in (False, True))
+    names = ["; ".join(style_of(method).title for method in some) for some in (here, elsewhere)]
+    parts = [f"{_count(len(here), 'method')} ({names[0]}) were trained with preset {presets}"] if here else []
+    parts += [f"pictures of {_count(len(elsewhere), 'method')} ({names[1]}) were brought"] if elsewhere else []
+    text = f"{' and '.join(parts)} on scene {scene} ({shown}; {who})"
+    text = text[:1].upper() + text[1:]
     if capture is not None:
         camera, train = next(iter(capture.cameras.values())), capture.splits["train"]
         text += f": {_count(len(train.cameras), 'camera')}, {_count(len(train.frames), 'frame')}"
@@ -250,7 +253,7 @@ def _conventions(run_tables: RunTables, scene: str) -> tuple[Block, ...]:
 
 def _pictured(data: SceneData) -> tuple[Capture | None, list[Shown], str]:
     """The capture and the first finished cell of each method on it, the user's first; or why there are none."""
-    done = {result.config.key: result for result in data.results if result.status == "done"}
+    done = {result.config.key: result for result in data.results if result.status == "done" and result.has_alpha}
     first: dict[str, Shown] = {}
     for cell in data.run.cells:
         if cell.config.key in done:
@@ -258,7 +261,7 @@ def _pictured(data: SceneData) -> tuple[Capture | None, list[Shown], str]:
     shown = [first[method] for method in data.tables.methods(data.scene) if method in first]
     shown = [each for each in shown if each.cell.config.capture == shown[0].cell.config.capture]
     if not shown:
-        return None, [], "No pictures: every cell failed."
+        return None, [], "No pictures: every cell failed, or has pictures without alpha."
     try:
         return load_capture(shown[0].cell.capture_folder), shown, ""
     except InputError as error:

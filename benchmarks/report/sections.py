@@ -1,23 +1,26 @@
 """What a report says of a run as a whole, beside its scenes: ablations, stability, cost of training, the paper."""
 
+import tomllib
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
 import pandas as pd
 
-from benchmarks.analysis import ablation_matrix, curves, paper, pareto, stability, template_error
+from benchmarks.analysis import ablation_matrix, curves, pareto, stability, template_error
 from benchmarks.analysis.differences import differences
-from benchmarks.analysis.results import FRAME_MS, RANKED_SPLITS, Quantity, RunTables, foreground
+from benchmarks.analysis.results import RANKED_SPLITS, Quantity, RunTables
 from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell.metrics import METRICS, PROTOCOL
 from benchmarks.cell.schema import CellResult
-from benchmarks.report import charts, vega
+from benchmarks.report import author_table, charts, vega
 from benchmarks.report.content import Block, Bullets, Section, Table, Text
 from benchmarks.report.figures import line_figure
 from benchmarks.report.glossary import GLOSSARY
 from benchmarks.report.tables import text_of
 from benchmarks.report.vega import Figure, Series
+from benchmarks.suites.files import suite_file
 from benchmarks.suites.stress import AXES
+from benchmarks.suites.tables import tables_of
 
 WHISKERS = "Whiskers: 95 % interval over seeds, or over captures where there are several."
 LIMIT_DB = 2.0  # differences from which on a matrix has the deepest colour
@@ -37,6 +40,7 @@ CHOSEN_NOTE = (
     f"that was best there, with the 90 % interval. Equivalent: the interval lies within {pareto.SUFFICIENT_DB} dB."
 )
 NOT_CHOSEN = "On subjects for validation nothing was chosen: no scene or row in common with this run, or too few."
+PAPER_SUITES = ("paper", "cameras")
 PAPER_NOTE = (
     "The paper: captured data at 1285x940 and weeks on a GPU, PSNR of the release's convention. Ours: foreground PSNR "
     "and LPIPS on the release's window, on {suite}. Levels cannot be compared, orders can."
@@ -332,26 +336,15 @@ def _stability(tables: RunTables, scene: str, breakdowns: pd.DataFrame, steps: p
 
 
 def beside_the_paper(tables: RunTables, suite: str) -> list[Section]:
-    """Our rows beside those of the paper's tables."""
+    """Our rows beside those of the paper's tables, of which at least two were run: `[[table]]` of the suites there."""
+    files = [suite_file(name) for name in PAPER_SUITES]
+    specs = [spec for path in files for spec in tables_of(tomllib.loads(path.read_text())["table"], place=path.name)]
     blocks: list[Block] = []
-    asked = [
-        (SPLIT_NAMES[split].title, quantity, METRICS[quantity.metric].title)
-        for split in RANKED_SPLITS
-        for quantity in (foreground(split), Quantity(split, "release_crop", "lpips"))
-    ]
-    asked.append(("Cost", FRAME_MS, "ms per frame"))
-    for table in paper.tables_beside(tables):
-        texts = {}
-        for group, k in (("paper, seen motion", "view"), ("paper, unseen motion", "pose")):
-            for i, title in enumerate(("PSNR", "LPIPS")):
-                texts[group, title] = [f"{getattr(row, k)[i]:.2f}" for row in table.rows]
-        for group, quantity, title in asked:
-            values = [tables.get(table.scene, row.method or "", quantity) for row in table.rows]
-            texts[group, title] = [text_of(row, METRICS[quantity.metric]) for row in values]
-        frame = pd.DataFrame(texts, index=[row.title for row in table.rows])
-        blocks += [Table(title=table.title, frame=frame)]
-        notes = tuple(row.note for row in table.rows if row.note)
-        blocks += [Bullets(items=notes)] if notes else []
+    for spec in specs:
+        run = tables.methods(spec.scene)
+        if sum(row.method in run or row.instead in run for group in spec.rows for row in group) > 1:
+            for made in author_table.of_tables(tables, [spec]):
+                blocks += [made.shown, Text(text=made.caption, note=True)]
     note = Text(text=PAPER_NOTE.format(suite=suite), note=True)
     return [Section(title="Beside the paper", blocks=(*blocks, note))] if blocks else []
 

@@ -1,10 +1,12 @@
 """The sentences that head a report, computed from its numbers. Differences are taken before anything is rounded."""
 
+import math
 from collections.abc import Sequence
 from itertools import chain
 
 from benchmarks.analysis import paper, pareto
-from benchmarks.analysis.results import FRAME_MS, RANKED_SPLITS, Quantity, RunTables, foreground
+from benchmarks.analysis.results import FRAME_MS, RANKED_SPLITS, Quantity, RunTables, compare, foreground
+from benchmarks.analysis.statistics import Comparison
 from benchmarks.analysis.style import EXACT, PAIRS, SPLIT_NAMES, style_of
 from benchmarks.cell.registry import is_oracle
 from benchmarks.cell.schema import CellResult
@@ -33,43 +35,49 @@ def sentence(text: str) -> str:
 
 
 def headline(tables: RunTables, scene: str) -> str:
-    """The finding of a scene: who is ahead and by how much; and whose training had not reached its plateau."""
+    """Whose training had not reached its plateau; then the finding of a scene, with its certainty."""
     short = _with_outcome(tables, scene, "not plateau")
-    rest = f" Not at their plateau when training ended: {sentence(titles(short))}" if short else ""
-    return _finding(tables, scene) + rest
+    first = f"Not at their plateau when training ended: {sentence(titles(short))} " if short else ""
+    return first + _finding(tables, scene)
 
 
 def _finding(tables: RunTables, scene: str) -> str:
     if pairs := [pair for pair in PAIRS if set(pair) <= set(tables.methods(scene))]:
         return " ".join(_pair(tables, scene, *pair) for pair in pairs)
     means = tables.values(scene, foreground(), tables.methods(scene, oracles=False))
-    ranked = sorted(means.items(), key=lambda pair: -pair[1])
+    ranked = sorted(means, key=lambda name: -means[name])
     if not ranked:
         return f"On {scene}, no method was ranked on novel views."
-    (best, most), *others = ranked
-    text = f"On {scene}, {style_of(best).title} is best on novel views with {most:.1f} dB"
-    if others and most - others[0][1] < TOO_CLOSE_DB:
-        text += f", level with {style_of(others[0][0]).title} (within {TOO_CLOSE_DB:g} dB)"
-    elif others:
-        text += f", {most - others[0][1]:.1f} dB ahead of {style_of(others[0][0]).title}"
-    return sentence(text)
+    if len(ranked) == 1:
+        return f"On {scene}, {sentence(f'{style_of(ranked[0]).title} has {means[ranked[0]]:.1f} dB on novel views')}"
+    return _pair(tables, scene, *ranked[:2], splits=("novel_view",))
 
 
-def _pair(tables: RunTables, scene: str, splats: str, mesh: str) -> str:
-    names = style_of(splats).title, style_of(mesh).title
-    if lost := [method for method in (splats, mesh) if tables.failed(scene, method)]:
+def _pair(tables: RunTables, scene: str, first: str, second: str, *, splits: Sequence[str] = RANKED_SPLITS) -> str:
+    """Two methods by split: what is known of the difference, and both means."""
+    names = style_of(first).title, style_of(second).title
+    if lost := [method for method in (first, second) if tables.failed(scene, method)]:
         return f"On {scene}, {titles(lost)} failed: {names[0]} and {names[1]} cannot be compared."
     parts = []
-    for split in RANKED_SPLITS:
-        means = tables.values(scene, foreground(split), (splats, mesh))
-        if len(means) == 2:
-            lead = means[splats] - means[mesh]
-            far = f"{abs(lead):.1f} dB {'ahead of' if lead > 0 else 'behind'} {names[1]}"
-            standing = f"level with {names[1]}" if abs(lead) < TOO_CLOSE_DB else far
-            parts.append(f"{standing} on {SPLIT_NAMES[split].words} ({means[splats]:.1f} and {means[mesh]:.1f} dB)")
+    for split in splits:
+        means = tables.values(scene, foreground(split), (first, second))
+        compared = compare(tables.of(scene), first, second, foreground(split))
+        if len(means) == 2 and compared is not None:
+            numbers = f"{means[first]:.1f} and {means[second]:.1f} dB"
+            parts.append(f"{_standing(compared, numbers)} on {SPLIT_NAMES[split].words}")
     if not parts:
         return f"On {scene}, {names[0]} and {names[1]} were not both scored."
-    return f"On {scene}, {names[0]} is {' and '.join(parts)}."
+    verdict = "" if tables.unit(scene) else "; one value of each, hence no verdict"
+    return f"On {scene}, {names[0]} against {names[1]}: {' and '.join(parts)}{verdict}."
+
+
+def _standing(compared: Comparison, numbers: str) -> str:
+    """The verdict on a difference of PSNR, with its interval; of single values the difference alone."""
+    difference = f"{compared.mean:+.1f} dB"
+    if math.isnan(compared.p):
+        return f"{difference} ({numbers})"
+    words = "not shown to differ" if compared.verdict == "unclear" else compared.verdict
+    return f"{words} ({difference} [{compared.low:+.1f}, {compared.high:+.1f}]; {numbers})"
 
 
 def remarks(tables: RunTables, scene: str) -> list[str]:
@@ -118,9 +126,12 @@ def _template(tables: RunTables, scene: str) -> str:
     views, poses = (tables.values(scene, Quantity(split, "", "template_mm"), names) for split in RANKED_SPLITS)
     if not views:
         return ""
-    method, error = next(iter(views.items()))
-    later = f", {poses[method]:.1f} mm on novel poses" if method in poses else ""
-    return f"The error of the template that methods were given is {error:.1f} mm (root mean square){later}."
+    stood_on: dict[str, list[str]] = {}  # methods by what is said of their template
+    for method, error in views.items():
+        later = f", {poses[method]:.1f} mm on novel poses" if method in poses else ""
+        stood_on.setdefault(f"{error:.1f} mm on novel views{later}", []).append(method)
+    parts = [f"{text} ({titles(methods)})" if len(stood_on) > 1 else text for text, methods in stood_on.items()]
+    return f"Error of the template that methods were given, root mean square: {'; '.join(parts)}."
 
 
 def _noise(tables: RunTables, scene: str) -> str:
@@ -167,6 +178,7 @@ def doubts(results: Sequence[CellResult]) -> tuple[str, ...]:
     for result in results:
         if result.evaluated_code:
             lines.append(f"{result.config.title}: scored by other code ({result.evaluated_code}) than trained it.")
+    lines += dict.fromkeys(_reported(result) for result in results if result.brought is not None)
     for kind, words in DRAWN_BY.items():
         timed = dict.fromkeys(r.config.method for r in results if r.timing is not None and r.timing.drawn_by == kind)
         lines += [f"{titles([*timed])}: {words}."] if timed else []
@@ -180,6 +192,19 @@ def doubts(results: Sequence[CellResult]) -> tuple[str, ...]:
         why = "it was stopped, or shared its core" if wall > cpu else "it used more than one core"
         lines.append(f"{result.config.title} trained {wall:.0f} s by the clock and {cpu:.0f} s of CPU time: {why}.")
     return tuple(lines)
+
+
+def _reported(result: CellResult) -> str:
+    """What the authors of brought pictures say of them, never among what was measured."""
+    brought = result.brought
+    assert brought is not None
+    parts = [f"training {brought.training_s:g} s"] if brought.training_s is not None else []
+    parts += [f"{brought.frame_ms:g} ms per frame"] if brought.frame_ms is not None else []
+    parts += [f"{brought.parameters} parameters"] if brought.parameters is not None else []
+    parts += [f"{name} {value}" for name in ("device", "commit") if (value := getattr(brought, name))]
+    text = f"{style_of(result.config.method).title}: brought pictures, rendered elsewhere; what it saw is not known."
+    text += " Without alpha: only the whole frame is scored." if brought.alpha == "none" else ""
+    return f"{text} Reported by its authors, not measured here: {', '.join(parts)}." if parts else text
 
 
 def frontier(tables: RunTables, scene: str) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Tables of a scene's numbers, and tables as text for terminals and LaTeX."""
+"""Tables of a scene's numbers, and tables as text for terminals."""
 
 import re
 from collections.abc import Collection, Sequence
@@ -10,8 +10,8 @@ from benchmarks.analysis.results import HELD_OUT_SPLITS, RANKED_SPLITS, Quantity
 from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell.metrics import METRICS, Metric
 from benchmarks.cell.registry import is_oracle
+from benchmarks.cell.schema import BROUGHT_NOTE
 from benchmarks.report.content import Mark, Table
-from benchmarks.report.escaping import latex as tex
 
 REGION_TITLES = {"full": "whole frame", "release_crop": "release crop", "white_frame": "on white"}
 SEVERAL_REGIONS = ("psnr", "ssim", "flip")  # Their columns name the region, unless it is the foreground.
@@ -112,33 +112,11 @@ def plain(table: Table) -> str:
     return "\n".join(line.rstrip() for line in (spans, *lines))
 
 
-def latex(table: Table) -> str:
-    """A `booktabs` table; best and second best are coloured as in the paper. Needs booktabs and colortbl."""
-    spans = " & ".join(rf"\multicolumn{{{span}}}{{c}}{{{tex(group)}}}" for group, span in table.groups)
-    rules, start = "", 2
-    for _, span in table.groups:
-        rules += rf"\cmidrule(lr){{{start}-{start + span - 1}}}"
-        start += span
-    lines = [
-        r"\begin{tabular}{l" + "r" * len(table.heads) + "}",
-        r"\toprule",
-        *([f" & {spans} \\\\", rules] if any(group for group, _ in table.groups) else []),
-        " & " + " & ".join(tex(title) for _, title in table.heads) + r" \\",
-        r"\midrule",
-    ]
-    colours = {"best": r"\cellcolor{yellow}", "second": r"\cellcolor{antiquebrass}"}
-    for index, (name, texts) in enumerate(table.rows):
-        if index and index == len(table.rows) - table.below:
-            lines.append(r"\midrule")
-        cells = " & ".join(colours.get(mark, "") + tex(text) for text, mark in texts)
-        lines.append(f"{tex(name)} & {cells} \\\\")
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
-
-
 def _name(tables: RunTables, scene: str, method: str, *, exposed: bool) -> str:
     failed = tables.failed(scene, method)
     notes = [f"{failed} of {tables.cells['cells'][scene, method]} failed"] if failed else []
     notes += ["not isolated"] if exposed else []
+    notes += [BROUGHT_NOTE] if method in tables.brought else []
     return f"{style_of(method).title} ({', '.join(notes)})" if notes else style_of(method).title
 
 

@@ -19,7 +19,7 @@ WHEN = (1980, 1, 1, 0, 0, 0)  # of every entry, so that equal runs are equal byt
 def write_archive(run: Run, path: Path) -> None:
     """Write `run.json` and the `config.json` and `result.json` of every finished cell into a zip file.
 
-    Of a capture's folder only the name is kept: where it lay says nothing to others.
+    Of a capture's folder only the name is kept, of brought pictures none: where they lay says nothing to others.
     """
     keys: list[str] = []
     entries: dict[str, Any] = {}
@@ -27,6 +27,7 @@ def write_archive(run: Run, path: Path) -> None:
         if (cell.folder / "result.json").exists():
             config = read_json(cell.folder / "config.json")  # A gathered run may call the scene by another name.
             keys.append(config["key"])
+            config = {name: value for name, value in config.items() if name not in ("predictions", "info")}
             entries[f"cells/{keys[-1]}/config.json"] = config | {"capture_folder": cell.capture_folder.name}
             entries[f"cells/{keys[-1]}/result.json"] = read_json(cell.folder / "result.json")
     entries[RUN_FILE] = description_of(run) | {"cells": keys}

@@ -11,11 +11,14 @@
     limit_minutes = 60           # of one cell, and limit_mb
     cell_minutes = 2.5           # what one cell takes, for estimates
 
+What the report's own table shows stands in `[[table]]`, see `benchmarks.suites.tables`.
 A method's table may have a `title` for reports: `{ of = "ash", name = "narrow", title = "Half the width", ... }`.
+A method `{ of = "predictions:DIR", name = "mine" }` is pictures that were rendered elsewhere (docs/predictions.md).
 `[[methods]]` and `[[scenes]]` as tables of their own mean the same; all further keys of such a table are replacements
 in the scene or in the method's configuration. Of a scene that names some of the methods, only those run on it.
 """
 
+import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -29,9 +32,10 @@ from ash.capture.manifest import read_manifest
 from ash.fields import WRITTEN, Changes, for_json, suggest
 from ash.files import InputError, hash_of, open_regular
 from benchmarks.aliases import OLD_SIZES, OLD_SUITES
-from benchmarks.cell.registry import configured, find_method
+from benchmarks.cell.registry import brought_folder, configured, find_method, methods
 from benchmarks.suites.stress import Stress
-from benchmarks.suites.suites import MethodSpec, SceneSpec, Suite, varied_name
+from benchmarks.suites.suites import AS_GIVEN, MethodSpec, SceneSpec, Suite, varied_name
+from benchmarks.suites.tables import TableSpec, tables_of
 
 FOLDER = Path(__file__).parent
 LARGEST = 1 << 20  # bytes of a suite's file
@@ -59,12 +63,17 @@ def our_rows() -> frozenset[tuple[str, str, str]]:
     """Name, factory and hash of the changes of every varied method in our own suites."""
     found = set()
     for path in suite_files().values():
-        for row in tomlkit.parse(path.read_text()).unwrap()["methods"]:
+        for row in tomllib.loads(path.read_text())["methods"]:  # tomlkit takes seconds for all.
             if isinstance(row, dict):
                 changes = _dotted({key: value for key, value in row.items() if key not in METHOD_KEYS})
                 name = row.get("name") or varied_name(row["of"], changes)
                 found.add((name, row["of"], hash_of(for_json(changes))))
     return frozenset(found)
+
+
+def methods_known() -> frozenset[str]:
+    """Every name that a row of methods may have without a definition of its own: installed, or varied in our suites."""
+    return frozenset((*methods(), *(name for name, _, _ in our_rows())))
 
 
 def find_suite(name: str | Path) -> Suite:
@@ -91,6 +100,32 @@ def read_suite(path: Path) -> Suite:
     Raises:
         InputError: names file, line and key.
     """
+    text, content = _parsed(path)
+    return _Reader(path, text).suite(content)
+
+
+def read_tables(path: Path) -> tuple[tuple[TableSpec, ...], frozenset[str]]:
+    """The tables of a file, a suite's or one of its own, and the suite's rows and scenes, which they may name.
+
+    Raises:
+        InputError: it has no table, or something in it is wrong; names the file and the key.
+    """
+    _, content = _parsed(path)
+    if "methods" in content:
+        suite = read_suite(path)
+        names = [row.name for row in suite.methods] + [scene.name for scene in suite.scenes]
+        tables, own = suite.table, frozenset(names)
+    elif unknown := [key for key in content if key != "table"]:
+        raise InputError(f"{path}: unknown key {unknown[0]!r}, {suggest(unknown[0], ('table',))}")
+    else:
+        tables, own = tables_of(content.get("table", []), place=str(path)), frozenset[str]()
+    if not tables:
+        raise InputError(f"{path}: expected a [[table]] with `columns`")
+    return tables, own
+
+
+def _parsed(path: Path) -> tuple[str, dict[str, Any]]:
+    """The text of a file, and what it says."""
     try:
         with open_regular(path, most=LARGEST) as file:
             text = file.read().decode()
@@ -99,7 +134,7 @@ def read_suite(path: Path) -> Suite:
         raise InputError(f"{path}: expected TOML in UTF-8 ({error})") from error
     except TOMLKitError as error:  # Not every kind knows its line.
         raise InputError(f"{path}:{getattr(error, 'line', 1)}: not valid TOML ({error})") from error
-    return _Reader(path, text).suite(content)
+    return text, content
 
 
 SUITE_KEYS = tuple(field.name for field in fields(Suite) if field.name not in ("name", "validation"))
@@ -129,10 +164,18 @@ class _Reader:
         methods = tuple(self.method(index, row, preset) for index, row in enumerate(self.rows(content, "methods")))
         stresses = tuple(self.stresses(content.get("stresses", {})))
         try:
-            return Suite(name=self.path.stem, scenes=scenes, methods=methods, stresses=stresses, **plain)
+            tables = tables_of(content.get("table", []), place="table")
         except InputError as error:
-            named = [key for key in content if str(error).startswith((f"{key}:", f"two {key}"))]
-            raise self.error(tuple(named), str(error)) from error
+            raise self.error(("table",), str(error)) from error
+        named = {row.method for table in tables for group in table.rows for row in group if row.method}
+        known = tuple(row.name for row in methods)
+        if unknown := sorted(named - {*known, *methods_known()} if named - set(known) else ()):
+            raise self.error(("table",), f"table: no row {unknown[0]!r}, {suggest(unknown[0], known)}")
+        try:
+            return Suite(name=self.path.stem, scenes=scenes, methods=methods, stresses=stresses, table=tables, **plain)
+        except InputError as error:
+            keys = [key for key in content if str(error).startswith((f"{key}:", f"two {key}"))]
+            raise self.error(tuple(keys), str(error)) from error
 
     def rows(self, content: dict[str, Any], key: str) -> list[dict[str, Any]]:
         """Scenes or methods: names, which stand for themselves, and tables."""
@@ -167,16 +210,30 @@ class _Reader:
         place: Place = ("methods", index)
         known, changes = self.split(row, place, METHOD_KEYS)
         of = self.required(known, place)
+        if brought_folder(of) is not None:
+            return self.brought(known, changes, place)
         self.located((*place, "of"), lambda: find_method(of))
         own = known.get("preset", "")
         self.each(place, changes, lambda some: configured(of, own or preset, some))
         varied = changes + ((("preset", own),) if own else ())
         name, title = known.get("name") or varied_name(of, varied), known.get("title", "")
-        if not title.isprintable() or len(title) > LONGEST_TITLE:
-            raise self.error((*place, "title"), f"title: expected at most {LONGEST_TITLE} printable characters")
+        self.check_title(title, place)
         if title and name == of and find_method(of).is_ours:
             raise self.error((*place, "title"), f"title: {of} has one; expected it beside a name of the row's own")
         return self.located(place, lambda: MethodSpec(name=name, of=of, preset=own, changes=changes, title=title))  # type: ignore[no-any-return]
+
+    def brought(self, known: dict[str, str], changes: Changes, place: Place) -> MethodSpec:
+        """A row of pictures that were rendered elsewhere: nothing of it can be changed."""
+        if changes or "preset" in known or "name" not in known:
+            raise self.error(place, "pictures are taken as they are: expected the keys of, name and perhaps title")
+        name, of, title = known["name"], known["of"], known.get("title", "")
+        self.check_title(title, place)
+        return self.located(place, lambda: MethodSpec(name=name, of=of, preset=AS_GIVEN, title=title))  # type: ignore[no-any-return]
+
+    def check_title(self, title: str, place: Place) -> None:
+        """Refuse a title that no table can hold."""
+        if not title.isprintable() or len(title) > LONGEST_TITLE:
+            raise self.error((*place, "title"), f"title: expected at most {LONGEST_TITLE} printable characters")
 
     def stresses(self, table: Any) -> Iterator[Stress]:
         """Every step of every axis."""
@@ -249,7 +306,7 @@ class _Reader:
 def given_capture(folder: Path, *, name: str = "") -> SceneSpec:
     """A finished capture as a row of a suite; it is called as its scene is, where no name is given."""
     manifest = read_manifest(folder)
-    return SceneSpec(name=name or manifest.scene, size=manifest.size or "as given", folder=folder)
+    return SceneSpec(name=name or manifest.scene, size=manifest.size or AS_GIVEN, folder=folder)
 
 
 def given_captures(folders: Sequence[Path]) -> tuple[SceneSpec, ...]:

@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ from ash.fields import for_json
 from ash.files import InputError, read_json, require_plain, run_lock, write_json
 from benchmarks.cell import sandbox
 from benchmarks.cell.metrics import PROTOCOL
-from benchmarks.cell.registry import code_version, configured, find_method, offered
+from benchmarks.cell.predictions import open_predictions
+from benchmarks.cell.registry import BROUGHT, brought_folder, code_version, configured, find_method, offered
 from benchmarks.cell.sandbox import clean_environment
 from benchmarks.cell.schema import Cell, CellConfig, CellResult, printable, read_cell, result_of
 from benchmarks.suites.captures import (
@@ -29,6 +30,7 @@ from benchmarks.suites.captures import (
 from benchmarks.suites.engine import Limits, make_executor, plan_cells, require_executor, run_cells, shard_of
 from benchmarks.suites.progress import Progress
 from benchmarks.suites.suites import CellSpec, Suite
+from benchmarks.suites.tables import TableSpec
 from synth.person.cast import VALIDATION
 
 RUN_FILE = "run.json"
@@ -46,6 +48,7 @@ class Run:
     cells: tuple[Cell, ...]
     absent: tuple[str, ...] = ()  # keys of cells that have no folder: other shards have them
     titles: dict[str, str] = field(default_factory=dict)  # of methods, where the suite gives them
+    table: tuple[TableSpec, ...] = ()  # what its own table shows
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -58,6 +61,7 @@ class RunFile:
     command: str
     cells: tuple[str, ...]
     titles: dict[str, str] = field(default_factory=dict)
+    table: tuple[TableSpec, ...] = ()
     cell_titles: dict[str, str] = field(default_factory=dict)
 
 
@@ -118,6 +122,10 @@ def require_runnable(suite: Suite, options: RunOptions) -> list[str]:
     notes = []
     for row in suite.methods:
         of, preset = row.of or row.name, row.preset or suite.preset
+        if (brought := brought_folder(of)) is not None:
+            if not brought.is_dir():
+                raise InputError(f"row {row.name!r}: expected the folder of its pictures, got {brought}")
+            continue
         method = find_method(of)
         if row.changes:
             if configured(of, preset, row.changes) == offered(of, preset):
@@ -159,6 +167,7 @@ def _run_suite(suite: Suite, options: RunOptions) -> Run:
         command=options.command,
         cells=tuple(cells),
         titles={method.name: method.title for method in suite.methods if method.title},
+        table=suite.table,
     )
     write_run(run)
     run_missing(shard_of(cells, options.shard) if options.shard else cells, suite, options)
@@ -182,9 +191,22 @@ def run_missing(cells: Sequence[Cell], suite: Suite, options: RunOptions) -> Non
     progress.close()
 
 
-def cell_for(spec: CellSpec, capture_folder: Path, out: Path) -> Cell:
-    """The cell of a method on a capture, in its folder under `out`."""
+def cell_for(spec: CellSpec, capture_folder: Path, out: Path, *, info: Path | None = None) -> Cell:
+    """The cell of a method on a capture, in its folder under `out`; of brought pictures, `info` says what they are.
+
+    Pictures for several captures lie each in a folder that is called as its capture's.
+
+    Raises:
+        InputError: brought pictures cannot be scored.
+    """
     capture = load_capture(capture_folder)
+    brought = brought_folder(spec.factory)
+    if brought is not None and (own := brought / capture_folder.resolve().name).is_dir():
+        brought = own
+    if brought is None:
+        code = code_version(spec.factory or spec.method)
+    else:
+        code = open_predictions(brought, capture, info=info).digest
     config = CellConfig(
         scene=spec.capture.scene,
         size=spec.capture.size,
@@ -194,14 +216,15 @@ def cell_for(spec: CellSpec, capture_folder: Path, out: Path) -> Cell:
         method=spec.method,
         preset=spec.preset,
         seed=spec.seed,
-        code=code_version(spec.factory or spec.method),
-        factory=spec.factory,
+        code=code,
+        factory=spec.factory if brought is None else BROUGHT,
         changes=for_json(spec.changes),
         axis=spec.capture.stress.axis if spec.capture.stress else "",
         severity=spec.capture.stress.severity if spec.capture.stress else 0.0,
         subject=subject_of(capture.manifest),
     )
-    return Cell(config=config, folder=out / "cells" / config.key, capture_folder=capture_folder)
+    folder = out / "cells" / config.key
+    return Cell(config=config, folder=folder, capture_folder=capture_folder, predictions=brought, info=info)
 
 
 def write_run(run: Run) -> None:
@@ -218,6 +241,7 @@ def description_of(run: Run) -> dict[str, Any]:
         "command": run.command,
         "cells": [cell.config.key for cell in run.cells],
         **({"titles": run.titles} if run.titles else {}),
+        **({"table": [asdict(table) for table in run.table]} if run.table else {}),
         "cell_titles": {cell.config.key: cell.config.title for cell in run.cells},
     }
 
@@ -249,7 +273,7 @@ def read_run(folder: Path) -> Run:
     present = [key for key in keys if (folder / "cells" / key / "config.json").exists()]
     cells = tuple(read_cell(folder / "cells" / key) for key in present)
     absent = tuple(key for key in keys if key not in present)
-    return Run(folder=folder, cells=cells, absent=absent, titles=titles, **names)
+    return Run(folder=folder, cells=cells, absent=absent, titles=titles, table=file.table, **names)
 
 
 def require_complete(run: Run) -> Run:
@@ -286,7 +310,8 @@ def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
     named = [_told_apart(cell) if cell.config.place in mixed else cell for cell in cells]
     about = f"cells of {', '.join(map(str, folders))}"
     titles = {name: title for run in reversed(runs) for name, title in run.titles.items()}  # The first run's first.
-    return Run(folder=out, suite=out.name, about=about, command=command, cells=tuple(named), titles=titles)
+    table = next((run.table for run in runs if run.table), ())
+    return Run(folder=out, suite=out.name, about=about, command=command, cells=tuple(named), titles=titles, table=table)
 
 
 def require_for_choosing(run: Run) -> Run:

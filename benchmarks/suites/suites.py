@@ -7,11 +7,13 @@ from pathlib import Path
 
 from ash.fields import Changes, suggest
 from ash.files import InputError, hash_of
-from benchmarks.cell.registry import ORACLES, find_method, is_oracle, named_method
+from benchmarks.cell.registry import ORACLES, brought_folder, find_method, is_oracle, methods, named_method
 from benchmarks.suites.stress import Stress
+from benchmarks.suites.tables import TableSpec
 from synth.person.cast import VALIDATION
 
 MOST_SEEDS = 1000
+AS_GIVEN = "as given"  # size of a capture, or preset of brought pictures, that nobody says
 LONGEST_VALUE = 24  # Characters of a changed value in a name; its hash stands for a longer one.
 
 
@@ -29,7 +31,10 @@ class SceneSpec:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class MethodSpec:
-    """A row of methods: an entry point or `package.module:factory`, perhaps with its configuration changed."""
+    """A row of methods: an entry point or `package.module:factory`, perhaps with its configuration changed.
+
+    Or `predictions:DIR`, pictures that were rendered elsewhere.
+    """
 
     name: str  # in tables
     of: str = ""  # the entry point or factory, where it has another name
@@ -38,12 +43,16 @@ class MethodSpec:
     title: str = ""  # in reports; none: the name
 
     def __post_init__(self) -> None:
-        """Refuse an oracle under a competitor's name, and a competitor under an oracle's."""
+        """Refuse an oracle under a competitor's name, a competitor under an oracle's, and pictures under a method's."""
         oracle, method = self.of in ORACLES, named_method(self.of)
         if oracle and named_method(self.name) != method:
             raise InputError(f"method {self.name!r}: expected a name that begins with {method!r}, an oracle")
         if self.of and not oracle and is_oracle(self.name):
             raise InputError(f"method {self.name!r}: expected a name that is no oracle's")
+        if brought_folder(self.of) is not None and named_method(self.name) in methods():
+            raise InputError(
+                f"method {self.name!r}: pictures are brought, expected a name that no installed method has"
+            )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -92,6 +101,7 @@ class Suite:
     subjects: int = 1
     cell_minutes: float = 1.0
     stresses: tuple[Stress, ...] = ()
+    table: tuple[TableSpec, ...] = ()  # that the report shows
     limit_minutes: float = 60.0
     limit_mb: int = 8192
     validation: bool = False  # on the people that are there to choose by, whom no table of results has
@@ -149,6 +159,8 @@ class Suite:
                 for method in self.methods:
                     if chosen[capture.scene] and method.name not in chosen[capture.scene]:
                         continue
+                    if seed and brought_folder(method.of) is not None:
+                        continue  # The same pictures again would pass for a second training.
                     yield CellSpec(
                         capture=capture,
                         method=method.name,

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ash.capture.dataset import Capture, Split
+from ash.capture.dataset import Capture, Split, scan_path
 from ash.capture.formats import write_cameras, write_skeleton, write_template
 from ash.files import InputError, write_arrays, write_atomic, write_image, write_json
 from synth.export.official import export_official
+from synth.export.readme import PLAIN, TEST_VIEWS, readme
 from synth.posing import bone_frames, dual_quaternion_skinning, rotmat_to_unitquat, skinning_transforms
 
 
@@ -90,36 +91,40 @@ View = tuple[str, str, int]  # split, camera, frame
 
 
 def export_plain(capture: Capture, folder: Path) -> Path:
-    """The training images with their cameras, poses and template, for a program that reads JSON, NumPy and PNG."""
+    """The training images with cameras, poses, template and scans, for a program that reads JSON, NumPy and PNG.
+
+    README.md there says what each file means.
+    """
     train = capture.splits["train"]
     for camera, frame in train.views:
         write_image(folder / _image(camera, frame), capture.image(camera, frame))
     _write_model(capture, folder, cameras=train.cameras, frames=train.frames)
     images = [{"camera": camera, "frame": frame, "image": _image(camera, frame)} for camera, frame in train.views]
     write_json(folder / "views.json", {"views": images})
-    _write_about(capture, folder, f"split train, {len(images)} images, straight alpha; poses.npz: {POSES}")
+    for frame in train.frames:
+        if (scan := scan_path(capture.folder, frame)).is_file():
+            write_atomic(scan_path(folder, frame), scan.read_bytes())
+    write_atomic(folder / "README.md", readme(PLAIN, capture))
+    _write_about(capture, folder, f"split train, {len(images)} images, straight alpha; README.md says what is what")
     return folder
 
 
 def export_test_views(capture: Capture, folder: Path, *, views: Sequence[View]) -> Path:
-    """What a method elsewhere is asked to render: cameras and poses of the scored views, none of their images."""
+    """What a method elsewhere is asked to render: cameras and poses of the scored views, none of their images.
+
+    Pictures are named as they are in a cell, so that `ash-bench score` reads them; README.md there says how.
+    """
     rows = [
         {"split": split, "camera": camera, "frame": frame, "image": _image(camera, frame, split=split)}
         for split, camera, frame in views
     ]
     cameras = tuple(dict.fromkeys(camera for _, camera, _ in views))
     _write_model(capture, folder, cameras=cameras, frames=range(len(capture.motion.dofs)))
-    write_json(folder / "views.json", {"views": rows})
-    _write_about(
-        capture, folder, f"{len(rows)} views to render as RGBA PNG, colour on black, at `image`; poses.npz: {POSES}"
-    )
+    splits = {name: [row["image"] for row in rows if row["split"] == name] for name, _, _ in views}
+    write_json(folder / "views.json", {"views": rows, "splits": splits})
+    write_atomic(folder / "README.md", readme(TEST_VIEWS, capture))
+    _write_about(capture, folder, f"{len(rows)} views to render as PNG files; README.md says how")
     return folder
-
-
-POSES = (
-    "dofs (root translation in metres, then a rotation vector per joint in radians), joints and skinning "
-    "([f, j, 4, 4]: world from joint, world from rest pose)"
-)
 
 
 def _image(camera: str, frame: int, *, split: str = "") -> str:
@@ -127,8 +132,9 @@ def _image(camera: str, frame: int, *, split: str = "") -> str:
 
 
 def _write_model(capture: Capture, folder: Path, *, cameras: Sequence[str], frames: Sequence[int]) -> None:
-    """Cameras, skeleton, template, and the poses of some frames."""
+    """Cameras, skeleton, template, and the poses of some frames, also as the template that the skeleton moves."""
     motion, chosen = capture.motion, list(frames)
+    transforms = skinning_transforms(capture.skeleton, motion.dofs[chosen])
     write_cameras(folder / "cameras.json", [capture.cameras[name] for name in cameras])
     write_skeleton(folder / "skeleton.json", capture.skeleton)
     write_template(folder / "template.npz", capture.template)
@@ -139,8 +145,12 @@ def _write_model(capture: Capture, folder: Path, *, cameras: Sequence[str], fram
         fps=np.array(motion.fps),
         dofs=motion.dofs[chosen],
         joints=bone_frames(capture.skeleton, motion.dofs[chosen]),
-        skinning=skinning_transforms(capture.skeleton, motion.dofs[chosen]),
+        skinning=transforms,
     )
+    rest, weights = capture.template.vertices, capture.template.skin_weights
+    for frame, moved in zip(chosen, transforms, strict=True):
+        posed = dual_quaternion_skinning(rest, weights, moved)
+        write_arrays(folder / "posed_template" / f"{frame:06d}.npz", vertices=posed.astype(np.float32))
 
 
 def export_undistorted(capture: Capture, folder: Path) -> Path:

@@ -9,26 +9,30 @@ from benchmarks.analysis import paper
 from benchmarks.analysis.results import RunTables
 from benchmarks.cell.registry import offered
 from benchmarks.cell.schema import CellResult, Summary
-from benchmarks.report.content import Bullets, Table
+from benchmarks.report.content import Table, Text
 from benchmarks.report.sections import beside_the_paper
-from benchmarks.suites.files import find_suite
+from benchmarks.suites.files import find_suite, read_tables, suite_file
+from benchmarks.suites.tables import TableSpec
 
 
 def run(levels: dict[str, float], seeds: int = 3) -> RunTables:
     return RunTables([cell(m, level + 0.1 * seed, seed=seed) for m, level in levels.items() for seed in range(seeds)])
 
 
+def specs() -> list[TableSpec]:
+    return [spec for name in ("paper", "cameras") for spec in read_tables(suite_file(name))[0]]
+
+
 def test_the_papers_numbers_are_the_papers() -> None:
-    comparison = {row.title: row for row in paper.PAPER_TABLES[1].rows}
-    assert comparison["ASH"].view[0] - comparison["DDC"].view[0] == pytest.approx(7.37)  # "7.4 dB" in the text
-    assert [len(table.rows) for table in paper.PAPER_TABLES] == [5, 5, 5, 2, 4, 2]
+    comparison = {row.title: row.given for row in specs()[1].rows[0]}
+    assert comparison["ASH"]["view_psnr"] - comparison["DDC"]["view_psnr"] == pytest.approx(7.37)  # "7.4 dB" there
+    assert [len(spec.rows[0]) for spec in specs()] == [5, 5, 5, 2, 2, 4]
 
 
 def test_a_table_needs_two_of_its_methods() -> None:
-    assert [table.title for table in paper.tables_beside(run({"wo_disp": 20.0, "ash": 24.0}))] == [
-        "Ablation of components (Table 3)"
-    ]
-    assert paper.tables_beside(run({"ash": 24.0})) == ()
+    (section,) = beside_the_paper(run({"wo_disp": 20.0, "ash": 24.0}), "table")
+    assert sum(isinstance(block, Table) for block in section.blocks) == 1
+    assert beside_the_paper(run({"ash": 24.0}), "table") == []
 
 
 def test_methods_that_were_not_run_are_not_made_up() -> None:
@@ -39,22 +43,18 @@ def test_methods_that_were_not_run_are_not_made_up() -> None:
     assert table.frame.loc["ASH"].tolist()[4:6] == ["24.00", "n/a"], "no weights for LPIPS"
 
 
-def components(levels: dict[str, float]) -> tuple[Table, tuple[str, ...]]:
-    """The ablation of components as it is printed, and the notes below it."""
-    (section,) = beside_the_paper(run(levels), "table")
-    at = next(i for i, block in enumerate(section.blocks) if isinstance(block, Table) and "components" in block.title)
-    table, below = section.blocks[at : at + 2]
-    assert isinstance(table, Table)
-    return table, below.items if isinstance(below, Bullets) else ()
-
-
 def test_the_papers_static_row_is_compared_with_ours_of_as_few_frames_or_it_is_said() -> None:
-    table, notes = components({"wo_mot": 30.0, "wo_mot_truncated": 20.0, "ash": 24.0})
-    assert table.frame.iloc[0, 4].startswith("20.10") and notes == ()
-    table, notes = components({"wo_mot": 30.0, "ash": 24.0})
-    assert table.frame.iloc[0, 4].startswith("30.10")
-    assert notes == ("w/o mot.: ours saw all frames, the paper's 40 s of footage.",)
-    assert components({"wo_disp": 20.0, "ash": 24.0})[1] == (), "neither was run"
+    def components(levels: dict[str, float]) -> tuple[str, bool]:
+        (section,) = beside_the_paper(run(levels), "table")
+        table, caption = section.blocks[:2]
+        assert isinstance(table, Table) and isinstance(caption, Text) and "components (Table 3)" in caption.text
+        return str(table.frame.iloc[0, 4]), "ours saw all frames, the paper's 40 s of footage" in caption.text
+
+    text, said = components({"wo_mot": 30.0, "wo_mot_truncated": 20.0, "ash": 24.0})
+    assert text.startswith("20.10") and not said
+    text, said = components({"wo_mot": 30.0, "ash": 24.0})
+    assert text.startswith("30.10") and said
+    assert components({"wo_disp": 20.0, "ash": 24.0}) == ("n/a", False), "neither was run"
 
 
 def test_conventions_score_the_same_renders_and_leave_oracles_out() -> None:
@@ -87,6 +87,6 @@ def test_rows_on_a_part_of_the_views_train_on_the_papers_share(method: str) -> N
         assert training.camera_share == int(part) / int(whole) and training.footage_s == math.inf
 
 
-def test_the_suite_of_the_paper_has_all_of_its_rows_that_we_have() -> None:
-    ours = {row.method for table in paper.PAPER_TABLES for row in table.rows} - {None}
+def test_the_suites_of_the_paper_have_all_of_its_rows_that_we_have() -> None:
+    ours = {row.method for spec in specs() for row in spec.rows[0]} - {""}
     assert ours <= {row.name for row in find_suite("paper").methods}

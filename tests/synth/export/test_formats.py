@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.captures import write_tube_capture
 from PIL import Image
 
-from ash.capture.dataset import Capture
-from ash.capture.formats import load_capture
+from ash.capture.dataset import Capture, scan_path
+from ash.capture.formats import load_capture, read_scan
 from ash.files import InputError
 from synth.export.formats import export
 from synth.posing import linear_blend_skinning, skinning_transforms
@@ -91,7 +92,34 @@ def test_test_views_hold_poses_and_cameras_and_no_image(capture: Capture, tmp_pa
         camera for _, camera, _ in views
     }
     np.testing.assert_array_equal(np.load(tmp_path / "poses.npz")["dofs"], capture.motion.dofs)
+    document = json.loads((tmp_path / "views.json").read_text())
+    assert document["splits"] == {split: [f"images/{split}/{c}/{f:06d}.png"] for split, c, f in views}
+    assert "straight alpha" in (tmp_path / "README.md").read_text()
     assert not list(tmp_path.rglob("*.png"))
+    poses, template = np.load(tmp_path / "poses.npz"), np.load(tmp_path / "template.npz")
+    for row, frame in enumerate(poses["frame"]):
+        moved = np.load(tmp_path / "posed_template" / f"{frame:06d}.npz")["vertices"]
+        softer = linear_blend_skinning(template["vertices"], template["skin_weights"], poses["skinning"][row])
+        assert np.linalg.norm(moved - softer, axis=1).mean() < 0.01
+
+
+@pytest.mark.parametrize("form", ["nerfstudio", "colmap", "ash", "plain"])
+def test_no_export_of_the_training_part_holds_a_test_image(capture: Capture, tmp_path: Path, form: str):
+    """Compared by colours: the release's images have no alpha, its masks are black and white."""
+    export(capture, tmp_path, form=form)
+    train = {capture.image(*view)[..., :3].tobytes() for view in capture.splits["train"].views}
+    tests = [view for name, split in capture.splits.items() if name != "train" for view in split.views]
+    held_out = {capture.image(*view)[..., :3].tobytes() for view in tests} - train
+    images = [np.array(Image.open(path).convert("RGB")).tobytes() for path in tmp_path.rglob("*.png")]
+    assert set(images) & train and held_out and not set(images) & held_out
+
+
+def test_scans_are_part_of_the_plain_files(tmp_path: Path):
+    capture = write_tube_capture(tmp_path / "tube")
+    export(capture, tmp_path / "plain", form="plain")
+    for frame in capture.splits["train"].frames:
+        vertices, _ = read_scan(capture, frame)
+        np.testing.assert_array_equal(np.load(scan_path(tmp_path / "plain", frame))["vertices"], vertices)
 
 
 def test_unknown_formats_are_refused(capture: Capture, tmp_path: Path):
