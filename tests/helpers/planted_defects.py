@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 import ash.avatar
-import ash.gaussians.texels
 import ash.model
+import ash.native.texels
 import ash.plus
 import ash.template.template
 import ash.textures
@@ -51,7 +51,7 @@ def sound_sh(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
 
 def sh_frame(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
     """Spherical harmonics stay in the canonical frame while their Gaussians turn."""
-    ash.gaussians.texels.rotate_sh = lambda quats, sh: sh
+    ash.native.texels.turn_sh = lambda quats, sh, *, threads: sh
     return sound_sh(capture, seed=seed, preset=preset)
 
 

@@ -37,12 +37,11 @@ def changes_undone() -> Iterator[None]:
                 setattr(owner, name, sound)
 
 
-def trained_image(
-    factory: Callable[..., Avatar], capture: Capture, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> np.ndarray:
+def trained_image(factory: Callable[..., Avatar], capture: Capture, folder: Path) -> np.ndarray:
     """What a method draws after a few steps of training on a tiny model."""
-    monkeypatch.setattr(planted_defects, "plus", lambda _: tiny_plus(steps=6, warmup_steps=2))
-    avatar = factory(capture.training_only(), seed=0, preset="ci")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(planted_defects, "plus", lambda _: tiny_plus(steps=6, warmup_steps=2))
+        avatar = factory(capture.training_only(), seed=0, preset="ci")
     avatar.fit(capture.training_only(), folder=folder)
     camera = next(iter(capture.cameras.values()))
     return avatar.render(Pose(capture.motion, 2), camera, clock=StageClock())
@@ -52,17 +51,26 @@ def none(capture: Capture, *, seed: int, preset: str) -> Avatar:
     return planted_defects._ash(capture, seed, preset)
 
 
+@pytest.fixture(scope="module")
+def sound_images(tube: Capture, tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
+    """What is drawn without a defect."""
+    folder = tmp_path_factory.mktemp("sound")
+    return {
+        sound.__name__: trained_image(sound, tube, folder / sound.__name__)
+        for sound in (none, planted_defects.sound_sh)
+    }
+
+
 @pytest.mark.parametrize("defect", planted_defects.DEFECTS, ids=lambda defect: defect.__name__)
 def test_a_defect_changes_what_is_drawn_or_what_it_costs(
     defect: Callable[..., Avatar],
     tube: Capture,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    sound_images: dict[str, np.ndarray],
     changes_undone: None,
 ) -> None:
-    sound = planted_defects.sound_sh if defect is planted_defects.sh_frame else none
-    before = trained_image(sound, tube, tmp_path / "sound", monkeypatch)
-    after = trained_image(defect, tube, tmp_path / "defect", monkeypatch)
+    before = sound_images["sound_sh" if defect is planted_defects.sh_frame else "none"]
+    after = trained_image(defect, tube, tmp_path)
     assert np.isfinite(after).all()
     assert np.array_equal(before, after) == (defect in (planted_defects.slow_splatter, planted_defects.more_memory))
 
