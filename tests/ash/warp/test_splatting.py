@@ -44,7 +44,7 @@ HARD = 5 * TOLERANCE
 def tube_scene() -> Scene:
     """The tube of the tests' capture, bent, before three of its cameras."""
     with torch.no_grad():
-        ((_, gaussians),) = known_model().pose_components(Pose(tube_motion(6), 4))
+        gaussians = known_model().posed_gaussians(Pose(tube_motion(6), 4))
     # Spheres have no gradient in their rotation but rounding.
     gaussians = replace(gaussians, scales=gaussians.scales * torch.tensor([1.0, 0.6, 0.3]))
     views = views_of(ring_cameras(3, 48))
