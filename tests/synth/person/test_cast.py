@@ -210,11 +210,12 @@ def test_a_block_of_bodies_is_baked_by_two_models_and_what_is_there_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     made: list[str] = []
-    anny, legacy = ModuleType("anny"), ModuleType("anny.models.legacy")
+    anny, models, legacy = ModuleType("anny"), ModuleType("anny.models"), ModuleType("anny.models.legacy")
+    models.full_model = SimpleNamespace()  # type: ignore[attr-defined]
     anny.create_fullbody_model = lambda: made.append("reduced")  # type: ignore[attr-defined]
     anny.Anny = lambda **options: made.append(options["phenotypes"])  # type: ignore[attr-defined]
     legacy.legacy_rig_to_anny = legacy.legacy_topology_to_anny = lambda *names: SimpleNamespace()  # type: ignore[attr-defined]
-    for name, module in (("anny", anny), ("anny.models", ModuleType("models")), ("anny.models.legacy", legacy)):
+    for name, module in (("anny", anny), ("anny.models", models), ("anny.models.legacy", legacy)):
         monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.setenv("ASH_BENCH_CACHE", str(tmp_path))
     shapes: list[Shape] = []
