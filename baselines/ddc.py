@@ -170,8 +170,8 @@ class DdcModel(MovingModule):
         posed = inputs.posed
         if self.refinement is None:
             return posed
-        moving = (inputs.window,) if isinstance(self.refinement, MotionRefinement) else ()
-        canonical = posed.canonical + self.refinement(*moving)
+        follows = isinstance(self.refinement, MotionRefinement)
+        canonical = posed.canonical + (self.refinement(inputs.window) if follows else self.refinement())
         return replace(posed, canonical=canonical, vertices=posed.transforms.apply(canonical))
 
 

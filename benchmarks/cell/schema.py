@@ -31,14 +31,8 @@ from benchmarks.cell.metrics import IMAGE_SPLITS, LPIPS_SCORES, METRICS, PROTOCO
 DrawnBy = Literal["method", "display", "trainer"]  # a timed frame; "trainer": the display did not open there
 Status = Literal["done", "crashed", "diverged", "timeout", "out of memory"]
 VARIED = ("factory", "changes", "subject")
-PRINTED = (
-    "reason",
-    "training",
-    "provenance",
-    "drawn_on",
-    "evaluated_code",
-    "brought",
-)  # texts of a result, for people to read
+# Texts of a result, for people to read.
+PRINTED = ("reason", "training", "provenance", "drawn_on", "evaluated_code", "brought")
 CHECKPOINT = "model.safetensors"
 BROUGHT_NOTE = "brought pictures; what it saw is not known"  # of rows whose pictures were rendered elsewhere
 RETIRED = ("choice", "search_seconds")

@@ -93,7 +93,7 @@ def of_run(run: Run, tables: Path | None = None) -> tuple[AuthorTable, ...]:
     with titles_of((cell.config for cell in run.cells), run.titles):
         run_tables = RunTables(results_of(run))
         if tables is None:
-            return of_tables(run_tables, run.table) or of_tables(run_tables, by_default(run_tables))
+            return of_tables(run_tables, run.table) or default_tables(run_tables)
         specs, own = read_tables(tables)
         ran = tuple(map(str, run_tables.rows["method"].unique()))
         there = f"the run has the methods {', '.join(ran)} on {', '.join(run_tables.scenes)}"
@@ -112,14 +112,15 @@ def of_run(run: Run, tables: Path | None = None) -> tuple[AuthorTable, ...]:
         return made
 
 
-def by_default(tables: RunTables) -> tuple[TableSpec, ...]:
+def default_tables(tables: RunTables) -> tuple[AuthorTable, ...]:
     """A table for each scene, narrow enough for one column of a paper: PSNR, LPIPS or FLIP, and times."""
     has_lpips = (tables.rows["metric"] == "lpips").any()
     qualities = [
         TableColumn(metric=m, split=s) for s in RANKED_SPLITS for m in ("psnr", "lpips" if has_lpips else "flip")
     ]
     columns = (*qualities, TableColumn(metric="frame_ms"), TableColumn(metric="train_s"))
-    return tuple(TableSpec(scene=scene, columns=columns, label=f"tab:{_plain(scene)}") for scene in tables.scenes)
+    specs = [TableSpec(scene=scene, columns=columns, label=f"tab:{_plain(scene)}") for scene in tables.scenes]
+    return of_tables(tables, specs)
 
 
 def _plain(name: str) -> str:

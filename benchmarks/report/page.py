@@ -46,7 +46,6 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
     results = results_of(run)
     run_tables = RunTables(results, {cell.config.key: printable(cell.capture_folder.name) for cell in run.cells})
     own = author_table.of_tables(run_tables, run.table)
-    default = author_table.by_default(run_tables)
     album = Album()
     many = sum(len(run_tables.methods(scene)) for scene in run_tables.scenes) > MANY
     scenes = [
@@ -85,7 +84,7 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
     files |= {name: png for scene in scenes for name, png in scene.sheets.items()}
     files |= {
         "results.csv": csv_of(_without_formulas(run_tables.all_rows)).encode(),
-        "tables.tex": author_table.latex(own or author_table.of_tables(run_tables, default)).encode(),
+        "tables.tex": author_table.latex(own or author_table.default_tables(run_tables)).encode(),
         "report.md": render(report, "md").encode(),
         "report.html": render(report, "html", album).encode(),
     }
