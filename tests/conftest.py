@@ -1,5 +1,6 @@
 """What holds for every test."""
 
+import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -7,9 +8,9 @@ from functools import cache
 
 import pytest
 from helpers.browser import chromium, visit  # noqa: F401  (fixtures for all)
-from helpers.sharing import shared, small_capture  # noqa: F401
+from helpers.sharing import ci_data, shared, small_capture  # noqa: F401
 
-from benchmarks.cell import registry
+from benchmarks.cell import metrics, registry
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -22,6 +23,7 @@ def can_be_interrupted() -> Iterator[None]:
 
 def pytest_sessionstart() -> None:
     """What is installed follows `sys.path` here; to read it anew takes a tenth of a second at each look."""
+    os.environ.setdefault(metrics.LPIPS_WEIGHTS, "none")  # They take a second in each of hundreds of cells.
     look = registry.methods
     seen = cache(lambda path: look())
     registry.methods = lambda: seen(tuple(sys.path))

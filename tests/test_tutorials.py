@@ -1,7 +1,9 @@
 """Every tutorial in docs/ runs as it is written: its files are written, its commands and its Python are executed."""
 
+import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -51,5 +53,7 @@ def run_command(line: str, folder: Path) -> None:
 
 @pytest.mark.timeout(900)  # Commands of minutes where other work runs beside them.
 @pytest.mark.parametrize("name", TUTORIALS)
-def test_a_tutorial_runs_as_it_is_written(name: str, tmp_path: Path) -> None:
+def test_a_tutorial_runs_as_it_is_written(name: str, ci_data: Path, tmp_path: Path) -> None:
+    """On a capture that is there already: it is made once for all."""
+    shutil.copytree(ci_data, tmp_path / "data", copy_function=os.link)
     run_tutorial(name, tmp_path)

@@ -41,6 +41,7 @@ from ash.training.stopping import (
 )
 
 LOG_EVERY = 50
+FIRST_STEPS = 8  # Each of them is logged, with its gradient: the gate compares them bit by bit.
 CHECKPOINT_SECONDS = 60.0  # Between two checkpoints.
 SNAPSHOT_SECONDS = tuple(round(30 * 2 ** (i / 2)) for i in range(13))  # Half a minute to half an hour of CPU time.
 
@@ -162,6 +163,9 @@ class Trainer:
             weight = 1 - min(self.config.ema, (1 + self.steps) / (10 + self.steps))
             torch._foreach_lerp_(list(self.average.values()), self.averaged, weight)
         self.steps += 1
+        if self.steps <= FIRST_STEPS:
+            gradients = [p.grad for p in self.learner.module.parameters() if p.grad is not None]
+            self._write_log(loss, gradient=float(torch.stack([g.double().norm() for g in gradients]).norm()))
         self._look(loss)
 
     def _look(self, loss: Tensor) -> None:
@@ -169,7 +173,8 @@ class Trainer:
         if self.images.reserved and (is_eval_step(self.steps) or self.has_ended):
             self._score()
         self.state = update(self.state, self.config, step=self.steps, seconds=self._elapsed())
-        if self.steps % LOG_EVERY == 1 or self.has_ended or self._score_of_this_step() is not None:
+        regular = self.steps % LOG_EVERY == 1 and self.steps > FIRST_STEPS
+        if regular or self.has_ended or self._score_of_this_step() is not None:
             self._write_log(loss)
         if self.config.snapshots:
             self._save_snapshots()
@@ -190,8 +195,8 @@ class Trainer:
         self.load()
         self.rate_scale = 0.5
 
-    def _write_log(self, loss: Tensor) -> None:
-        row = {"step": self.steps, "seconds": round(self._elapsed(), 3), "loss": float(loss.detach())}
+    def _write_log(self, loss: Tensor, **more: float) -> None:
+        row = {"step": self.steps, "seconds": round(self._elapsed(), 3), "loss": float(loss.detach()), **more}
         if (psnr := self._score_of_this_step()) is not None:
             row["train_psnr"] = psnr
         self.log.parent.mkdir(parents=True, exist_ok=True)

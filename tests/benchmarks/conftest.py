@@ -10,6 +10,7 @@ from helpers.captures import write_tube_capture
 from helpers.sharing import Shared
 
 from benchmarks import cli
+from benchmarks.cell import metrics
 from benchmarks.cell.schema import read_cell
 
 
@@ -20,13 +21,15 @@ def capture(shared: Shared) -> Path:
 
 
 @pytest.fixture(scope="session")
-def ci_run(shared: Shared) -> Path:
-    """The suite `ci` in `run`, its capture in `data`, and what it took in `seconds`."""
+def ci_run(shared: Shared, ci_data: Path) -> Path:
+    """The suite `ci` in `run`, and what it took in `seconds`."""
 
     def make(folder: Path) -> None:
         start = time.monotonic()
-        command = ["run", "ci", "--out", str(folder / "run"), "--data", str(folder / "data")]
-        assert cli.main(command) == cli.DONE
+        command = ["run", "ci", "--out", str(folder / "run"), "--data", str(ci_data)]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.delenv(metrics.LPIPS_WEIGHTS)
+            assert cli.main(command) == cli.DONE
         (folder / "seconds").write_text(f"{time.monotonic() - start:.1f}")
 
     return shared("ci", make)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.analysis.results import Quantity, RunTables, foreground
+from benchmarks.cell import metrics
 from benchmarks.cell.schema import CellResult
 from benchmarks.suites.files import find_suite
 from benchmarks.suites.runs import read_run, results_of
@@ -57,6 +58,15 @@ def require_quality(tables: RunTables, method: str, split: str, least_psnr: floa
     psnr, iou = (tables.get("mannequin", method, quantity) for quantity in asked)
     assert psnr is not None and psnr.value > least_psnr
     assert iou is not None and iou.value > least_iou
+
+
+def test_lpips_is_measured_where_its_weights_are(tables: RunTables, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(metrics.LPIPS_WEIGHTS)
+    if metrics.weights_file() is None:
+        pytest.skip("no weights for LPIPS here")
+    for method in tables.methods("mannequin"):
+        value = tables.get("mannequin", method, Quantity("novel_view", "full", "lpips"))
+        assert value is not None and 1 < value.value < 400
 
 
 def test_an_oracle_has_no_template_error_and_the_others_have_an_honest_one(tables: RunTables) -> None:

@@ -309,33 +309,6 @@ def test_shards_are_merged_into_the_undisturbed_run(finished: Path, boxes: str, 
     assert quality[0] == quality[1] and len(quality[0]) > 40
 
 
-def test_the_gate_on_a_run(finished: Path, tmp_path: Path, capsys) -> None:
-    baseline = tmp_path / "baseline.json"
-    gate = ["gate", "--baseline", str(baseline), "--head", str(finished)]
-    assert "baseline.json" in refused_last(capsys, *gate)
-    assert cli.main([*gate, "--update-baseline"]) == arguments.DONE
-    assert cli.main([*gate, "--markdown", str(tmp_path / "s.md"), "--junit", str(tmp_path / "j.xml")]) == arguments.DONE
-    assert "passed" in (tmp_path / "s.md").read_text() and (tmp_path / "j.xml").exists()
-    baseline.write_text(baseline.read_text().replace('"params": 2', '"params": 1'))
-    assert cli.main(gate) == arguments.FAILED
-    (cell, *_) = finished.glob("cells/*")
-    (cell / "result.json").unlink()
-    assert "the run is incomplete, 1 of 2 cells have a result; finish it with: " in refused_last(capsys, *gate)
-    shutil.rmtree(cell)
-    assert "the run is incomplete, 1 of 2 cells" in refused_last(capsys, *gate, "--update-baseline")
-
-
-def test_the_gate_takes_the_suite_of_its_baseline(finished: Path, boxes: str, tmp_path: Path, capsys) -> None:
-    baseline = str(tmp_path / "b.json")
-    assert cli.main(["gate", "--baseline", baseline, "--head", str(finished), "--update-baseline"]) == arguments.DONE
-    capsys.readouterr()
-    assert "b.json is of the suite 'boxes': expected its file in --suite" in refused(
-        capsys, "gate", "--baseline", baseline
-    )
-    told = refused(capsys, "gate", "--baseline", baseline, "--suite", "ci")
-    assert "--suite ci: expected the suite 'boxes', which" in told
-
-
 def test_a_capture_of_an_older_scene_is_kept_and_the_new_one_goes_beside_it(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -32,7 +32,7 @@ from ash.files import InputError, read_arrays, read_image, read_json, write_imag
 from benchmarks.cell.evaluation import read_curve
 from benchmarks.cell.lpips import _load as read_tensors
 from benchmarks.cell.schema import Cell, CellConfig, failed_result, read_cell, read_result, write_config, write_result
-from benchmarks.gate.gate import read_baseline
+from benchmarks.gate.baseline import GateFile, read_gate_file
 from benchmarks.studies.conformance_worker import Outcome, read_outcome
 from benchmarks.suites.files import read_suite
 from benchmarks.suites.runs import read_run
@@ -41,7 +41,7 @@ from synth.motion.importing import import_motion, read_joint_map
 from synth.person.mannequin import heads
 from synth.skeleton import make_skeleton
 
-MUTANTS = int(os.environ.get("MUTANTS", "500"))
+MUTANTS = int(os.environ.get("MUTANTS", "200"))
 SECONDS, MORE_MEMORY = 10.0, 64 << 20
 ROOT = Path(__file__).parents[2]
 Reader = Callable[[Path], object]
@@ -82,7 +82,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Rea
         "amass": (amass_file(folder / "a.npz"), lambda path: import_motion(path, SKELETON, fps=12.0, most=20)),
         "joint map": (folder / "joints.json", read_joint_map),
         "rig": (capture / "cameras.json", rig_from_file),
-        "baseline": (ROOT / "reports" / "baseline.json", read_baseline),
+        "gate": (_gate_file(folder / "gate.json"), read_gate_file),
         "curve": (folder / "log.jsonl", read_curve),
         "run": (run, lambda path: read_run(path.parent)),
         "result": (_result(folder), lambda path: read_result(path.parent)),
@@ -117,6 +117,11 @@ def _outcome(path: Path) -> Path:
     return path
 
 
+def _gate_file(path: Path) -> Path:
+    write_json(path, asdict(GateFile(machine="m", times={"boxes · mine": {"frame": 1.5}})))
+    return path
+
+
 def _tensors(path: Path) -> Path:
     torch.save({"features.0.weight": torch.ones(4, 3)}, path)
     return path
@@ -139,7 +144,7 @@ def as_a_user_runs_it(monkeypatch: pytest.MonkeyPatch) -> None:
 
 KINDS = (
     "manifest", "cameras", "skeleton", "template", "motion", "surface", "image", "bvh", "amass", "joint map", "rig",
-    "baseline", "curve", "run", "result", "cell", "json", "weights", "suite", "trial", "lpips",
+    "gate", "curve", "run", "result", "cell", "json", "weights", "suite", "trial", "lpips",
 )  # fmt: skip
 
 
@@ -251,7 +256,7 @@ def test_only_regular_files_are_read(what: str, tmp_path: Path) -> None:
         case _:
             path.mkdir()
     arrays, image = partial(read_arrays, expected=("a",)), partial(read_image, shape=(4, 4, 4))
-    for read in (read_json, arrays, image, read_baseline, read_suite, read_tensors):
+    for read in (read_json, arrays, image, read_suite, read_tensors):
         with pytest.raises(InputError, match="regular file"):
             read(path)
 

@@ -1,182 +1,300 @@
-"""Planted defects: ASH with one thing wrong, to measure what the gate catches. Each is a factory of a method.
+"""Planted defects: what may go wrong in a change, each with the layer of the gate that must tell it first.
 
-A defect changes the configuration, or what a module's name stands for in the process that trains: a cell has a process
-of its own, so nothing else is touched.
+A defect changes what a name of ours stands for, or the configuration. Harmless changes are planted in the same way.
 """
 
-import time
-from dataclasses import replace
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 
 import ash.avatar
+import ash.decoders
 import ash.model
 import ash.native.texels
 import ash.plus
 import ash.template.template
 import ash.textures
-from ash.avatar import AshAvatar
-from ash.capture.dataset import Camera, Capture
+import ash.training.batches
+import ash.training.loop
+from ash.capture.dataset import Camera, Pose
 from ash.config import AshConfig
-from ash.presets import plus
 from ash.rotations import RigidTransforms
 from ash.template.skinning import SkinWeights
+from benchmarks.cell import evaluation, metrics
+from benchmarks.gate.checks import Layer
 
-MISCALIBRATION_PX = 2.0
-SLOWER = 0.2
-MORE_MEMORY_MB = 400
-_held: list[torch.Tensor] = []
-
-
-def _ash(capture: Capture, seed: int, preset: str, *, model: Any = None, training: Any = None) -> AshAvatar:
-    """ASH with some fields of its configuration replaced."""
-    config = plus(preset)
-    return AshAvatar.from_capture(
-        AshConfig(
-            model=replace(config.model, **(model or {})),
-            training=replace(config.training, **(training or {})),
-            template=config.template,
-            seed=seed,
-        ),
-        capture,
-    )
+Patch = pytest.MonkeyPatch
 
 
-def sound_sh(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """No defect: ASH with colours that depend on the view, the reference of `sh_frame`."""
-    return _ash(capture, seed, preset, model={"sh_degree": 1})
+@dataclass(frozen=True, kw_only=True)
+class Defect:
+    """A change of code or configuration, and the layer that must tell it first; None: it is harmless."""
+
+    about: str
+    layer: Layer | None
+    reason: str = ""  # in what the gate says
+    plant: Callable[[Patch], None] = lambda _: None
+    config: Callable[[AshConfig], AshConfig] = lambda config: config
+    sound: Callable[[AshConfig], AshConfig] = lambda config: config  # what it is compared with
 
 
-def sh_frame(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """Spherical harmonics stay in the canonical frame while their Gaussians turn."""
-    ash.native.texels.turn_sh = lambda quats, sh, *, threads: sh
-    return sound_sh(capture, seed=seed, preset=preset)
+def model(**changes: Any) -> Callable[[AshConfig], AshConfig]:
+    return lambda config: replace(config, model=replace(config.model, **changes))
 
 
-def linear_skinning(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """Quaternions and translations are blended linearly, each for itself."""
+def training(**changes: Any) -> Callable[[AshConfig], AshConfig]:
+    return lambda config: replace(config, training=replace(config.training, **changes))
 
+
+def linear_skinning(patch: Patch) -> None:
     def blend(joints: RigidTransforms, skin: SkinWeights) -> RigidTransforms:
         quats = (joints.quats[skin.joints] * skin.weights[..., None]).sum(1)
         translations = (joints.translations[skin.joints] * skin.weights[..., None]).sum(1)
         return RigidTransforms(quats=quats / quats.norm(dim=-1, keepdim=True), translations=translations)
 
-    ash.template.template.dual_quaternion_skinning = blend
-    return _ash(capture, seed, preset)
+    patch.setattr(ash.template.template, "dual_quaternion_skinning", blend)
 
 
-def ssim_dropped(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """The loss is L1 alone."""
-    return _ash(capture, seed, preset, training={"ssim_weight": 0.0})
-
-
-def half_offset(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """Offsets are scaled by one half on the way to the posed Gaussian."""
-    return _ash(capture, seed, preset, model={"offset_unit_m": 0.5 * plus(preset).model.offset_unit_m})
-
-
-def triple_learning_rate(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """Both learning rates are three times as large."""
-    training = plus(preset).training
-    rates = {name: 3 * getattr(training, name) for name in ("learning_rate", "base_learning_rate")}
-    return _ash(capture, seed, preset, training=rates)
-
-
-def warm_up_dropped(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """Everything is learned at once from the first step on."""
-    return _ash(capture, seed, preset, training={"warmup": "none", "warmup_steps": 0})
-
-
-def half_the_steps(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """Training ends after half its steps."""
-    return _ash(capture, seed, preset, training={"steps": plus(preset).training.steps // 2})
-
-
-def _turned(camera: Camera, pixels: float) -> Camera:
-    """The camera turned about its own vertical axis, so that the middle of its image moves by so many pixels."""
-    angle = pixels / camera.K[0, 0]
-    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    viewmat = camera.viewmat.copy()
-    viewmat[:3] = turn @ viewmat[:3]
-    return replace(camera, viewmat=viewmat)
-
-
-class _Miscalibrated(AshAvatar):
-    """Learns with one training camera turned."""
-
-    def fit(self, capture: Capture, **more: Any) -> None:
-        """Train on wrong extrinsics."""
-        first = capture.splits["train"].cameras[0]
-        wrong = _turned(capture.cameras[first], MISCALIBRATION_PX)
-        super().fit(replace(capture, cameras={**capture.cameras, first: wrong}), **more)
-
-
-def one_camera_off(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """The extrinsics of one training camera are off by about 2 pixels."""
-    return _Miscalibrated.from_capture(replace(plus(preset), seed=seed), capture)
-
-
-def normals_flipped(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """Normals point inwards, in training and in rendering."""
+def normals_flipped(patch: Patch) -> None:
     sound = ash.template.template.Template.pose
 
     def pose(*arguments: Any, **more: Any) -> ash.template.template.PosedTemplate:
         posed = sound(*arguments, **more)
         return replace(posed, normals=-posed.normals)
 
-    ash.template.template.Template.pose = pose  # type: ignore[method-assign]
-    return _ash(capture, seed, preset)
+    patch.setattr(ash.template.template.Template, "pose", pose)
 
 
-def holes(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """Every fourth Gaussian is never drawn."""
-    sound = ash.model.pose
+def first_pose_kept(patch: Patch) -> None:
+    sound, kept = ash.template.template.Template.pose, []
 
-    def pose(*arguments: Any, **more: Any) -> Any:
-        gaussians = sound(*arguments, **more)
-        shown = torch.ones_like(gaussians.opacities)
-        shown[::4] = 0
-        return replace(gaussians, opacities=gaussians.opacities * shown)
+    def pose(self: Any, pose: Pose) -> ash.template.template.PosedTemplate:
+        if not kept:
+            kept.append(sound(self, pose))
+        return kept[0]
 
-    ash.model.pose = ash.plus.pose = pose
-    return _ash(capture, seed, preset)
+    patch.setattr(ash.template.template.Template, "pose", pose)
 
 
-def slow_splatter(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """Splatting takes 20 % more time."""
+def sh_not_turned(patch: Patch) -> None:
+    patch.setattr(ash.native.texels, "turn_sh", lambda quats, sh, *, threads: sh)
+
+
+def gaussians_changed(change: Callable[[Any], Any]) -> Callable[[Patch], None]:
+    """What is posed is changed on its way to the splatter."""
+
+    def plant(patch: Patch) -> None:
+        for module in (ash.model, ash.plus):
+            sound = module.pose
+            patch.setattr(module, "pose", lambda *a, sound=sound, **more: change(sound(*a, **more)))
+
+    return plant
+
+
+def with_holes(gaussians: Any) -> Any:
+    shown = torch.ones_like(gaussians.opacities)
+    shown[::4] = 0
+    return replace(gaussians, opacities=gaussians.opacities * shown)
+
+
+def in_linear_light(patch: Patch) -> None:
     sound = ash.model.splat
 
-    def splat(*arguments: Any, **more: Any) -> Any:
-        start = time.perf_counter()
-        drawn = sound(*arguments, **more)
-        end = time.perf_counter() + SLOWER * (time.perf_counter() - start)
-        while time.perf_counter() < end:
-            pass
-        return drawn
+    def splat(gaussians: Any, **more: Any) -> Any:
+        drawn = sound(replace(gaussians, sh=gaussians.sh * gaussians.sh.abs()), **more)
+        return replace(drawn, rgb=drawn.rgb.clamp(min=1e-8).sqrt())
 
-    ash.model.splat = splat
-    return _ash(capture, seed, preset)
+    patch.setattr(ash.model, "splat", splat)
 
 
-def more_memory(capture: Capture, *, seed: int, preset: str) -> AshAvatar:
-    """Holds 400 MB that nobody needs: twice what the cell's process takes without its libraries."""
-    _held.append(torch.from_numpy(np.ones(MORE_MEMORY_MB << 17)))
-    return _ash(capture, seed, preset)
+def camera_moved(pixels: float) -> Callable[[Patch], None]:
+    def plant(patch: Patch) -> None:
+        sound = ash.avatar.AshAvatar.render
+
+        def render(self: Any, pose: Pose, camera: Camera, *, clock: Any) -> np.ndarray:
+            K = camera.K + np.array([[0, 0, pixels], [0, 0, 0], [0, 0, 0]])
+            return sound(self, pose, replace(camera, K=K), clock=clock)
+
+        patch.setattr(ash.avatar.AshAvatar, "render", render)
+
+    return plant
 
 
-DEFECTS = (
-    linear_skinning,
-    ssim_dropped,
-    half_offset,
-    triple_learning_rate,
-    warm_up_dropped,
-    one_camera_off,
-    normals_flipped,
-    sh_frame,
-    slow_splatter,
-    more_memory,
-    half_the_steps,
-    holes,
-)
+def textures_of_the_frame_before(patch: Patch) -> None:
+    sound = ash.textures.TextureDrawer.forward
+
+    def forward(self: Any, template: Any, pose: Pose) -> torch.Tensor:
+        return sound(self, template, Pose(pose.motion, max(0, pose.frame - 1)))
+
+    patch.setattr(ash.textures.TextureDrawer, "forward", forward)
+
+
+def residual_weakened(patch: Patch) -> None:
+    sound = ash.model.AshModel.residual
+    patch.setattr(ash.model.AshModel, "residual", lambda self, inputs: 0.9 * sound(self, inputs))
+
+
+def phi_dropped(patch: Patch) -> None:
+    sound = ash.decoders.GlobalFeatures.forward
+    patch.setattr(ash.decoders.GlobalFeatures, "forward", lambda self, where: 0 * sound(self, where))
+
+
+def one_camera_off(patch: Patch) -> None:
+    sound = ash.training.batches.crop_camera
+
+    def crop(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
+        return sound(camera, left + 2 * (camera.name == "cam1"), top, width, height)
+
+    patch.setattr(ash.training.batches, "crop_camera", crop)
+
+
+def masks_eroded(patch: Patch) -> None:
+    sound = ash.training.batches.composite
+
+    def composite(rgba: torch.Tensor, background: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        alpha = -torch.nn.functional.max_pool2d(-rgba[None, None, ..., 3].float(), 3, 1, 1)[0, 0]
+        return sound(torch.cat([rgba[..., :3], alpha.to(torch.uint8)[..., None]], -1), background)
+
+    patch.setattr(ash.training.batches, "composite", composite)
+
+
+def frames_in_another_order(patch: Patch) -> None:
+    sound = ash.training.batches._order
+    patch.setattr(ash.training.batches, "_order", lambda seed, epoch, frames: sound(seed, epoch + 1, frames))
+
+
+def adam_with_another_eps(patch: Patch) -> None:
+    sound = ash.training.loop.Adam
+    patch.setattr(ash.training.loop, "Adam", lambda groups, *, eps: sound(groups, eps=0.1))
+
+
+def gradient_halved(patch: Patch) -> None:
+    sound = ash.avatar.AshAvatar.loss
+
+    def loss(self: Any, batches: Any, step: int) -> torch.Tensor:
+        whole = sound(self, batches, step)
+        return 0.5 * whole + 0.5 * whole.detach()
+
+    patch.setattr(ash.avatar.AshAvatar, "loss", loss)
+
+
+def psnr_of_the_whole_frame(patch: Patch) -> None:
+    sound = metrics.psnr
+    patch.setattr(metrics, "psnr", lambda a, b, region=None: sound(a, b, None))
+
+
+def median_for_mean(patch: Patch) -> None:
+    numbers = type("Numbers", (), {"mean": staticmethod(np.median), "__getattr__": lambda _, name: getattr(np, name)})()
+    patch.setattr(evaluation, "np", numbers)
+
+
+def seed_ignored(patch: Patch) -> None:
+    sound = ash.avatar.AshAvatar.from_capture.__func__
+
+    def made(cls: Any, config: AshConfig, capture: Any) -> Any:
+        return sound(cls, replace(config, seed=0), capture)
+
+    patch.setattr(ash.avatar.AshAvatar, "from_capture", classmethod(made))
+
+
+def moved_by_rounding(gaussians: Any) -> Any:
+    return replace(gaussians, means=gaussians.means * (1 + 2e-7))
+
+
+DEFECTS: dict[str, Defect] = {
+    "linear skinning": Defect(about="quaternions are blended linearly", layer="rendering", plant=linear_skinning),
+    "normals flipped": Defect(about="normals point inwards", layer="rendering", plant=normals_flipped),
+    "stale pose": Defect(about="a cache keeps the first pose", layer="rendering", plant=first_pose_kept),
+    "half offset": Defect(
+        about="offsets are halved",
+        layer="rendering",
+        sound=model(offset_unit_m=0.05),
+        config=model(offset_unit_m=0.025),
+    ),
+    "sh frame": Defect(
+        about="harmonics do not turn with their Gaussian",
+        layer="rendering",
+        plant=sh_not_turned,
+        sound=model(sh_degree=1),
+        config=model(sh_degree=1),
+    ),
+    "holes": Defect(about="every fourth Gaussian is missing", layer="rendering", plant=gaussians_changed(with_holes)),
+    "opacity": Defect(
+        about="opacities times 0.9",
+        layer="rendering",
+        plant=gaussians_changed(lambda g: replace(g, opacities=0.9 * g.opacities)),
+    ),
+    "scales": Defect(
+        about="Gaussians are 10 % larger",
+        layer="rendering",
+        plant=gaussians_changed(lambda g: replace(g, scales=1.1 * g.scales)),
+    ),
+    "linear light": Defect(about="colours are blended in linear light", layer="rendering", plant=in_linear_light),
+    "half a pixel": Defect(about="pictures move by half a pixel", layer="rendering", plant=camera_moved(0.5)),
+    "dilation": Defect(about="another low-pass filter", layer="rendering", config=model(dilation=0.3)),
+    "late textures": Defect(
+        about="decoders see the frame before", layer="rendering", plant=textures_of_the_frame_before
+    ),
+    "weak decoders": Defect(about="residual times 0.9", layer="rendering", plant=residual_weakened),
+    "no phi": Defect(about="Phi is zero", layer="rendering", plant=phi_dropped),
+    "no ssim": Defect(
+        about="the loss is L1 alone", layer="training", reason="loss of step 1 ", config=training(ssim_weight=0.0)
+    ),
+    "halved gradient": Defect(
+        about="half of the gradient is lost", layer="training", reason="gradient of step 1 ", plant=gradient_halved
+    ),
+    "triple rate": Defect(
+        about="learning rates times three",
+        layer="training",
+        reason="in the update before it",
+        config=lambda c: training(
+            learning_rate=3 * c.training.learning_rate, base_learning_rate=3 * c.training.base_learning_rate
+        )(c),
+    ),
+    "adam's eps": Defect(
+        about="another constant in Adam",
+        layer="training",
+        reason="in the update before it",
+        plant=adam_with_another_eps,
+    ),
+    "one camera off": Defect(
+        about="a training camera is off by 2 px", layer="training", reason="from the loss", plant=one_camera_off
+    ),
+    "eroded masks": Defect(about="masks lose a pixel", layer="training", reason="loss of step 1 ", plant=masks_eroded),
+    "another order": Defect(
+        about="frames come in another order", layer="training", reason="from the loss", plant=frames_in_another_order
+    ),
+    "no warm-up": Defect(
+        about="everything is learned from the first step on",
+        layer="training",
+        config=training(warmup="none", warmup_steps=0),
+    ),
+    "seed ignored": Defect(about="all seeds are 0", layer="training", reason="seed is ignored", plant=seed_ignored),
+    "fewer steps": Defect(about="training ends after three quarters", layer="quality", config=training(steps=12)),
+    "no averaging": Defect(about="weights are not averaged", layer="quality", config=training(ema=0.0)),
+    "whole frame": Defect(
+        about="PSNR is of the whole frame", layer="protocol", reason="foreground psnr", plant=psnr_of_the_whole_frame
+    ),
+    "median": Defect(about="means are medians", layer="protocol", reason="mean ", plant=median_for_mean),
+}
+HARMLESS: dict[str, Defect] = {
+    "nothing": Defect(about="the same code", layer=None),
+    "rounding": Defect(
+        about="another order of summation moves Gaussians by rounding",
+        layer=None,
+        plant=gaussians_changed(moved_by_rounding),
+    ),
+    "same picture another way": Defect(
+        about="a pixel is moved there and back", layer=None, plant=lambda patch: camera_moved(math.ulp(1.0))(patch)
+    ),
+    "same score another way": Defect(
+        about="means are summed in another order",
+        layer=None,
+        plant=lambda patch: patch.setattr(evaluation.np, "mean", lambda values: math.fsum(values) / len(values)),
+    ),
+}

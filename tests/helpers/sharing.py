@@ -36,3 +36,13 @@ def small_capture(shared: Shared) -> Path:
     from synth.capture import make_capture
 
     return shared("small", lambda folder: make_capture(small_scene(), folder))
+
+
+@pytest.fixture(scope="session")
+def ci_data(shared: Shared) -> Path:
+    """A folder of captures that holds the one of the suite `ci`; templates that are learned go there as well."""
+    from benchmarks.suites.captures import make_capture_in
+    from benchmarks.suites.suites import CaptureSpec
+
+    spec = CaptureSpec(scene="mannequin", size="ci")
+    return shared("ci_data", lambda folder: make_capture_in(spec, folder / spec.name, workers=2))

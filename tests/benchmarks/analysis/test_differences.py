@@ -17,7 +17,7 @@ from benchmarks.report.content import Table
 from benchmarks.report.scene import detectable as detectable_sentence
 from benchmarks.report.scene import difference_blocks
 
-ROUNDS, TABLES = 600, 200
+ROUNDS, TABLES = 300, 80
 
 
 def null_rows(rng: np.random.Generator, *, captures: int, seeds: int, methods: tuple[str, ...]) -> pd.DataFrame:

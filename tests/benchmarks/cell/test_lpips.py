@@ -93,6 +93,8 @@ def test_without_weights_there_is_none(tmp_path: Path, backbone: Path, monkeypat
     monkeypatch.setenv(metrics.LPIPS_WEIGHTS, str(tmp_path / "none"))
     with pytest.raises(InputError, match="expected AlexNet's weights"):
         metrics.weights_file()
+    monkeypatch.setenv(metrics.LPIPS_WEIGHTS, "none")
+    assert metrics.weights_file() is None
 
 
 def test_files_that_are_no_alexnet(tmp_path: Path) -> None:

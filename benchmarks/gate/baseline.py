@@ -1,0 +1,235 @@
+"""What a change is compared with: a run of code that is known to be good, small enough for a repository.
+
+SUITE.toml                                 the suite; its content counts, not its name
+run.json, cells/KEY/{config,result}.json   every number of every seed, as a run has them
+cells/KEY/{log.jsonl, model.safetensors, images/}
+                                           of the first seed of each row: the beginning of its training log, the
+                                           trained avatar, and some of its pictures
+gate.json                                  the least times of these avatars, and the changes that were accepted
+"""
+
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from itertools import islice
+from pathlib import Path
+
+from ash.capture.typed import from_json
+from ash.files import InputError, open_regular, read_json, write_atomic, write_json
+from benchmarks.cell.evaluation import spread
+from benchmarks.cell.schema import (
+    CHECKPOINT,
+    Cell,
+    CellConfig,
+    CellResult,
+    View,
+    prediction_path,
+    printable,
+    read_cell,
+    result_of,
+    write_config,
+    write_result,
+)
+from benchmarks.provenance import commit
+from benchmarks.suites.runs import RUN_FILE, Run, description_of, read_run
+
+FILE = "gate.json"
+LOG_LINES = 16  # of a training log
+LARGEST_LOG = 1 << 22  # bytes that are read of it
+LARGEST_CHECKPOINT = 8 << 20  # bytes of one avatar; a larger one is left out, and the row is judged by training alone
+PICTURES = 2  # of each split
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Accepted:
+    """A change that somebody accepted: which row, why, and at which commit."""
+
+    row: str
+    because: str
+    commit: str
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class GateFile:
+    """`gate.json`. Times are ratios to the reference workload, by row and by what was timed."""
+
+    machine: str  # processor
+    times: dict[str, dict[str, float]]
+    accepted: tuple[Accepted, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Entry:
+    """One cell and its result."""
+
+    cell: Cell
+    result: CellResult
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Baseline:
+    """A baseline that was read."""
+
+    folder: Path
+    suite: Path  # its file
+    rows: dict[str, list[Entry]]  # seeds in order
+    file: GateFile
+    commit: str
+
+
+def row_of(config: CellConfig) -> str:
+    """The row of a cell: scene, person and method."""
+    return config.title.rpartition(" · ")[0]
+
+
+def rows_of(run: Run) -> dict[str, list[Entry]]:
+    """The finished cells of a run by row, seeds in order."""
+    rows: dict[str, list[Entry]] = {}
+    for cell in sorted(run.cells, key=lambda cell: cell.config.seed):
+        if (result := result_of(cell)) is not None:
+            rows.setdefault(row_of(cell.config), []).append(
+                Entry(cell=cell, result=replace(result, config=cell.config))
+            )
+    return rows
+
+
+def read_baseline(folder: Path) -> Baseline:
+    """Read a baseline.
+
+    Raises:
+        InputError: there is none, it is damaged, or it is of another protocol version.
+    """
+    suites = sorted(folder.glob("*.toml")) if folder.is_dir() else []
+    if len(suites) != 1 or not (folder / FILE).is_file():
+        raise InputError(f"{folder}: expected a baseline of the gate; make one with `gate --update-baseline`")
+    rows = rows_of(read_run(folder))
+    if not rows:
+        raise InputError(f"{folder}: expected a baseline of the gate, got one without a finished cell")
+    provenance = next(iter(rows.values()))[0].result.provenance
+    commit = provenance.commit if provenance else "unknown"
+    return Baseline(folder=folder, suite=suites[0], rows=rows, file=read_gate_file(folder / FILE), commit=commit)
+
+
+def read_gate_file(path: Path) -> GateFile:
+    """Read `gate.json`.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    content = read_json(path)
+    try:
+        file: GateFile = from_json(GateFile, content)
+    except ValueError as error:
+        raise InputError(f"{path}: expected what the gate wrote ({error})") from error
+    texts = [
+        Accepted(row=printable(a.row), because=printable(a.because), commit=printable(a.commit)) for a in file.accepted
+    ]
+    return replace(file, machine=printable(file.machine), accepted=tuple(texts))
+
+
+def require_replaceable(folder: Path, rows: Mapping[str, Sequence[Entry]]) -> None:
+    """Refuse a run that may not become the baseline in `folder`, which need not exist.
+
+    Raises:
+        InputError: a cell of it failed, or it lacks a row that the baseline has.
+    """
+    failed = [row for row, entries in rows.items() if any(entry.result.status != "done" for entry in entries)]
+    if failed:
+        raise InputError(f"a baseline needs cells that are done, and cells of {', '.join(failed)} failed")
+    before = read_baseline(folder).rows if (folder / FILE).exists() else {}
+    if dropped := [row for row in before if row not in rows]:
+        raise InputError(
+            f"{folder} holds {', '.join(dropped)}, which this run lacks; to drop them, remove that folder first"
+        )
+
+
+def write_baseline(folder: Path, suite: Path, run: Run, file: GateFile) -> None:
+    """Write a run as the baseline; what was there is replaced as a whole.
+
+    Raises:
+        InputError: as `require_replaceable`, or `folder` holds something else.
+    """
+    rows = rows_of(run)
+    require_replaceable(folder, rows)
+    if folder.exists() and any(folder.iterdir()) and not (folder / FILE).exists():
+        raise InputError(f"{folder}: expected a baseline, an empty folder or none")
+    with _replacing(folder) as made:
+        for entries in rows.values():
+            _write_cells(entries, made)
+        keys = [entry.cell.config.key for entries in rows.values() for entry in entries]
+        write_json(made / RUN_FILE, description_of(run) | {"cells": keys, "command": ""})
+        write_atomic(made / f"{suite.stem}.toml", suite.read_bytes())
+        write_json(made / FILE, asdict(file))
+
+
+@contextmanager
+def _replacing(folder: Path) -> Iterator[Path]:
+    """A new folder beside `folder`, which takes its place when the body is done."""
+    made, old = (folder.with_name(f".{folder.name}.{what}") for what in ("new", "old"))
+    for path in (made, old):
+        shutil.rmtree(path, ignore_errors=True)
+    made.mkdir(parents=True)
+    try:
+        yield made
+        if folder.exists():
+            folder.rename(old)
+        made.rename(folder)
+    finally:
+        for path in (made, old):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _write_cells(entries: Sequence[Entry], made: Path) -> None:
+    """The cells of a row: numbers of all, and the avatar of the first."""
+    for entry in entries:
+        folder = made / "cells" / entry.cell.config.key
+        # Of a capture's folder the name says enough: it is searched where captures are kept.
+        told = {"capture_folder": entry.cell.capture_folder.resolve().name}
+        write_json(folder / "config.json", read_json(entry.cell.folder / "config.json") | told)
+        write_result(folder, entry.result)
+    first = entries[0]
+    folder = made / "cells" / first.cell.config.key
+    if (log := first.cell.folder / "log.jsonl").exists():
+        with open_regular(log, most=LARGEST_LOG) as file:
+            write_atomic(folder / "log.jsonl", b"".join(islice(file, LOG_LINES)))
+    checkpoint = first.cell.folder / CHECKPOINT
+    if checkpoint.exists() and checkpoint.stat().st_size <= LARGEST_CHECKPOINT:
+        shutil.copyfile(checkpoint, folder / CHECKPOINT)
+        for view in stored_views(first.result):
+            source = prediction_path(first.cell.folder, view)
+            target = prediction_path(folder, view)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source, target)
+
+
+def with_row(baseline: Baseline, row: str, entries: Sequence[Entry], because: str) -> tuple[Run, tuple[Accepted, ...]]:
+    """The baseline's cells as a run with those of one row replaced, and the changes accepted so far with this one."""
+    rows = {**baseline.rows, row: list(entries)}
+    cells = tuple(entry.cell for each in rows.values() for entry in each)
+    told = Accepted(row=row, because=printable(because), commit=commit())
+    return replace(read_run(baseline.folder), cells=cells), (*baseline.file.accepted, told)
+
+
+def stored_views(result: CellResult) -> list[View]:
+    """The views whose pictures a baseline keeps: `PICTURES` of each split, spread evenly."""
+    views = [View(split=v.split, camera=v.camera, frame=v.frame) for v in result.views]
+    by_split = [[view for view in views if view.split == split] for split in dict.fromkeys(v.split for v in views)]
+    return [of_one[index] for of_one in by_split for index in spread(len(of_one), PICTURES)]
+
+
+def is_frozen(entry: Entry) -> bool:
+    """Whether the baseline has the avatar of a cell."""
+    return (entry.cell.folder / CHECKPOINT).is_file()
+
+
+def frozen_cell(entry: Entry, capture_folder: Path, identity: str, out: Path) -> Cell:
+    """A copy of a baseline's cell in `out`, on this machine's capture, for today's code to draw."""
+    folder = out / entry.cell.config.key
+    shutil.rmtree(folder, ignore_errors=True)
+    config = replace(entry.cell.config, capture=identity)
+    cell = replace(entry.cell, folder=folder, config=config, capture_folder=capture_folder)
+    write_config(cell)
+    write_result(folder, replace(entry.result, config=config))
+    shutil.copyfile(entry.cell.folder / CHECKPOINT, folder / CHECKPOINT)
+    return read_cell(folder)
