@@ -30,6 +30,9 @@ class GateCommand:
     markdown: File | None = None  # write the summary there, for a pull request
     junit: File | None = None  # write the checks there as JUnit
     update_baseline: bool = False  # make today's code the new baseline
+    history: Folder | None = None  # append the run to this folder's history, and write its page of charts
+    against: str | None = None  # a revision of this checkout: times are interleaved with its code
+    init: str | None = None  # package.module:factory: write gate/NAME.toml, its baseline and a GitHub workflow here
     accept: str | None = None  # a row of the last comparison, as it is printed: make what it is now its baseline
     because: str = ""  # with --accept: why; shown from then on
 
@@ -39,13 +42,25 @@ class GateCommand:
             return self._accept(self.accept)
         if self.because:
             raise InputError("--because goes with --accept ROW")
+        if self.init is not None:
+            return self._start(self.init)
         return self._update() if self.update_baseline else self._judge()
+
+    def _start(self, method: str) -> int:
+        from benchmarks.gate.starting import WORKFLOW, start
+
+        folder = Path("gate")
+        suite = start(method, folder)
+        print(f"{suite} and {WORKFLOW}: commit them with the baseline, which is made now")
+        return replace(self, init=None, suite=str(suite), baseline=folder / "baseline")._update()
 
     def _judge(self) -> int:
         from ash.files import write_atomic
+        from benchmarks.gate.against import checkout_of
         from benchmarks.gate.baseline import read_baseline
         from benchmarks.gate.checks import FAILING, outcome
         from benchmarks.gate.gate import judge
+        from benchmarks.gate.history import append
         from benchmarks.gate.summary import junit, markdown, terminal, write_pictures
         from benchmarks.provenance import changed_since
         from benchmarks.suites.files import read_suite
@@ -54,7 +69,8 @@ class GateCommand:
         suite = read_suite(baseline.suite)
         if self.suite is not None:
             self._require_own(baseline)
-        judged = judge(baseline, suite, self._options(), minutes=self.minutes)
+        tree = None if self.against is None else checkout_of(self.against, self.out / "against")
+        judged = judge(baseline, suite, self._options(), minutes=self.minutes, against=tree)
         pictures = write_pictures(judged, self.out)
         print(terminal(baseline, judged, changed_since(baseline.commit)))
         for path in pictures:
@@ -63,6 +79,8 @@ class GateCommand:
             write_atomic(self.markdown, markdown(baseline, judged).encode())
         if self.junit:
             write_atomic(self.junit, junit(judged.checks).encode())
+        if self.history:
+            print(f"history: {append(judged, judged.times, self.history)}")
         verdict = outcome(judged.checks)
         return FAILED if verdict in FAILING or (self.strict and verdict != "unchanged") else DONE
 

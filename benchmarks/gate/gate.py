@@ -18,6 +18,7 @@ from ash.capture.formats import load_capture
 from ash.files import InputError
 from benchmarks.cell.run import evaluate_cell
 from benchmarks.cell.schema import Cell, CellResult, result_of
+from benchmarks.gate.against import interleaved
 from benchmarks.gate.baseline import Baseline, Entry, frozen_cell, is_frozen, row_of
 from benchmarks.gate.checks import Check
 from benchmarks.gate.exact import (
@@ -50,17 +51,21 @@ FROZEN = "frozen"  # folder of avatars that were drawn again
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Judgement:
-    """The checks, the run that was judged, and for each row whose rendering changed its worst picture."""
+    """The checks, the run that was judged, least times of frozen avatars, and the worst pictures of changed rows."""
 
     checks: tuple[Check, ...]
     run: Run
+    times: dict[str, dict[str, float]] = field(default_factory=dict)
     worst: dict[str, Worst] = field(default_factory=dict)
 
 
-def judge(baseline: Baseline, suite: Suite, options: RunOptions, *, minutes: float) -> Judgement:
+def judge(
+    baseline: Baseline, suite: Suite, options: RunOptions, *, minutes: float, against: Path | None = None
+) -> Judgement:
     """Run what is needed of a suite, and compare it with the baseline.
 
-    `minutes`: clock time that trainings beyond the first two seeds of a row may take.
+    `minutes`: clock time that trainings beyond the first two seeds of a row may take. `against`: a checkout of other
+    code, with which times are interleaved in place of those of the baseline.
 
     Raises:
         InputError: the suite has no row in common with the baseline.
@@ -86,8 +91,15 @@ def judge(baseline: Baseline, suite: Suite, options: RunOptions, *, minutes: flo
     checks += quality.checks
     for row, (before, entries) in pairs.items():
         checks += count_checks(row, before[0].result, entries[0].result)
-    checks += _cost_checks(baseline, pairs, drawn)
-    return Judgement(checks=tuple(checks), run=run, worst=worst)
+    times: dict[str, dict[str, float]] = {}
+    if against is None:
+        checks += _cost_checks(baseline, pairs, drawn, times)
+    else:
+        for row in drawn:
+            here = by_row[row][0].capture_folder
+            identity = by_row[row][0].config.capture
+            checks += interleaved(row, _first(baseline, row), here, identity, options.out / FROZEN, against)
+    return Judgement(checks=tuple(checks), run=run, times=times, worst=worst)
 
 
 def cells_of(suite: Suite, options: RunOptions) -> tuple[Run, dict[str, list[Cell]]]:
@@ -248,8 +260,12 @@ def _cost_checks(
     baseline: Baseline,
     pairs: Mapping[str, tuple[Sequence[Entry], Sequence[Entry]]],
     drawn: Mapping[str, Iterator[CellResult]],
+    times: dict[str, dict[str, float]],
 ) -> list[Check]:
-    """Memory and times, where the processor is the baseline's; a time that fails is measured again."""
+    """Memory and times, where the processor is the baseline's; a time that fails is measured again.
+
+    `times`: receives the least times of each row.
+    """
     if (here := processor_name()) != baseline.file.machine:
         told = f"memory and times: the baseline was made on {baseline.file.machine}, this run on {here}"
         return [Check(row="", layer="cost", verdict="not judged", detail=told)]
@@ -258,7 +274,8 @@ def _cost_checks(
         checks.append(memory_check(row, before, after))
         old = baseline.file.times.get(row, {})
         if row in drawn:
-            checks += _times_again(row, old, training_time(after), drawn[row])
+            told, times[row] = _times_again(row, old, training_time(after), drawn[row])
+            checks += told
         else:
             checks += time_checks(row, old, training_time(after))
     return checks
@@ -266,13 +283,14 @@ def _cost_checks(
 
 def _times_again(
     row: str, old: Mapping[str, float], training: Mapping[str, float], results: Iterator[CellResult]
-) -> list[Check]:
-    """The checks of times, after up to `2 * TIMED` more drawings where one fails."""
+) -> tuple[list[Check], dict[str, float]]:
+    """The checks of times, after up to `2 * TIMED` more drawings where one fails, and the times."""
     timings = []
     for _ in range(1 + 2 * TIMED):
         timing = next(results).timing
         timings += [timing] if timing is not None else []
-        checks = time_checks(row, old, {**least_times(timings), **training})
+        times = {**least_times(timings), **training}
+        checks = time_checks(row, old, times)
         if not any(check.verdict == "worse" and not check.name.endswith("training") for check in checks):
             break
-    return checks
+    return checks, times

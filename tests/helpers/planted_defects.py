@@ -275,7 +275,12 @@ DEFECTS: dict[str, Defect] = {
         config=training(warmup="none", warmup_steps=0),
     ),
     "seed ignored": Defect(about="all seeds are 0", layer="training", reason="seed is ignored", plant=seed_ignored),
-    "fewer steps": Defect(about="training ends after three quarters", layer="quality", config=training(steps=12)),
+    "fewer steps": Defect(
+        about="training ends after three quarters",
+        layer="training",
+        reason="from step 16 on (step 16 -> 12)",
+        config=training(steps=12),
+    ),
     "no averaging": Defect(about="weights are not averaged", layer="quality", config=training(ema=0.0)),
     "whole frame": Defect(
         about="PSNR is of the whole frame", layer="protocol", reason="foreground psnr", plant=psnr_of_the_whole_frame
