@@ -30,7 +30,7 @@ from benchmarks.cell.registry import is_oracle
 from benchmarks.cell.schema import BROUGHT_NOTE, Cell, CellResult, View, prediction_path, printable, result_of
 from benchmarks.report.escaping import csv_text
 from benchmarks.report.page import environment
-from benchmarks.suites.archive import LARGEST_PICTURE, PACK_FILE, PNG_HEAD, unpacked
+from benchmarks.suites.archive import LARGEST_PICTURE, PACK_FILE, unpacked
 from benchmarks.suites.runs import read_run
 from benchmarks.suites.verification import Kind, find_capture, verify_pack
 from synth.person.cast import VALIDATION
@@ -164,7 +164,7 @@ def _truth(identity: str) -> str:
 def _pixels(path: Path) -> np.ndarray:
     """A stored picture, uint8 RGBA on black, of whatever size."""
     with open_regular(path, most=LARGEST_PICTURE) as file:
-        width, height = struct.unpack(">II", file.read(PNG_HEAD)[16:].rjust(8, b"\0"))
+        width, height = struct.unpack(">II", file.read(24)[16:].rjust(8, b"\0"))  # where a PNG has them
     return read_image(path, shape=(height, width, 4))
 
 

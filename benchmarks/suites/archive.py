@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from ash.capture.typed import from_json
-from ash.files import LIMITS, PACKED, PLAIN, InputError, disk_problem, open_regular, read_json, sha256_of
+from ash.files import PACKED, PLAIN, InputError, disk_problem, open_regular, read_json, sha256_of
 from benchmarks.cell.metrics import IMAGE_SPLITS, PROTOCOL
 from benchmarks.cell.schema import CHECKPOINT, View, prediction_path, result_of
 from benchmarks.provenance import commit, machine, versions
@@ -34,7 +34,6 @@ ENTRY = re.compile(rf"run\.json|pack\.json|cells/[0-9a-f]{{16}}/{CELL_FILES}")
 LARGEST_ARCHIVE, LARGEST_UNPACKED = (1 << 32) - 1, 1 << 32  # bytes
 LARGEST_JSON, LARGEST_PICTURE, LARGEST_INDEX = 1 << 25, 1 << 26, 1 << 25  # bytes
 MOST_RATIO = 200  # bytes unpacked from one; our JSON shrinks to a twentieth
-PNG_HEAD = 24  # bytes: signature, length and name of the first chunk, width, height
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -95,7 +94,7 @@ def _numbers(run: Run) -> Iterator[tuple[str, bytes]]:
             config = read_json(cell.folder / "config.json")  # A gathered run may call the scene by another name.
             keys.append(config["key"])
             config = {name: value for name, value in config.items() if name not in ("predictions", "info")}
-            name = re.sub(r"[^\w.+=@-]", "_", cell.capture_folder.name)
+            name = re.sub(r"[^\w .:+=@-]", "_", cell.capture_folder.name)
             yield f"cells/{keys[-1]}/config.json", _json(config | {"capture_folder": name})
             yield f"cells/{keys[-1]}/result.json", _json(read_json(cell.folder / "result.json"))
     yield RUN_FILE, _json(description_of(run) | {"cells": keys})
@@ -173,8 +172,6 @@ def _unpack(archive: zipfile.ZipFile, folder: Path) -> None:
         target = folder / entry.filename
         target.parent.mkdir(parents=True, exist_ok=True)
         with archive.open(entry) as source, target.open("xb") as sink:
-            if target.suffix == ".png":
-                sink.write(_picture_head(entry.filename, source.read(PNG_HEAD)))
             shutil.copyfileobj(source, sink)
 
 
@@ -189,14 +186,6 @@ def _require_entry(entry: zipfile.ZipInfo) -> None:
     most = LARGEST_PICTURE if name.endswith(".png") else LARGEST_JSON
     if entry.file_size > most or entry.file_size > MOST_RATIO * entry.compress_size + 1000:
         raise ValueError(f"{name} unpacks from {entry.compress_size} to {entry.file_size} bytes")
-
-
-def _picture_head(name: str, head: bytes) -> bytes:
-    """The first bytes of a PNG, if its pixels are not too many."""
-    width, height = struct.unpack(">II", head[16:24].rjust(8, b"\0"))
-    if head[:8] != b"\x89PNG\r\n\x1a\n" or head[12:16] != b"IHDR" or width * height > LIMITS["image pixels"]:
-        raise ValueError(f"{name} is no PNG image of at most {LIMITS['image pixels']} pixels")
-    return head
 
 
 def read_pack(folder: Path) -> PackFile:
