@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ash.files import InputError
-from benchmarks.commands.arguments import DONE, File, Folder, Positional, Repeated, typed
+from benchmarks.commands.arguments import DONE, File, Folder, Positional, Repeated
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +53,6 @@ class LeaderboardCommand:
 
         for folder in self.capture:
             read_manifest(folder)
-        for line in write_leaderboard(self.sources, self.out, captures=self.capture, command=typed()):
+        for line in write_leaderboard(self.sources, self.out, captures=self.capture):
             print(line)
         return DONE

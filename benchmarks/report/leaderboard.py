@@ -67,9 +67,7 @@ class Entry:
     capture: Path | None  # where its truth lies
 
 
-def write_leaderboard(
-    sources: Sequence[Path], out: Path, *, captures: Sequence[Path] = (), command: str = ""
-) -> list[str]:
+def write_leaderboard(sources: Sequence[Path], out: Path, *, captures: Sequence[Path] = ()) -> list[str]:
     """Write the page, the CSV and the pictures into `out`; returns lines for the terminal.
 
     `captures`: folders with the truth, besides those that runs and packs name.
@@ -93,7 +91,7 @@ def write_leaderboard(
             places = _places(entries)
             pictures, truths = _write_pictures(entries, out)
             data = _data(entries, places, pictures, truths)
-            page = environment("html").get_template("leaderboard.html").render(data=data, command=printable(command))
+            page = environment("html").get_template("leaderboard.html").render(data=data)
             write_atomic(out / "images.csv", _csv(entries, places).encode())
             write_atomic(out / "index.html", page.encode())
     count = sum(len(entry.result.views) for entry in entries)
@@ -109,7 +107,7 @@ def _entries(number: int, source: Path, folder: Path, captures: Sequence[Path]) 
             if check.kind == "differs":
                 raise InputError(f"{source}: {check.cell.config.title}: {check.text}")
             origins[check.cell.folder] = ORIGINS[check.kind]
-    default = "run" if source.is_dir() else "numbers alone, not checked"
+    default = "scores of its folder" if source.is_dir() else "numbers alone, not checked"
     for cell in read_run(folder).cells:
         if (result := result_of(cell)) is not None:
             yield Entry(
@@ -216,8 +214,7 @@ def _row(place: str, group: Sequence[Entry]) -> dict[str, Any]:
     return {
         "scene": place,
         "method": style_of(config.method).title,
-        "notes": _notes(results),
-        "origin": " | ".join(dict.fromkeys(f"{entry.source}: {entry.origin}" for entry in group)),
+        "origin": "; ".join([*dict.fromkeys(f"{each.source}: {each.origin}" for each in group), *_notes(results)]),
         "protocol": config.protocol,
         "preset": config.preset,
         "over": f"{len(people)} people, {len(seeds)} seeds" if len(group) > 1 else "1",
@@ -240,7 +237,7 @@ def _notes(results: Sequence[CellResult]) -> list[str]:
                 "ms per frame": brought.frame_ms,
                 "parameters": brought.parameters,
             }
-            figures = ", ".join([*(f"{value:g} {unit}" for unit, value in told.items() if value is not None)])
+            figures = ", ".join([*(f"{value:.10g} {unit}" for unit, value in told.items() if value is not None)])
             notes += [BROUGHT_NOTE, *([f"reported by its authors, not measured: {figures}"] if figures else [])]
     if any(result.isolated is False for result in results):
         notes.append("not isolated")

@@ -19,25 +19,27 @@ const score = (row, name) => row.scores[get("split").value]?.[`${region(name)}/$
 const cost = (row, name) => (row.machine === get("machine").value || !["frame_ms", "train_s"].includes(name) ? row.costs[name] : null);
 const columns = () => [
   { key: "method", title: "method" },
-  ...(get("scene").value ? [] : [{ key: "scene", title: "scene" }]),
+  ...(get("scene").value ? [] : [{ key: "scene", title: "scene", words: true }]),
   ...data.qualities.map((key) => ({ key, ...data.metrics[key], of: score, where: region(key) === "full" && get("region").value !== "full" ? " (whole frame)" : "" })),
   ...data.costs.map(([key, metric]) => ({ key, ...metric, of: cost })),
-  { key: "over", title: "mean of" }, { key: "origin", title: "origin", words: true },
+  { key: "over", title: "mean of" },
 ];
 const cellOf = (row, column) => {
   if (column.key === "method") {
-    const head = make("th", row.method, { scope: "row" });
-    for (const note of row.notes) head.append(make("small", note));
-    const shown = data.cells.find((cell) => cell.name === row.cell);
-    if (shown.views.length) head.append(make("small"));
-    if (shown.views.length) head.lastChild.append(make("a", shown.pictures ? "pictures" : "values by image", { href: `#${row.cell}` }));
+    const head = make("th", row.method, { scope: "row" }), cell = data.cells.find((each) => each.name === row.cell), link = make("small");
+    link.append(make("a", cell.pictures ? "pictures" : "values by image", { href: `#${row.cell}` }));
+    if (cell.views.length) link.append(" · ");
+    else link.replaceChildren();
+    link.append(row.origin);
+    head.append(link);
     return head;
   }
-  if (!column.of) return make("td", row[column.key], { className: column.key === "over" ? "" : "text" });
+  if (column.words) return make("td", row[column.key], { className: "scene" });
+  if (!column.of) return make("td", row[column.key]);
   const value = column.of(row, column.key);
   if (!value) return make("td", "n/a", { title: row.machine && column.of === cost ? `on ${row.machine}` : "not measured" });
   const text = value[0] >= 1e4 ? large(value[0]) : number(value[0], column.decimals);
-  return make("td", value[1] === null ? text : `${text} ± ${number(value[1], column.decimals)}`);
+  return make("td", !value[1] ? text : `${text} ± ${number(value[1], column.decimals)}`);
 };
 const showBoard = () => {
   const rows = data.rows.filter((row) => row.protocol === get("protocol").value && [row.scene, ""].includes(get("scene").value));

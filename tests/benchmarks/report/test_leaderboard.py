@@ -52,8 +52,8 @@ def data_of(page: Path) -> dict:
 def test_rows_pictures_and_numbers_are_those_of_the_cells(board: Path, made_once: Path, capture: Path) -> None:
     data = data_of(board)
     assert [(row["method"], row["origin"]) for row in data["rows"]] == [
-        ("fake_good", "run: run"),
-        ("fake_bad", "run: run"),
+        ("fake_good", "run: scores of its folder"),
+        ("fake_bad", "run: scores of its folder"),
         ("fake_bad", "sent.zip: pack, scored again: equal"),
     ]
     assert "Abacus" in data["rows"][2]["machine"] and Text(board.read_text()).tags.count("script") == 2

@@ -6,6 +6,7 @@ import struct
 import tempfile
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,11 @@ from helpers.commands import refused
 from helpers.packs import Files, change, change_json, read_files, write_files
 from PIL import Image
 
+from ash.capture.manifest import hash_files, read_manifest
 from ash.files import InputError, sha256_of
 from benchmarks import cli
 from benchmarks.cell.schema import CHECKPOINT
+from benchmarks.suites import verification
 from benchmarks.suites.archive import read_pack, unpacked, write_archive
 from benchmarks.suites.runs import read_run
 
@@ -65,6 +68,33 @@ def test_without_its_capture_a_pack_is_not_checked(pack: Path, capture: Path, ca
     assert "scores are equal" in capsys.readouterr().out
     assert "expected a file" in refused(capsys, "verify", str(capture), "--capture", str(capture))
     assert "manifest.json" in refused(capsys, "verify", str(pack), "--capture", "nowhere")
+
+
+def test_the_scene_rendered_elsewhere_gives_the_same_within_tolerance(
+    pack: Path, capture: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    """Another processor draws other pixels of the same scene; a fake capture has no scene, so it is given one."""
+    elsewhere = Path(shutil.copytree(capture, pack.parent / "elsewhere"))
+    path = next(elsewhere.glob("frames/cam3/*.png"))
+    pixels = np.array(Image.open(path))
+    pixels[0, 0] ^= 1
+    Image.fromarray(pixels).save(path)
+    replace(read_manifest(elsewhere), identity="scene", files=hash_files(elsewhere)).write(elsewhere)
+    monkeypatch.setattr(verification, "truth_of", lambda manifest: read_config(pack)["truth"])
+    assert cli.main(["verify", str(pack), "--capture", str(elsewhere)]) == cli.DONE
+    assert "within what counts as no change (the same scene, rendered elsewhere)" in capsys.readouterr().out
+    monkeypatch.setattr(verification, "truth_of", lambda manifest: "of another scene")
+    assert cli.main(["verify", str(pack), "--capture", str(elsewhere)]) == 1
+    assert "NOT CHECKED" in capsys.readouterr().out
+    path.unlink()
+    monkeypatch.setattr(verification, "truth_of", lambda manifest: read_config(pack)["truth"])
+    assert f"{path.name}: missing" in refused(capsys, "verify", str(pack), "--capture", str(elsewhere))
+
+
+def read_config(pack: Path) -> dict:
+    """The configuration of the only cell."""
+    files = read_files(pack)
+    return json.loads(next(files[name] for name in files if name.endswith("config.json")))["config"]
 
 
 def _repaint(files: Files) -> None:
