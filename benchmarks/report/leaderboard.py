@@ -81,8 +81,12 @@ def write_leaderboard(sources: Sequence[Path], out: Path, *, captures: Sequence[
         titles: dict[str, str] = {}
         for number, source in enumerate(sources):
             folder = source if source.is_dir() else stack.enter_context(unpacked(source))
-            entries += _entries(number, source, folder, captures)
-            titles = read_run(folder).titles | titles
+            near = (
+                entry.capture for entry in entries if entry.capture is not None
+            )  # A run knows where its truth lies.
+            entries += _entries(number, source, folder, tuple(dict.fromkeys((*captures, *near))))
+            if source.is_dir():  # Titles that a pack gives would stand above rows of others too.
+                titles = read_run(folder).titles | titles
         if not entries:
             raise InputError(f"{sources[0]}: no cell is finished, so there is nothing to show")
         if len({entry.cell.config.subject >= VALIDATION for entry in entries}) > 1:
@@ -107,7 +111,7 @@ def _entries(number: int, source: Path, folder: Path, captures: Sequence[Path]) 
             if check.kind == "differs":
                 raise InputError(f"{source}: {check.cell.config.title}: {check.text}")
             origins[check.cell.folder] = ORIGINS[check.kind]
-    default = "scores of its folder" if source.is_dir() else "numbers alone, not checked"
+    default = "scores of its folder" if source.is_dir() else "no pack, NOT CHECKED"
     for cell in read_run(folder).cells:
         if (result := result_of(cell)) is not None:
             yield Entry(
@@ -149,7 +153,7 @@ def _write_pictures(entries: Sequence[Entry], out: Path) -> tuple[set[str], dict
             if (stored := prediction_path(entry.cell.folder, view)).is_file():
                 drawn.add(entry.name)
                 _write(prediction_path(out / "pictures" / entry.name, view), _pixels(stored)[..., :3])
-            if identity in truths:
+            if entry.capture is not None and view.camera in truths[identity].cameras:
                 truth = metrics.on_black(truths[identity].image(view.camera, view.frame))[..., :3]
                 _write(out / _truth(identity) / view.camera / f"{view.frame:06d}.png", truth)
     return drawn, {identity: _truth(identity) for identity in truths}
@@ -210,14 +214,13 @@ def _row(place: str, group: Sequence[Entry]) -> dict[str, Any]:
         half = None if math.isnan(each.half_width) else each.half_width
         scores.setdefault(split, {})[f"{region}/{metric}"] = [float(f"{each.value:.6g}"), half]
     machines = {_machine(result) for result in results} - {""}
-    people, seeds = ({getattr(entry.cell.config, name) for entry in group} for name in ("subject", "seed"))
+    counts = {"people": len({r.config.subject for r in results}), "seeds": len({r.config.seed for r in results})}
     return {
         "scene": place,
         "method": style_of(config.method).title,
         "origin": "; ".join([*dict.fromkeys(f"{each.source}: {each.origin}" for each in group), *_notes(results)]),
         "protocol": config.protocol,
-        "preset": config.preset,
-        "over": f"{len(people)} people, {len(seeds)} seeds" if len(group) > 1 else "1",
+        "over": ", ".join(f"{count} {what}" for what, count in counts.items() if count > 1) or "1",
         "scores": {split: scores[split] for split in IMAGE_SPLITS if split in scores},
         "costs": {name: scores.get(split, {}).get(f"/{name}") for split, name in COSTS},
         "machine": machines.pop() if len(machines) == 1 else "several machines" if machines else "",
@@ -226,8 +229,8 @@ def _row(place: str, group: Sequence[Entry]) -> dict[str, Any]:
 
 
 def _notes(results: Sequence[CellResult]) -> list[str]:
-    notes = [f"{sum(result.status != 'done' for result in results)} of {len(results)} failed"]
-    notes = [] if notes[0].startswith("0 ") else notes
+    failed = sum(result.status != "done" for result in results)
+    notes = [f"{failed} of {len(results)} failed"] if failed else []
     if is_oracle(results[0].config.method):
         notes.append("is given part of the truth")
     for brought in dict.fromkeys(result.brought for result in results):
@@ -237,7 +240,7 @@ def _notes(results: Sequence[CellResult]) -> list[str]:
                 "ms per frame": brought.frame_ms,
                 "parameters": brought.parameters,
             }
-            figures = ", ".join([*(f"{value:.10g} {unit}" for unit, value in told.items() if value is not None)])
+            figures = ", ".join(f"{value:.10g} {unit}" for unit, value in told.items() if value is not None)
             notes += [BROUGHT_NOTE, *([f"reported by its authors, not measured: {figures}"] if figures else [])]
     if any(result.isolated is False for result in results):
         notes.append("not isolated")
@@ -269,7 +272,7 @@ def _cell(entry: Entry, place: str, pictures: set[str], truths: dict[str, str]) 
         "source": entry.source,
         "capture": f"{place}, subject {config.subject}",
         "pictures": f"pictures/{entry.name}/images" if entry.name in pictures else "",
-        "truth": truths.get(config.capture, ""),
+        "truth": truths[config.capture] if entry.capture is not None else "",
         "views": views,
     }
 

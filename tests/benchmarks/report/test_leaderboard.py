@@ -4,6 +4,7 @@ import csv
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,10 @@ from helpers.packs import change, change_json
 from PIL import Image
 
 from ash.capture.formats import load_capture
+from ash.files import read_json, write_json
 from benchmarks import cli
 from benchmarks.cell import metrics
-from benchmarks.cell.schema import read_result
+from benchmarks.cell.schema import read_cell, read_result, write_config, write_result
 from benchmarks.suites.archive import write_archive
 from benchmarks.suites.runs import read_run
 
@@ -33,14 +35,14 @@ def packed(made_once: Path, tmp_path: Path) -> Path:
     assert cli.main(["pack", str(cell.folder), "--out", str(path)]) == cli.DONE
     facts = {"processor": f"Abacus {SCRIPT}", "cores": "1"}
     change(path, change_json("result.json", lambda result: result["provenance"]["machine"].update(facts)))
+    change(path, change_json("run.json", lambda run: run.update(titles={"fake_good": "worst", "fake_bad": "best"})))
     return path
 
 
 @pytest.fixture
-def board(made_once: Path, packed: Path, capture: Path, tmp_path: Path) -> Path:
-    """The page of the run and of the pack."""
-    command = ["leaderboard", str(made_once), str(packed), "--out", str(tmp_path / "board"), "--capture", str(capture)]
-    assert cli.main(command) == cli.DONE
+def board(made_once: Path, packed: Path, tmp_path: Path) -> Path:
+    """The page of the run and of the pack, which is verified with the capture of the run."""
+    assert cli.main(["leaderboard", str(made_once), str(packed), "--out", str(tmp_path / "board")]) == cli.DONE
     return tmp_path / "board" / "index.html"
 
 
@@ -58,10 +60,8 @@ def test_rows_pictures_and_numbers_are_those_of_the_cells(board: Path, made_once
     ]
     assert "Abacus" in data["rows"][2]["machine"] and Text(board.read_text()).tags.count("script") == 2
     cell = read_run(made_once).cells[0]
-    result, rows = (
-        read_result(cell.folder),
-        list(csv.DictReader((board.parent / "images.csv").read_text().splitlines())),
-    )
+    result = read_result(cell.folder)
+    rows = list(csv.DictReader((board.parent / "images.csv").read_text().splitlines()))
     assert result is not None and len(rows) == 78
     for view, row in zip(result.views, rows, strict=False):
         assert (row["camera"], int(row["frame"]), row["prediction"]) == (view.camera, view.frame, view.prediction)
@@ -106,6 +106,27 @@ def test_it_sorts_filters_and_shows_any_picture(board: Path, visit: Visitor) -> 
         assert all(request.startswith(local) for request in each.requests)
 
 
+def test_scenes_of_one_name_are_told_apart_and_seeds_are_averaged(finished: Path, tmp_path: Path) -> None:
+    other = Path(shutil.copytree(finished, tmp_path / "other"))
+    keys = []
+    for folder in sorted((other / "cells").iterdir()):
+        cell, result = read_cell(folder), read_result(folder)
+        assert result is not None
+        for changed in ({"truth": "f" * 64}, {"truth": "f" * 64, "seed": 1}):
+            config = replace(cell.config, **changed)
+            keys.append(config.key)
+            write_config(replace(cell, config=config, folder=other / "cells" / config.key))
+            write_result(other / "cells" / config.key, replace(result, config=config))
+        shutil.rmtree(folder)
+    write_json(other / "run.json", read_json(other / "run.json") | {"cells": keys})
+    assert cli.main(["leaderboard", str(finished), str(other), "--out", str(tmp_path / "b")]) == cli.DONE
+    rows = data_of(tmp_path / "b" / "index.html")["rows"]
+    assert len({row["scene"] for row in rows}) == 2 and all(row["scene"].startswith("boxes (") for row in rows)
+    assert [row["over"] for row in rows] == ["1", "1", "2 seeds", "2 seeds"]
+    mean, half = rows[2]["scores"]["novel_view"]["foreground/psnr"]
+    assert half == 0 and mean > 0
+
+
 def _improve(result: dict) -> None:
     next(row for row in result["summary"] if row["metric"] == "psnr")["value"] += 3
 
@@ -128,7 +149,7 @@ def test_what_is_not_at_hand_is_said(
     assert cli.main(["leaderboard", str(packed), "--out", "b"]) == cli.DONE
     assert "truth of capture: not at hand" in capsys.readouterr().out
     data = data_of(tmp_path / "b" / "index.html")
-    told = "numbers alone, not checked" if numbers_alone else "NOT CHECKED: no capture at hand"
+    told = "no pack, NOT CHECKED" if numbers_alone else "NOT CHECKED: no capture at hand"
     assert told in data["rows"][0]["origin"] and not data["cells"][0]["truth"]
     assert bool(data["cells"][0]["pictures"]) is not numbers_alone
 
