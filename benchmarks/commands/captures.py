@@ -1,4 +1,4 @@
-"""Commands that make and check captures: synth, verify, motions."""
+"""Commands that make and check captures: synth, verify (of packs too), motions."""
 
 import contextlib
 import sys
@@ -7,7 +7,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from ash.fields import Changes
-from benchmarks.commands.arguments import DONE, WRONG_INPUT, Argument, Count, CountIfAny, File, Folder, Positional, Seed
+from ash.files import InputError
+from benchmarks.commands.arguments import (
+    DONE,
+    FAILED,
+    WRONG_INPUT,
+    Argument,
+    Count,
+    CountIfAny,
+    File,
+    Folder,
+    Positional,
+    Repeated,
+    Seed,
+)
 
 if TYPE_CHECKING:
     from synth.scene import Scene, Take
@@ -161,24 +174,49 @@ def _shard(text: str | None) -> tuple[int, int]:
 
 @dataclass(frozen=True, kw_only=True)
 class VerifyCommand:
-    """Hash every file of a capture again."""
+    """Hash every file of a capture again; of a pack, hash its files and score its pictures again.
 
-    folder: Positional[Path]  # of the capture
+    Exit code 1: a score of a pack differs, or could not be checked because its capture is not at hand.
+    """
+
+    source: Positional[Path]  # a capture's folder, or a pack
+    capture: Repeated[tuple[Path, ...]] = ()  # of a pack: a capture to score on; may be repeated; default: data/NAME
 
     def __call__(self) -> int:
         """Name every problem."""
         from ash.capture.manifest import read_manifest, verify_capture
 
-        manifest = read_manifest(self.folder)
-        problems = verify_capture(self.folder)
+        if not self.source.is_dir():
+            return self._pack()
+        if self.capture:
+            raise InputError("--capture: goes with a pack, expected a file")
+        manifest = read_manifest(self.source)
+        problems = verify_capture(self.source)
         if not manifest.complete:
             problems.append("the capture is unfinished")
         for problem in problems:
-            print(f"{self.folder}: {problem}", file=sys.stderr)
+            print(f"{self.source}: {problem}", file=sys.stderr)
         if problems:
             return WRONG_INPUT
-        print(f"{self.folder}: {len(manifest.files)} files, all as the manifest says")
+        print(f"{self.source}: {len(manifest.files)} files, all as the manifest says")
         return DONE
+
+    def _pack(self) -> int:
+        from ash.capture.manifest import read_manifest
+        from ash.files import one_line
+        from benchmarks.cell.metrics import PROTOCOL
+        from benchmarks.suites.archive import unpacked
+        from benchmarks.suites.verification import TRUST, verify_pack
+
+        for folder in self.capture:
+            read_manifest(folder)
+        with unpacked(self.source) as folder:
+            checks, files = verify_pack(folder, self.capture)
+        print(f"{self.source}: {files} files, names, sizes and SHA-256 as pack.json says, protocol {PROTOCOL}")
+        for check in checks:
+            print(one_line(f"{check.cell.config.title}: {check.text}"))
+        print("\n".join(TRUST))
+        return FAILED if {check.kind for check in checks} & {"differs", "unchecked"} else DONE
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,6 +4,7 @@ import shutil
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers import fakes
 from helpers.captures import write_tube_capture
@@ -11,7 +12,10 @@ from helpers.sharing import Shared
 
 from benchmarks import cli
 from benchmarks.cell import metrics
+from benchmarks.cell.metrics import score_view
 from benchmarks.cell.schema import read_cell
+
+SCORED: dict[bytes, dict[tuple[str, str], float]] = {}
 
 
 @pytest.fixture(scope="session")
@@ -87,3 +91,18 @@ def made_once(capture: Path, shared: Shared) -> Path:
 def finished(made_once: Path, tmp_path: Path) -> Path:
     """A copy of the finished run."""
     return Path(shutil.copytree(made_once, tmp_path / "run"))
+
+
+@pytest.fixture
+def scored_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pair of pictures is scored once for all tests, and LPIPS is not measured, which takes long."""
+
+    def score(predicted: np.ndarray, truth: np.ndarray) -> dict[tuple[str, str], float]:
+        key = predicted.tobytes() + truth.tobytes()
+        if key not in SCORED:
+            SCORED[key] = score_view(predicted, truth)
+        return SCORED[key]
+
+    monkeypatch.setattr(metrics, "score_view", score)
+    monkeypatch.setattr("benchmarks.cell.evaluation._perceptual", lambda device: None)
+    monkeypatch.setattr("benchmarks.suites.verification.weights_file", lambda: None)

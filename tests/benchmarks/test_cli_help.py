@@ -69,7 +69,7 @@ for command in COMMANDS:
         ("run --methods nosuch", "unknown method 'nosuch', expected one of"),
         ("run --size huge --dry-run", "unknown size 'huge', expected one of ci, factor, quick, long, table, paper"),
         ("speed else", "WHAT: expected one of kernels, frame, got 'else'"),
-        ("verify", "expected FOLDER"),
+        ("verify", "expected SOURCE"),
         ("export", "expected SOURCE and --format"),
         ("run qiuck --list", "unknown suite 'qiuck', did you mean quick"),
         ("synth tihgt", "unknown scene 'tihgt', did you mean tight"),

@@ -34,6 +34,7 @@ from benchmarks.cell.lpips import _load as read_tensors
 from benchmarks.cell.schema import Cell, CellConfig, failed_result, read_cell, read_result, write_config, write_result
 from benchmarks.gate.baseline import GateFile, read_gate_file
 from benchmarks.studies.conformance_worker import Outcome, read_outcome
+from benchmarks.suites.archive import read_pack, unpacked, write_pack
 from benchmarks.suites.files import read_suite
 from benchmarks.suites.runs import read_run
 from synth.camera.rig import rig_from_file
@@ -92,6 +93,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Rea
         "suite": (_suite(folder / "mine.toml"), read_suite),
         "trial": (_outcome(folder / "outcome.json"), lambda path: read_outcome(path.parent)),
         "lpips": (_tensors(folder / "alex.pth"), read_tensors),
+        "pack": (_pack(folder), _read_pack),
     }
 
 
@@ -136,6 +138,17 @@ def _result(folder: Path) -> Path:
     return folder / "cell" / "result.json"
 
 
+def _pack(folder: Path) -> Path:
+    write_pack(read_run(folder / "cell"), folder / "mine.zip")
+    return folder / "mine.zip"
+
+
+def _read_pack(path: Path) -> None:
+    with unpacked(path) as folder:
+        read_pack(folder)
+        read_run(folder)
+
+
 @pytest.fixture(autouse=True)
 def as_a_user_runs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the checks of shapes, which no user has: they would refuse what a reader let through, and take time."""
@@ -145,6 +158,7 @@ def as_a_user_runs_it(monkeypatch: pytest.MonkeyPatch) -> None:
 KINDS = (
     "manifest", "cameras", "skeleton", "template", "motion", "surface", "image", "bvh", "amass", "joint map", "rig",
     "gate", "curve", "run", "result", "cell", "json", "weights", "suite", "trial", "lpips",
+    "pack",
 )  # fmt: skip
 
 

@@ -259,7 +259,8 @@ def test_a_method_in_another_repository(
     told = read_json(tmp_path / "base" / "gate.json")
     write_json(tmp_path / "base" / "gate.json", {**told, "machine": "another"})  # Others may be at work beside us.
     assert cli.main([*command, "--history", "history"]) == cli.DONE
-    assert "gate: passed, unchanged" in (told := capsys.readouterr().out)
+    told = capsys.readouterr().out
+    assert "gate: passed, unchanged" in told
     assert "not judged             cost: memory and times: the baseline was made on another" in told
     assert (tmp_path / "history" / "index.html").read_text().count("<svg") == 3
 
@@ -274,7 +275,8 @@ def test_a_method_in_another_repository(
     row = "boxes · mine"
     assert cli.main([*command, "--out", "dim", "--accept", row, "--because", "darker is wanted"]) == cli.DONE
     assert cli.main([*command, "--out", "dim"]) == cli.DONE
-    assert "Accepted at" in (told := capsys.readouterr().out) and "darker is wanted" in told
+    told = capsys.readouterr().out
+    assert "Accepted at" in told and "darker is wanted" in told
 
     fakes.write_suite(tmp_path, capture, "own_method:mine", "fake_good", name="gate")
     assert cli.main([*command, "--suite", str(suite)]) == cli.WRONG_INPUT
