@@ -21,7 +21,7 @@ from benchmarks.cell.evaluation import image_summary, scored_views
 from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.schema import Cell, CellResult, View, ViewScore, stored_prediction
 from benchmarks.gate.baseline import LARGEST_LOG, LOG_LINES, Entry, stored_views
-from benchmarks.gate.checks import GATED, Check, of_exact_change
+from benchmarks.gate.checks import GATED, Check, Verdict, of_exact_change
 
 SAME_SCORE = 1e-5  # as a share of a score: rounding of another instruction set
 SAME_DB = 50.0  # PSNR between two pictures that differ by rounding alone
@@ -89,7 +89,7 @@ def rendering_checks(row: str, before: CellResult, after: CellResult, worst: Wor
     told = f"rendering changed: {changed} of {len(old)} pictures{far}"
     scores = [check for name in GATED if (check := _score_check(row, name, before, after)) is not None]
     rounding = worst is not None and worst.psnr >= SAME_DB and all(s.verdict == "unchanged" for s in scores)
-    verdict = "unchanged" if rounding else "not worse"
+    verdict: Verdict = "unchanged" if rounding else "not worse"
     detail = f"equal within rounding: {told}" if rounding else told
     return [Check(row=row, layer="rendering", verdict=verdict, detail=detail), *scores]
 
@@ -120,9 +120,10 @@ def first_steps_check(row: str, before: Path, after: Path) -> Check | None:
 
 def _first_difference(row: str, old: Mapping[str, Any], new: Mapping[str, Any], what: str) -> Check:
     step = old.get("step", "?")
-    values = [line.get(what) for line in (old, new)]
-    told = f"{what} {values[0]} -> {values[1]}"
-    near = all(isinstance(value, float) for value in values) and math.isclose(*values, rel_tol=SAME_STEP)
+    before, after = old.get(what), new.get(what)
+    told = f"{what} {before} -> {after}"
+    numbers = isinstance(before, float) and isinstance(after, float)
+    near = numbers and math.isclose(before, after, rel_tol=SAME_STEP)
     where = {
         "loss": f"from the loss of step {step} on" + ("" if step == 1 else ", so in the update before it"),
         "gradient": f"from the gradient of step {step} on, whose loss is equal",

@@ -46,6 +46,7 @@ from benchmarks.suites.suites import Suite
 
 TRAINED = 2  # seeds of every row, so that a seed that is ignored is seen
 TIMED = 5  # drawings of a frozen avatar for a baseline's times; of a run one, and more while a time fails
+Pairs = dict[str, tuple[Sequence[Entry], Sequence[Entry]]]  # by row: before and after, seeds in order
 FROZEN = "frozen"  # folder of avatars that were drawn again
 
 
@@ -85,7 +86,7 @@ def judge(
     drawn, worst = _draw_frozen(baseline, by_row, same, options, checks)
     started = time.monotonic()
     after = _train(by_row, same, TRAINED, suite, options)
-    pairs = {row: (baseline.rows[row], entries) for row, entries in after.items() if entries}
+    pairs: Pairs = {row: (baseline.rows[row], entries) for row, entries in after.items() if entries}
     _judge_training(pairs, checks)
     quality = _judge_quality(pairs, by_row, suite, options, until=started + 60 * minutes, seeds=seeds)
     checks += quality.checks
@@ -221,7 +222,7 @@ def _train(
     return found
 
 
-def _judge_training(pairs: dict[str, tuple[Sequence[Entry], Sequence[Entry]]], checks: list[Check]) -> None:
+def _judge_training(pairs: Pairs, checks: list[Check]) -> None:
     """Failed cells, first steps and seeds; a row of which a cell failed is not compared any further."""
     for row, (before, entries) in list(pairs.items()):
         if failed := [entry.result for entry in entries if entry.result.status != "done"]:
@@ -236,7 +237,7 @@ def _judge_training(pairs: dict[str, tuple[Sequence[Entry], Sequence[Entry]]], c
 
 
 def _judge_quality(
-    pairs: dict[str, tuple[Sequence[Entry], Sequence[Entry]]],
+    pairs: Pairs,
     by_row: Mapping[str, Sequence[Cell]],
     suite: Suite,
     options: RunOptions,
@@ -258,7 +259,7 @@ def _judge_quality(
 
 def _cost_checks(
     baseline: Baseline,
-    pairs: Mapping[str, tuple[Sequence[Entry], Sequence[Entry]]],
+    pairs: Pairs,
     drawn: Mapping[str, Iterator[CellResult]],
     times: dict[str, dict[str, float]],
 ) -> list[Check]:
@@ -274,8 +275,8 @@ def _cost_checks(
         checks.append(memory_check(row, before, after))
         old = baseline.file.times.get(row, {})
         if row in drawn:
-            told, times[row] = _times_again(row, old, training_time(after), drawn[row])
-            checks += told
+            timed, times[row] = _times_again(row, old, training_time(after), drawn[row])
+            checks += timed
         else:
             checks += time_checks(row, old, training_time(after))
     return checks

@@ -132,7 +132,7 @@ def _figure(index: int, title: str, values: pd.DataFrame) -> Figure:
         named.mark_point(color=BLUE, size=120),
         named.mark_text(dy=-12).encode(text="commit:N"),
     )
-    panel = layers.properties(width=620, height=160)
+    panel: Any = layers.properties(width=620, height=160)
     return Figure(
         name=f"history_{index}", title=title, caption="", panels=(panel,), series=(Series(title=title, colour=BLUE),)
     )

@@ -86,18 +86,18 @@ def _tests(
     before, after = ({str(seed): [pair[side]] for seed, pair in enumerate(known)} for side in (0, 1))
     test = compare_samples(after, before, margin=metric.abs_tol, higher_is_better=metric.direction == "up")
     assert test is not None
-    return [(row, name, test, *(sum(pair[side] for pair in known) / len(known) for side in (0, 1)))]
+    old, new = (sum(pair[side] for pair in known) / len(known) for side in (0, 1))
+    return [(row, name, test, old, new)]
 
 
 def _missing(row: str, name: tuple[str, str, str], seeds: Sequence[tuple[CellResult, CellResult]]) -> list[Check]:
     """A score that was measured and is not any more; LPIPS where its weights are absent is not judged."""
     if all(new.value(*name) is not None for old, new in seeds if old.value(*name) is not None):
         return []
-    if name[2] == "lpips":
-        detail, verdict = "n/a: no weights for LPIPS here", "not judged"
-    else:
-        detail, verdict = "not measured", "worse"
-    return [Check(row=row, layer="quality", name="/".join(name), verdict=verdict, detail=detail)]  # type: ignore[arg-type]
+    absent = name[2] == "lpips"
+    detail = "n/a: no weights for LPIPS here" if absent else "not measured"
+    verdict: Verdict = "not judged" if absent else "worse"
+    return [Check(row=row, layer="quality", name="/".join(name), verdict=verdict, detail=detail)]
 
 
 def _quality_check(row: str, name: tuple[str, str, str], test: Comparison, old: float, new: float) -> Check:
