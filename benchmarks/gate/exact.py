@@ -122,8 +122,7 @@ def _first_difference(row: str, old: Mapping[str, Any], new: Mapping[str, Any], 
     step = old.get("step", "?")
     before, after = old.get(what), new.get(what)
     told = f"{what} {before} -> {after}"
-    numbers = isinstance(before, float) and isinstance(after, float)
-    near = numbers and math.isclose(before, after, rel_tol=SAME_STEP)
+    near = isinstance(before, float) and isinstance(after, float) and math.isclose(before, after, rel_tol=SAME_STEP)
     where = {
         "loss": f"from the loss of step {step} on" + ("" if step == 1 else ", so in the update before it"),
         "gradient": f"from the gradient of step {step} on, whose loss is equal",
