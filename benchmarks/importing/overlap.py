@@ -32,7 +32,10 @@ def posed_template(capture: Capture, frame: int) -> np.ndarray:
 
 
 def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
-    """Pixels `[h, w]` (bool) whose centre a mesh covers; `vertices` `[v, 3]` in metres. The lens bends vertices only."""
+    """Pixels `[h, w]` (bool) whose centre a mesh covers; `vertices` `[v, 3]` in metres.
+
+    A lens that distorts bends no edge between two vertices.
+    """
     if camera.is_pinhole:
         seen = (vertices @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.T
     else:
