@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-COUNT, STEPS, REACH = 3000, 120, 2  # Gaussians; steps of Adam; pixels on each side of a Gaussian's own
+COUNT, STEPS, REACH = 2000, 60, 2  # Gaussians; steps of Adam; pixels on each side of a Gaussian's own
 
 
 def read_training(folder):
@@ -89,7 +89,7 @@ def main(train, test, out):
     faces = torch.from_numpy(np.load(test / "template.npz")["faces"]).long()
     still = posed_template(test, int(train.name.removeprefix("frame_")))
     splats = Splats(still, faces)
-    optimiser = torch.optim.Adam(splats.parameters(), lr=0.05)
+    optimiser = torch.optim.Adam(splats.parameters(), lr=0.1)
     for step in range(STEPS):
         image, K, viewmat = views[step % len(views)]
         drawn = splats.render(still, K, viewmat, image.shape[1], image.shape[0])

@@ -115,9 +115,12 @@ def main(folder):
             name = f"{number}/image_c_{number}_f_{frame}.png"
             mask = np.array(Image.open(training / "foregroundSegmentation" / name))[..., -1] > 50
             assert np.array(Image.open(training / "images" / name)).shape == (*mask.shape, 3)
-            column, row = project(surface(posed[0], faces), camera).round().astype(int).T
+            pixels = project(surface(posed[0], faces), camera)
+            central = pixels[(np.abs(pixels - pixels.round()) < 0.2).all(axis=1)]
+            column, row = central.round().astype(int).T
             drawn = np.zeros_like(mask)
-            drawn[row.clip(0, mask.shape[0] - 1), column.clip(0, mask.shape[1] - 1)] = True
+            within = (row >= 0) & (row < mask.shape[0]) & (column >= 0) & (column < mask.shape[1])
+            drawn[row[within], column[within]] = True
             ious.append((drawn & mask).sum() / (drawn | mask).sum())
             offset_px.append(np.argwhere(drawn).mean(axis=0) - np.argwhere(mask).mean(axis=0))
     measured = {"joints_mm": max(joints_mm), "posed_mm": max(posed_mm), "iou": min(ious)}
