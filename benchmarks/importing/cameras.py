@@ -45,7 +45,7 @@ def read_any_cameras(path: Path) -> dict[str, Camera]:
         InputError: the file is of no such format, larger than 64 MiB, or a camera in it is not of our kind.
     """
     if path.suffix == ".txt":
-        return _checked(path, _colmap_rows(path, path.with_name("images.txt")))
+        return read_colmap(path, path.with_name("images.txt"))
     content = read_json(path, most=LARGEST)
     rows = content.get("cameras") if isinstance(content, dict) else content
     if isinstance(rows, list) and any(isinstance(row, dict) and "viewmat" in row for row in rows):
@@ -53,8 +53,12 @@ def read_any_cameras(path: Path) -> dict[str, Camera]:
     return _checked(path, json.loads(rig_from_file(path).given)["cameras"])
 
 
-def _colmap_rows(cameras: Path, images: Path) -> list[dict[str, Any]]:
-    """Rows of our `cameras.json` from COLMAP's: one per image, its pose with the lens that it names."""
+def read_colmap(cameras: Path, images: Path) -> dict[str, Camera]:
+    """The cameras of a text model of COLMAP: one per image, its pose with the lens that it names.
+
+    Raises:
+        InputError: a file is missing or damaged, or a lens is of a model other than `MODELS`.
+    """
     from scipy.spatial.transform import Rotation
 
     lenses: dict[str, dict[str, Any]] = {}
@@ -81,7 +85,7 @@ def _colmap_rows(cameras: Path, images: Path) -> list[dict[str, Any]]:
         raise
     except (KeyError, IndexError, ValueError, OverflowError) as error:
         raise InputError(f"{cameras.parent}: expected a text model of COLMAP ({error})") from error
-    return rows
+    return _checked(cameras, rows)
 
 
 def _lines(path: Path) -> list[str]:

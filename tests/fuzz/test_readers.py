@@ -33,10 +33,12 @@ from benchmarks.cell.evaluation import read_curve
 from benchmarks.cell.lpips import _load as read_tensors
 from benchmarks.cell.schema import Cell, CellConfig, failed_result, read_cell, read_result, write_config, write_result
 from benchmarks.gate.gate import read_baseline
+from benchmarks.importing.cameras import read_colmap
 from benchmarks.studies.conformance_worker import Outcome, read_outcome
 from benchmarks.suites.files import read_suite
 from benchmarks.suites.runs import read_run
 from synth.camera.rig import rig_from_file
+from synth.export.formats import export
 from synth.motion.importing import import_motion, read_joint_map
 from synth.person.mannequin import heads
 from synth.skeleton import make_skeleton
@@ -65,6 +67,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Rea
     folder = tmp_path_factory.mktemp("good")
     capture = fakes.write_capture(folder / "capture")
     joints = 3
+    colmap = export(load_capture(capture), folder / "colmap", form="colmap") / "sparse" / "0"
     (folder / "joints.json").write_text('{"pelvis": "Hips", "thigh_left": "LeftUpLeg"}')
     (folder / "log.jsonl").write_text('{"seconds": 1, "loss": 2}\n{"seconds": 2, "train_psnr": 20.5}\n')
     run = folder / "run.json"
@@ -82,6 +85,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Rea
         "amass": (amass_file(folder / "a.npz"), lambda path: import_motion(path, SKELETON, fps=12.0, most=20)),
         "joint map": (folder / "joints.json", read_joint_map),
         "rig": (capture / "cameras.json", rig_from_file),
+        "lenses": (colmap / "cameras.txt", lambda path: read_colmap(path, colmap / "images.txt")),
+        "poses": (colmap / "images.txt", lambda path: read_colmap(colmap / "cameras.txt", path)),
         "baseline": (ROOT / "reports" / "baseline.json", read_baseline),
         "curve": (folder / "log.jsonl", read_curve),
         "run": (run, lambda path: read_run(path.parent)),
@@ -139,7 +144,7 @@ def as_a_user_runs_it(monkeypatch: pytest.MonkeyPatch) -> None:
 
 KINDS = (
     "manifest", "cameras", "skeleton", "template", "motion", "surface", "image", "bvh", "amass", "joint map", "rig",
-    "baseline", "curve", "run", "result", "cell", "json", "weights", "suite", "trial", "lpips",
+    "lenses", "poses", "baseline", "curve", "run", "result", "cell", "json", "weights", "suite", "trial", "lpips",
 )  # fmt: skip
 
 
