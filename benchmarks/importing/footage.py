@@ -1,9 +1,11 @@
 """A folder of footage as a capture without truth: docs/import.md says what lies where.
 
-images/CAM/*FRAME.png   or .jpg; RGB, or RGBA with straight alpha; a file's name ends with the frame's number
-masks/CAM/*FRAME.png    grey, white is the person; absent where the images have alpha
-cameras.json            or another of `cameras.FILES`
-skeleton.json, motion.npz, template.npz   as captures have them
+    images/CAM/*FRAME.png   or .jpg; RGB, or RGBA with straight alpha; a file's name ends with the frame's number
+    masks/CAM/*FRAME.png    grey, white is the person; absent where the images have alpha
+    cameras.json            or another of `cameras.FILES`
+    skeleton.json, motion.npz, template.npz   as captures have them
+
+Pictures are read one at a time, and the capture appears when all of them are good.
 """
 
 import io
@@ -113,11 +115,15 @@ def read_footage(folder: Path, *, cameras: Path | None = None, test: HeldOut | N
         folder=folder, cameras=rig, skeleton=skeleton, template=template, motion=motion, splits=splits,
         images=images, masks=masks,
     )  # fmt: skip
-    for what, files in (("images", images), *([("masks", masks)] if masks else [])):
-        for name in rig:
-            wanted = [frame for camera, frame in footage.views if camera == name]
-            if missing := [frame for frame in wanted if frame not in files[name]]:
-                count = f"{len(missing)} of {len(wanted)} frames are missing"
+    wanted: dict[str, list[int]] = {name: [] for name in rig}
+    for camera, frame in footage.views:
+        wanted[camera].append(frame)
+    for what, files in (("images", images), ("masks", masks)):
+        if not files:
+            continue
+        for name, frames in wanted.items():
+            if missing := [frame for frame in frames if frame not in files[name]]:
+                count = f"{len(missing)} of {len(frames)} frames are missing"
                 problems.append(f"{folder / what / name}: {count}, the first is {missing[0]}")
     if problems:
         raise BadFootage(problems)
@@ -236,7 +242,9 @@ def _splits(folder: Path, cameras: list[str], frames: list[int], motion: Motion,
     if unknown := sorted(set(test.cameras) - set(cameras)):
         raise InputError(f"test cameras: no camera {unknown[0]}, expected some of {', '.join(cameras):.200}")
     count = min(max(1, len(cameras) // 4), 8) if len(cameras) > 1 else 0
-    held = test.cameras or tuple(cameras[int(len(cameras) / count * (k + 0.5))] for k in range(count))
+    held = tuple(dict.fromkeys(test.cameras)) or tuple(
+        cameras[int(len(cameras) / count * (k + 0.5))] for k in range(count)
+    )
     shown = tuple(name for name in cameras if name not in held)
     last = int(motion.sequence[frames[-1]])
     if test.frames is not None:
@@ -254,9 +262,9 @@ def _splits(folder: Path, cameras: list[str], frames: list[int], motion: Motion,
         raise InputError(f"{folder}: test frame {tested[0]} lies before training frame {train[-1]}, expected it behind")
     splits = {"train": Split(cameras=shown, frames=train)}
     if held:
-        splits["novel_view"] = Split(cameras=tuple(held), frames=train)
+        splits["novel_view"] = Split(cameras=held, frames=train)
     if tested:
-        splits["novel_pose"] = Split(cameras=tuple(held) or shown, frames=tested)
+        splits["novel_pose"] = Split(cameras=held or shown, frames=tested)
     return splits
 
 
