@@ -38,6 +38,7 @@ METHOD_PATH_FLAG = "--method-path"
 COMMANDS = {
     "run": "runs:RunCommand",
     "synth": "captures:SynthCommand",
+    "import": "captures:ImportCommand",
     "train": "runs:TrainCommand",
     "report": "runs:ReportCommand",
     "compare": "runs:CompareCommand",

@@ -12,7 +12,7 @@ import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-TUTORIALS = ("ablation", "gate", "predictions", "truth")
+TUTORIALS = ("ablation", "gate", "import", "predictions", "truth")
 
 
 def run_tutorial(name: str, folder: Path) -> None:

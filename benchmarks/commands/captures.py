@@ -1,4 +1,4 @@
-"""Commands that make and check captures: synth, verify (of packs too), motions."""
+"""Commands that make and check captures: synth, import, verify (of packs too), motions."""
 
 import contextlib
 import sys
@@ -17,6 +17,7 @@ from benchmarks.commands.arguments import (
     CountIfAny,
     File,
     Folder,
+    Names,
     Positional,
     Repeated,
     Seed,
@@ -170,6 +171,51 @@ def _shard(text: str | None) -> tuple[int, int]:
     shard_of([], text)
     index, count = (int(part) for part in text.split("/"))
     return index, count
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportCommand:
+    """Make a capture without truth from footage: images, masks, cameras, skeleton, motion and a skinned template.
+
+    docs/import.md says which files lie where. What does not fit is named, a line each, and then no capture is made. The
+    posed template is compared with the masks of every camera. Metrics that need truth are n/a on such a capture.
+    """
+
+    footage: Positional[Path]  # the folder
+    out: Folder  # of the capture, new or empty
+    name: str = ""  # of the scene in tables; default: the name of --out
+    cameras: File | None = None  # our cameras.json, nerfstudio's, 3DGS's or COLMAP's cameras.txt; default: FOOTAGE's
+    test_cameras: Names = ()  # held out; default: a quarter, 1 to 8
+    test_frames: Annotated[str | None, Argument(metavar="A:B")] = None  # B not included; default: the last sequence
+    least_iou: float = 0.3  # of the template and the masks of each camera; below, nothing is made
+
+    def __call__(self) -> int:
+        """Check the whole, then write it."""
+        from benchmarks.importing.footage import BadFootage, HeldOut, import_footage, read_footage
+        from benchmarks.importing.overlap import overlap_table
+
+        test = HeldOut(cameras=self.test_cameras, frames=_first_and_last(self.test_frames))
+        try:
+            footage = read_footage(self.footage, cameras=self.cameras, test=test)
+            capture, overlaps = import_footage(footage, self.out, name=self.name, least_iou=self.least_iou)
+        except BadFootage as error:
+            for line in error.lines:
+                print(f"ash-bench: {line}", file=sys.stderr)
+            return WRONG_INPUT
+        print(overlap_table(overlaps))
+        for name, split in capture.splits.items():
+            print(f"{name}: {len(split.cameras)} cameras, {len(split.frames)} frames, {split.count} images")
+        print(f"{self.out}: {len(capture.manifest.files)} files with their hashes; no truth")
+        return DONE
+
+
+def _first_and_last(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    first, _, last = text.partition(":")
+    if not (first.isdecimal() and last.isdecimal()):
+        raise InputError(f"--test-frames: expected A:B, two frame numbers, got {text!r}")
+    return int(first), int(last)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from ash.files import InputError, read_json, require_plain, run_lock, write_json
 from benchmarks.cell import sandbox
 from benchmarks.cell.metrics import PROTOCOL
 from benchmarks.cell.predictions import open_predictions
-from benchmarks.cell.registry import BROUGHT, brought_folder, code_version, configured, find_method, offered
+from benchmarks.cell.registry import BROUGHT, ORACLES, brought_folder, code_version, configured, find_method, offered
 from benchmarks.cell.sandbox import clean_environment
 from benchmarks.cell.schema import Cell, CellConfig, CellResult, printable, read_cell, result_of
 from benchmarks.suites.captures import (
@@ -197,9 +197,11 @@ def cell_for(spec: CellSpec, capture_folder: Path, out: Path, *, info: Path | No
     Pictures for several captures lie each in a folder that is called as its capture's.
 
     Raises:
-        InputError: brought pictures cannot be scored.
+        InputError: brought pictures cannot be scored, or the method is an oracle and the capture has no truth.
     """
     capture = load_capture(capture_folder)
+    if (spec.factory or spec.method) in ORACLES and not (capture_folder / "truth" / "template.npz").is_file():
+        raise InputError(f"{spec.method}: an oracle is shown the truth, and {capture_folder} has none")
     brought = brought_folder(spec.factory)
     if brought is not None and (own := brought / capture_folder.resolve().name).is_dir():
         brought = own

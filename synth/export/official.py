@@ -14,7 +14,13 @@ from scipy.sparse.csgraph import dijkstra
 from ash.capture.dataset import Camera, Capture, Skeleton, TemplateMesh
 from ash.capture.formats import read_template_truth
 from ash.files import InputError, write_atomic, write_image, write_json
-from synth.posing import blended_dual_quaternions, bone_frames, rotvec_to_rotmat, skinning_transforms
+from synth.posing import (
+    blended_dual_quaternions,
+    bone_frames,
+    dual_quaternion_skinning,
+    rotvec_to_rotmat,
+    skinning_transforms,
+)
 
 MM = 1000.0
 YAW_WEIGHT = 3.0
@@ -169,11 +175,18 @@ def cameras_json(cameras: list[Camera]) -> dict:
 
 
 def cached_arrays(capture: Capture) -> dict[str, dict[int, np.ndarray]]:
-    """The six arrays per training frame that the released trainer caches of its template, from the truth instead."""
+    """The six arrays per training frame that the released trainer caches of its template, from the truth instead.
+
+    Of a capture without truth they are those of the template that the skeleton alone moves.
+    """
     template, motion, skeleton = capture.template, capture.motion, capture.skeleton
-    posed = read_template_truth(capture) * MM
     frames = sorted(capture.splits["train"].frames)
     transforms = skinning_transforms(skeleton, motion.dofs)
+    if (capture.folder / "truth" / "template.npz").is_file():
+        posed = read_template_truth(capture) * MM
+    else:
+        rest, weights = template.vertices, template.skin_weights
+        posed = MM * np.stack([dual_quaternion_skinning(rest, weights, moved) for moved in transforms])
     transforms[..., :3, 3] *= MM
     heads = bone_frames(skeleton, motion.dofs)[:, :, :3, 3] * MM
     result: dict[str, dict[int, np.ndarray]] = {name: {} for name in CACHED}
@@ -234,6 +247,9 @@ def graph_nodes(template: TemplateMesh) -> np.ndarray:
 
     The release looks a node up as the nearest vertex that is not taken yet, so of two vertices at one point it may take
     the other one; what that leaves out of reach becomes a node as well.
+
+    Raises:
+        InputError: the mesh is in so many pieces with vertices at one point that this never ends.
     """
     edges = _edges(template)
     nodes = _spread(edges, np.arange(len(template.vertices)), np.zeros(0, dtype=np.int64))
@@ -241,7 +257,12 @@ def graph_nodes(template: TemplateMesh) -> np.ndarray:
         far = np.flatnonzero(_hops(edges, taken_vertices(template.vertices, nodes)) > NODE_REACH + 1)
         if not len(far):
             return nodes
-        nodes = np.concatenate([nodes, _spread(edges, far, nodes)])
+        if not len(new := _spread(edges, far, nodes)):
+            raise InputError(
+                f"template.npz: the release's graph cannot reach {len(far)} vertices, as others lie at the same points;"
+                " expected faces that share their vertices"
+            )
+        nodes = np.concatenate([nodes, new])
 
 
 def taken_vertices(vertices: np.ndarray, nodes: np.ndarray) -> np.ndarray:

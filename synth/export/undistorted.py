@@ -1,6 +1,7 @@
 """From lenses that distort to pinholes: what a lab does with its footage before a method sees it.
 
-Images and masks are resampled, as a lab has to; the truth per pixel is traced again for the pinhole, so it stays exact.
+Images and masks are resampled, as a lab has to; the truth per pixel, where a capture has it, is traced again for the
+pinhole, so it stays exact.
 """
 
 from dataclasses import replace
@@ -31,11 +32,13 @@ def undistort(source: Path, folder: Path) -> Path:
     written = {"cameras.json"}
     write_cameras(folder / "cameras.json", list(pinholes.values()))
     views = sorted({view for split in capture.splits.values() for view in split.views}, key=lambda view: view[1])
-    studio = _studio(capture)
+    studio = _studio(capture) if (source / "truth" / "surface.npz").is_file() else None
     for name, frame in views:
         if not capture.cameras[name].is_pinhole:
-            studio.dress(read_surface_truth(capture.folder, frame))
-            written |= _write_view(capture, pinholes[name], frame, studio, folder)
+            written |= _write_image(capture, pinholes[name], frame, folder)
+            if studio is not None:
+                studio.dress(read_surface_truth(capture.folder, frame))
+                written |= _write_truth(capture, pinholes[name], frame, studio, folder)
     for name in set(capture.manifest.files) - written:
         link_or_copy(source / name, folder / name)
     files = {
@@ -45,7 +48,14 @@ def undistort(source: Path, folder: Path) -> Path:
     return folder
 
 
-def _write_view(capture: Capture, pinhole: Camera, frame: int, studio: Studio, folder: Path) -> set[str]:
+def _write_image(capture: Capture, pinhole: Camera, frame: int, folder: Path) -> set[str]:
+    camera = capture.cameras[pinhole.name]
+    image = resample_rgba(capture.image(camera.name, frame), camera, pinhole)
+    write_image(image_path(folder, camera.name, frame), image)
+    return {str(image_path(Path(), camera.name, frame))}
+
+
+def _write_truth(capture: Capture, pinhole: Camera, frame: int, studio: Studio, folder: Path) -> set[str]:
     camera = capture.cameras[pinhole.name]
     noise = read_arrays(pixels_path(capture.folder, camera.name, frame), expected=("noise",))["noise"]
     variance, squares = resample(noise[..., None], camera, pinhole)
@@ -56,9 +66,7 @@ def _write_view(capture: Capture, pinhole: Camera, frame: int, studio: Studio, f
         barycentric=barycentric.astype(np.float16),
         noise=(variance[..., 0] * squares).astype(np.float16),
     )
-    image = resample_rgba(capture.image(camera.name, frame), camera, pinhole)
-    write_image(image_path(folder, camera.name, frame), image)
-    return {str(place(Path(), camera.name, frame)) for place in (image_path, pixels_path)}
+    return {str(pixels_path(Path(), camera.name, frame))}
 
 
 def _studio(capture: Capture) -> Studio:

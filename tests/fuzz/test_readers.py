@@ -33,11 +33,13 @@ from benchmarks.cell.evaluation import read_curve
 from benchmarks.cell.lpips import _load as read_tensors
 from benchmarks.cell.schema import Cell, CellConfig, failed_result, read_cell, read_result, write_config, write_result
 from benchmarks.gate.baseline import GateFile, read_gate_file
+from benchmarks.importing.cameras import read_colmap
 from benchmarks.studies.conformance_worker import Outcome, read_outcome
 from benchmarks.suites.archive import read_pack, unpacked, write_pack
 from benchmarks.suites.files import read_suite
 from benchmarks.suites.runs import read_run
 from synth.camera.rig import rig_from_file
+from synth.export.formats import export
 from synth.motion.importing import import_motion, read_joint_map
 from synth.person.mannequin import heads
 from synth.skeleton import make_skeleton
@@ -66,6 +68,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Rea
     folder = tmp_path_factory.mktemp("good")
     capture = fakes.write_capture(folder / "capture")
     joints = 3
+    colmap = export(load_capture(capture), folder / "colmap", form="colmap") / "sparse" / "0"
     (folder / "joints.json").write_text('{"pelvis": "Hips", "thigh_left": "LeftUpLeg"}')
     (folder / "log.jsonl").write_text('{"seconds": 1, "loss": 2}\n{"seconds": 2, "train_psnr": 20.5}\n')
     run = folder / "run.json"
@@ -84,6 +87,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Rea
         "joint map": (folder / "joints.json", read_joint_map),
         "rig": (capture / "cameras.json", rig_from_file),
         "gate": (_gate_file(folder / "gate.json"), read_gate_file),
+        "lenses": (colmap / "cameras.txt", lambda path: read_colmap(path, colmap / "images.txt")),
+        "poses": (colmap / "images.txt", lambda path: read_colmap(colmap / "cameras.txt", path)),
         "curve": (folder / "log.jsonl", read_curve),
         "run": (run, lambda path: read_run(path.parent)),
         "result": (_result(folder), lambda path: read_result(path.parent)),
@@ -157,7 +162,7 @@ def as_a_user_runs_it(monkeypatch: pytest.MonkeyPatch) -> None:
 
 KINDS = (
     "manifest", "cameras", "skeleton", "template", "motion", "surface", "image", "bvh", "amass", "joint map", "rig",
-    "gate", "curve", "run", "result", "cell", "json", "weights", "suite", "trial", "lpips",
+    "lenses", "poses", "gate", "curve", "run", "result", "cell", "json", "weights", "suite", "trial", "lpips",
     "pack",
 )  # fmt: skip
 

@@ -2,16 +2,19 @@
 
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import fakes
 from PIL import Image
 
 from ash.capture.dataset import Capture, TemplateMesh
 from ash.capture.formats import load_capture, read_template_truth
+from ash.files import InputError
 from synth.export.formats import export
-from synth.export.official import graph_faces, graph_nodes, taken_vertices
+from synth.export.official import cached_arrays, graph_faces, graph_nodes, taken_vertices
 from synth.posing import bone_frames, linear_blend_skinning
 
 
@@ -246,6 +249,23 @@ def test_a_graph_spans_every_piece_of_a_mesh_even_where_two_touch():
     assert taken == taken_vertices(vertices, nodes).tolist()
     assert (hops.min(axis=0) <= 3).all()
     assert len(graph_faces(template, nodes)) > len(nodes) / 2
+
+
+def test_a_mesh_whose_faces_share_no_vertices_is_refused():
+    """The release takes one vertex of several at a point, and never reaches the others' pieces."""
+    with pytest.raises(InputError, match="expected faces that share their vertices"):
+        graph_nodes(fakes.template())
+
+
+def test_without_truth_the_cached_arrays_are_the_skinned_template(capture: Capture, tmp_path: Path):
+    cached = cached_arrays(replace(capture, folder=tmp_path))
+    frame = capture.splits["train"].frames[-1]
+    rest = cached["cached_ret_canonical_delta"][frame][..., :3]
+    np.testing.assert_allclose(rest, 1000 * np.stack([capture.template.vertices] * 3), atol=1e-9)
+    truth = cached_arrays(capture)
+    for name in ("cached_joints", "cached_fin_rotation_quad", "cached_fin_translation_quad"):
+        np.testing.assert_array_equal(cached[name][frame], truth[name][frame])
+    assert np.abs(cached["cached_ret_posed_delta"][frame] - truth["cached_ret_posed_delta"][frame]).max() > 1
 
 
 def test_cached_joints_are_all_joints_of_the_skeleton(meta: Path, capture: Capture):

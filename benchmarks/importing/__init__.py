@@ -1,0 +1,1 @@
+"""Captures without truth, made from the footage of users."""
