@@ -26,7 +26,12 @@ DRAWN_BY = {
 
 def titles(methods: Sequence[str]) -> str:
     """Methods for readers."""
-    return ", ".join(style_of(method).title for method in methods)
+    return listed([style_of(method).title for method in methods])
+
+
+def listed(texts: Sequence[str]) -> str:
+    """A list, with semicolons where an item has a comma of its own."""
+    return ("; " if any("," in text for text in texts) else ", ").join(texts)
 
 
 def sentence(text: str) -> str:
@@ -118,7 +123,7 @@ def _cost(tables: RunTables, scene: str) -> str:
         ends = [pick(frame_ms, key=lambda name: frame_ms[name]) for pick in (min, max)]
         frame_ms = {name: ms for name, ms in frame_ms.items() if name in (*chain(*PAIRS), *ends)}
     parts = [f"{style_of(method).title} {ms:.0f} ms" for method, ms in frame_ms.items()]
-    return f"A frame takes {', '.join(parts)} on one core." if parts else ""
+    return f"A frame takes {listed(parts)} on one core." if parts else ""
 
 
 def _template(tables: RunTables, scene: str) -> str:
