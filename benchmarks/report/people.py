@@ -11,6 +11,7 @@ from ash.capture.formats import load_capture
 from benchmarks.analysis.results import RANKED_SPLITS, RunTables, foreground, samples_of
 from benchmarks.analysis.statistics import spreads
 from benchmarks.analysis.style import SPLIT_NAMES, is_ours, style_of
+from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.schema import CellResult
 from benchmarks.report import pictures
 from benchmarks.report.content import Block, Bullets, Strips, Table, Text
@@ -20,6 +21,7 @@ from benchmarks.suites.runs import Run
 REFERENCE = "ash"
 RIVALS = ("ddc", "wo_mot", "ash_plus", "ddc_plus")  # of many rows, those that are shown, and the user's own
 FEW = 5
+MARGIN_DB = METRICS["psnr"].abs_tol  # below which nobody is ahead
 FEW_SUBJECTS = 4  # whose pictures are shown at twice their size
 NOTE = (
     "Foreground PSNR. Standard deviations: between captures (subjects in their outfits), and between trainings of one "
@@ -72,12 +74,9 @@ def blocks(tables: RunTables, scene: str) -> tuple[Block, ...]:
 
 def _sentence(lead: pd.Series, split: str, method: str) -> str:
     words, title, count = SPLIT_NAMES[split].words, style_of(method).title, len(lead)
-    span = f"{lead.min():+.2f} to {lead.max():+.2f} dB"
-    if (lead == 0).all():
-        return f"On {words} ASH and {title} are equal on all {count} subjects, within 0.01 dB."
-    if (lead > 0).any():
-        return f"On {words} ASH is ahead of {title} on {(lead > 0).sum()} of {count} subjects, by {span}."
-    return f"On {words} ASH is ahead of {title} on none of {count} subjects; the differences are {span}."
+    ahead, behind = (int((sign * lead > MARGIN_DB).sum()) for sign in (1, -1))
+    text = f"On {words} {style_of(REFERENCE).title} minus {title} is {lead.min():+.2f} to {lead.max():+.2f} dB: "
+    return f"{text}ahead by more than {MARGIN_DB:g} dB on {ahead} of {count} subjects, behind on {behind}."
 
 
 def _spread_table(tables: RunTables, scene: str, methods: Sequence[str]) -> Table:
