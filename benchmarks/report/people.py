@@ -1,4 +1,4 @@
-"""Subject by subject: how far ASH is ahead on each capture, and how far scores spread between captures and seeds."""
+"""Subject by subject: how far ASH is ahead on each capture, and how the methods draw every subject."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,7 +9,6 @@ import pandas as pd
 
 from ash.capture.formats import load_capture
 from benchmarks.analysis.results import RANKED_SPLITS, RunTables, foreground, samples_of
-from benchmarks.analysis.statistics import spreads
 from benchmarks.analysis.style import SPLIT_NAMES, is_ours, style_of
 from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.schema import CellResult
@@ -23,10 +22,6 @@ RIVALS = ("ddc", "wo_mot", "ash_plus", "ddc_plus")  # of many rows, those that a
 FEW = 5
 MARGIN_DB = METRICS["psnr"].abs_tol  # below which nobody is ahead
 FEW_SUBJECTS = 4  # whose pictures are shown at twice their size
-NOTE = (
-    "Foreground PSNR. Standard deviations: between captures (subjects in their outfits), and between trainings of one "
-    "capture from other seeds; n/a where no capture has two seeds, then the spread between captures contains theirs."
-)
 
 
 def leads(tables: RunTables, scene: str) -> pd.DataFrame:
@@ -67,8 +62,7 @@ def blocks(tables: RunTables, scene: str) -> tuple[Block, ...]:
     return (
         Bullets(items=tuple(sentences)),
         *split_tables,
-        _spread_table(tables, scene, [REFERENCE, *others]),
-        Text(text=NOTE, note=True),
+        Text(text="Foreground PSNR.", note=True),
     )
 
 
@@ -77,18 +71,6 @@ def _sentence(lead: pd.Series, split: str, method: str) -> str:
     ahead, behind = (int((sign * lead > MARGIN_DB).sum()) for sign in (1, -1))
     text = f"On {words} {style_of(REFERENCE).title} minus {title} is {lead.min():+.2f} to {lead.max():+.2f} dB: "
     return f"{text}ahead by more than {MARGIN_DB:g} dB on {ahead} of {count} subjects, behind on {behind}."
-
-
-def _spread_table(tables: RunTables, scene: str, methods: Sequence[str]) -> Table:
-    texts: dict[tuple[str, str], list[str]] = {}
-    for split in RANKED_SPLITS:
-        samples = samples_of(tables.of(scene), foreground(split))
-        components = [spreads(samples.get(method, {})) for method in methods]
-        for title, values in zip(
-            ("between captures [dB]", "between seeds [dB]"), zip(*components, strict=True), strict=True
-        ):
-            texts[SPLIT_NAMES[split].title, title] = ["n/a" if v is None else f"{v:.2f}" for v in values]
-    return Table(title="Spread of scores", frame=pd.DataFrame(texts, index=[style_of(m).title for m in methods]))
 
 
 def pictured(

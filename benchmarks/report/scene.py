@@ -156,13 +156,14 @@ def _facts(data: SceneData, capture: Capture | None, *, smoke: bool) -> list[tup
     of_scene = [c for c in data.run.cells if c.config.scene == scene and not c.config.axis]
     unfinished = len(of_scene) - len(data.results)
     known = dict(sentences.facts(run_tables, scene))
+    if smoke:
+        known.pop("Smallest sufficient", None)
     missing = [known.pop("Missing", "")]
     missing += [f"{unfinished} of {len(of_scene)} trainings are not finished."] if unfinished > 0 else []
     facts = {
         "Compared": " ".join(compared),
         "Data": f"{footage}.",
         "Held out": f"{'; '.join(tests)}." if tests else "",
-        "Result": sentences.finding(run_tables, scene) if smoke else "",
         **known,
         "Missing": " ".join(filter(None, missing)) or "Nothing: every method was trained and scored.",
         "Again": f"{command} (code and versions: Provenance, below)" if (command := data.run.command) else "",

@@ -61,10 +61,10 @@ def headline(tables: RunTables, scene: str, *, smoke: bool = False) -> str:
     names = titles(short) if len(short) <= FEW_NAMED else f"{len(short)} of {count} methods"
     names = "every method" if len(short) == count > 1 else names
     first = f"Not at their plateau when training ended: {sentence(names)} " if short else ""
-    return first + finding(tables, scene)
+    return first + _finding(tables, scene)
 
 
-def finding(tables: RunTables, scene: str) -> str:
+def _finding(tables: RunTables, scene: str) -> str:
     """The verdict on each pair, and where there is none on the two best methods."""
     if pairs := [pair for pair in PAIRS if set(pair) <= set(tables.methods(scene))]:
         ranked = differences(tables, scenes=(scene,))
