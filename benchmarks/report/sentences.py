@@ -106,7 +106,7 @@ def _pair(tables: RunTables, scene: str, ranked: pd.DataFrame, first: str, secon
         elif row.verdict == "unclear":
             how = f"no difference between {names[0]} and {names[1]} is shown "
             text = f"{words} ({row.mean:+.1f} dB, 95 % interval {row.low:+.1f} to {row.high:+.1f}"
-            text += f"; p {row.p:.2g} for all rows together)" if row.low * row.high > 0 else ")"
+            text += f"; p {row.p:.2g}, corrected for all rows)" if row.low * row.high > 0 else ")"
         parts.setdefault(how, []).append(text)
     if not parts:
         return f"{names[0]} and {names[1]} were not both scored."

@@ -22,6 +22,8 @@ from benchmarks.cell.metrics import PROTOCOL
 from benchmarks.cell.schema import CellResult, Summary, failed_result, result_of
 from benchmarks.commands import arguments
 from benchmarks.report import charts, sentences, tables, vega
+from benchmarks.report import page as page_module
+from benchmarks.report import scene as scene_module
 from benchmarks.report.content import Text
 from benchmarks.report.figures import speed_figure
 from benchmarks.report.page import publish, write_report
@@ -29,6 +31,7 @@ from benchmarks.report.pictures import Album
 from benchmarks.report.scene import SceneData, scene_report
 from benchmarks.suites import runs
 from benchmarks.suites.runs import Run, read_run, results_of
+from benchmarks.suites.tables import tables_of
 
 
 def scored(method: str, *, view: float, pose: float, frame_ms: float = 10.0, seed: int = 0) -> CellResult:
@@ -116,18 +119,38 @@ def test_one_failure_does_not_press_the_points_of_a_chart_together() -> None:
     assert 27 < low < 28.1 and 32.9 < high < 34
 
 
-def test_every_result_is_read_once(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_title_of_the_suite_is_shown_in_every_form_of_the_report_and_every_result_is_read_once(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     read = []
     monkeypatch.setattr(runs, "result_of", lambda cell: read.append(cell.folder) or result_of(cell))
-    write_report(run)
+    spec = tables_of({"columns": ["psnr"]}, place="x")
+    shown = "\n".join(write_report(replace(run, folder=tmp_path, titles={"fake_good": "Good row"}, table=spec)))
     assert read == [cell.folder for cell in run.cells]
-
-
-def test_a_title_of_the_suite_is_shown_in_every_form_of_the_report(run: Run, tmp_path: Path) -> None:
-    shown = write_report(replace(run, folder=tmp_path, titles={"fake_good": "Good row"}))
     texts = [(tmp_path / name).read_text() for name in ("report.html", "report.md", "tables.tex")]
-    assert all("Good row" in text for text in ("\n".join(shown), *texts))
+    assert all("Good row" in text for text in (shown, *texts))
     assert "Good row" not in (tmp_path / "results.csv").read_text(), "a table for programs keeps names"
+    for text in (shown, texts[1]):
+        assert "Smoke test on boxes" in text and "How sure" in text and "Protocol" in text, "beside the suite's tables"
+
+
+def test_the_findings_of_several_scenes_stand_first(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    results = [
+        replace(result, config=replace(result.config, scene=scene, preset="cpu", size="quick"))
+        for scene in ("boxes", "other")
+        for result in results_of(run)
+    ]
+
+    def no_capture(folder: Path) -> None:
+        raise InputError(f"{folder}: gone")
+
+    monkeypatch.setattr(page_module, "results_of", lambda _: results)
+    monkeypatch.setattr(scene_module, "load_capture", no_capture)
+    write_report(replace(run, folder=tmp_path))
+    text = (tmp_path / "report.md").read_text()
+    assert (
+        text.index("## Results by scene") < text.index("**other.**") < text.index("**Again.**") < text.index("## boxes")
+    )
 
 
 def test_rows_that_are_equal_are_not_told_as_a_win() -> None:
