@@ -11,7 +11,7 @@ import pandas as pd
 
 from benchmarks.analysis.results import HELD_OUT_SPLITS, foreground, samples_of
 from benchmarks.analysis.statistics import independent, intervals, mean_interval
-from benchmarks.analysis.style import SPLIT_NAMES, style_of
+from benchmarks.analysis.style import SPLIT_NAMES, listed, style_of
 from benchmarks.suites.stress import FOOTAGE_FRAMES
 
 FOOTAGE_AXIS, STATIC = "footage", "wo_mot"
@@ -161,9 +161,8 @@ def losses_by_novelty(table: pd.DataFrame) -> list[str]:
         losses = {
             str(method): curve["psnr"].iloc[0] - curve["psnr"].iloc[-1] for method, curve in ends if len(curve) > 1
         }
-        names = ", ".join(
-            f"{style_of(m).title} {loss:.1f} dB" for m, loss in sorted(losses.items(), key=lambda p: p[1])
-        )
+        ranked = sorted(losses.items(), key=lambda pair: pair[1])
+        names = listed([f"{style_of(method).title} {loss:.1f} dB" for method, loss in ranked])
         first, last = here["novelty_deg"].min(), here["novelty_deg"].max()
         sentences.append(
             f"On {scene}, from {first:.0f} to {last:.0f} degrees from the training poses, PSNR falls: {names}."

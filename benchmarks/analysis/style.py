@@ -1,6 +1,6 @@
 """Titles and colours of methods in tables and charts; a method of a third party keeps its own name."""
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -113,6 +113,11 @@ EXACT = {"ash": "ash_truth", "ddc": "ddc_truth"}  # A method and the same method
 
 
 _USER_ROWS: ContextVar[dict[str, str]] = ContextVar("_USER_ROWS")  # titles by name
+
+
+def listed(texts: Sequence[str]) -> str:
+    """A list, with semicolons where an item has a comma of its own."""
+    return ("; " if any("," in text for text in texts) else ", ").join(texts)
 
 
 def user_rows(configs: Iterable[CellConfig]) -> frozenset[str]:

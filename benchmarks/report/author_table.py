@@ -31,11 +31,7 @@ FORMS = {  # what stands in a cell, by form
     "interval": "Mean [95 % confidence interval]",
     "difference": "Mean (difference to {reference} ± half-width of its 95 % confidence interval)",
 }
-MARKED = {
-    "bold": "Bold: best, and better than every other row (p < 0.05 after Holm correction, by more than the margin).",
-    "underline": "Underlined: second best beside such a row.",
-    "colour": "Yellow: the row in bold or that would be. Light red: second best beside it.",
-}
+BEST, SECOND = {"bold": "bold", "colour": "yellow"}, {"underline": "underlined", "colour": "orange"}
 HEAD = r"""% In a paper: \usepackage{booktabs,graphicxPACKAGES} and \input this file. Compiled alone, it is a document.
 \expandafter\ifx\csname @nodocument\endcsname\relax\else
 \def\ashbenchalone{}
@@ -113,13 +109,16 @@ def of_run(run: Run, tables: Path | None = None) -> tuple[AuthorTable, ...]:
 
 
 def default_tables(tables: RunTables) -> tuple[AuthorTable, ...]:
-    """A table for each scene, narrow enough for one column of a paper: PSNR, LPIPS or FLIP, and times."""
+    """A table for each scene, over both columns of a paper: PSNR, LPIPS or FLIP, and times, as far as measured."""
     has_lpips = (tables.rows["metric"] == "lpips").any()
-    qualities = [
-        TableColumn(metric=m, split=s) for s in RANKED_SPLITS for m in ("psnr", "lpips" if has_lpips else "flip")
-    ]
-    columns = (*qualities, TableColumn(metric="frame_ms"), TableColumn(metric="train_s"))
-    specs = [TableSpec(scene=scene, columns=columns, label=f"tab:{_plain(scene)}") for scene in tables.scenes]
+    asked = [(metric, split) for split in RANKED_SPLITS for metric in ("psnr", "lpips" if has_lpips else "flip")]
+    there = set(tables.rows["metric"])
+    columns = tuple(
+        TableColumn(metric=metric, split=split)
+        for metric, split in (*asked, ("frame_ms", ""), ("train_s", ""))
+        if metric in there
+    )
+    specs = [TableSpec(scene=s, columns=columns, label=f"tab:{_plain(s)}", wide=True) for s in tables.scenes]
     return of_tables(tables, specs)
 
 
@@ -202,7 +201,7 @@ class _Maker:
             spec=self.spec,
             shown=Table(frame=frame, marks=marks),
             numbers=pd.DataFrame(records),
-            caption=self._caption(),
+            caption=self._caption({*marks.values()}),
             breaks=tuple(breaks),
         )
 
@@ -299,8 +298,8 @@ class _Maker:
         where = f"{column.scene}, {group}" if len(self.scenes) > 1 else group
         return column.group or where, column.title or title
 
-    def _caption(self) -> str:
-        """People, seeds, what stands in a cell, marks, protocol."""
+    def _caption(self, marks: set[Mark]) -> str:
+        """People, seeds, what stands in a cell, those marks that the table has, protocol."""
         sentences = [self.spec.caption.rstrip(".") + "."] if self.spec.caption else []
         units = set()
         for scene in self.scenes:
@@ -309,7 +308,7 @@ class _Maker:
                 continue
             people, seeds = rows["capture"].nunique(), rows["seed"].nunique()
             counts = f"{people} {'person' if people == 1 else 'people'}, {seeds} seed{'' if seeds == 1 else 's'}"
-            sentences.append(f"{scene}: {counts}{' each' if people > 1 and seeds > 1 else ''}.")
+            sentences.append(f"Scene {scene}: {counts}{' each' if people > 1 else ''}.")
             units.add("people" if people > 1 else "the seeds of one person" if seeds > 1 else "")
         over = " and ".join(sorted(filter(None, units)))
         if over:
@@ -317,7 +316,15 @@ class _Maker:
             form = FORMS[self.spec.form].format(reference=reference)
             test = ", in pairs" if self.spec.form == "difference" and "people" in units else ""
             sentences.append(f"{form}{test}, over {over}." if self.spec.form != "mean" else f"Mean over {over}.")
-            sentences += [MARKED[mark] for mark in self.spec.marks]
+            best, second = (
+                " and ".join(text for mark, text in words.items() if mark in self.spec.marks).capitalize()
+                for words in (BEST, SECOND)
+            )
+            if marks:
+                sentences += [f"{best}: better than every other row (p < 0.05, Holm)."] if best else []
+                sentences += [f"{second}: second."] if second else []
+            elif self.spec.marks:
+                sentences.append("No row is significantly better than all others.")
         else:
             sentences.append("One value per row: no interval, and no row is marked as best.")
         return " ".join([*sentences, *self.notes, f"Protocol {PROTOCOL} of ash-bench."])
@@ -355,7 +362,7 @@ def latex(tables: Sequence[AuthorTable]) -> str:
 
 def _latex(table: AuthorTable) -> str:
     """A `table` as wide as one column at most: a wider one is scaled down to it."""
-    kind, shown, width = "table*" if table.spec.wide else "table", table.shown, len(table.shown.heads)
+    kind, shown = "table*" if table.spec.wide else "table", table.shown
     spans, rules, start = [], [], 2
     for group, span in shown.groups:
         spans.append(rf"\multicolumn{{{span}}}{{c}}{{{tex(group)}}}")
@@ -367,13 +374,15 @@ def _latex(table: AuthorTable) -> str:
         body += [r"\midrule"] if i in table.breaks else []
         cells = " & ".join(_marked(tex(text), mark, table.spec.marks) for text, mark in texts)
         body.append(f"{tex(name)} & {cells} \\\\")
+    align = "".join("l" if table.spec.form == "difference" and column.metric else "r" for column in table.spec.columns)
     lines = [
         rf"\begin{{{kind}}}",
         r"\centering",
+        r"\setlength{\abovecaptionskip}{0pt}\setlength{\belowcaptionskip}{6pt}\setlength{\tabcolsep}{4pt}",
         rf"\caption{{{tex(table.caption)}}}",
         *([rf"\label{{{table.spec.label}}}"] if table.spec.label else []),
         r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
-        rf"\begin{{tabular}}{{@{{}}l{'r' * width}@{{}}}}",
+        rf"\begin{{tabular}}{{@{{}}l{align}@{{}}}}",
         *[r"\toprule", *grouped, " & " + " & ".join(tex(title) for _, title in shown.heads) + r" \\", r"\midrule"],
         *body,
         *[r"\bottomrule", r"\end{tabular}}", rf"\end{{{kind}}}"],

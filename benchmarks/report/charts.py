@@ -22,12 +22,17 @@ LEAST_SCALE = 0.7  # below which the numbers of a matrix are hardly readable
 
 
 def speed(
-    points: pd.DataFrame, front: pd.DataFrame, links: pd.DataFrame, series: Sequence[Series], *, notes: dict[str, str]
+    points: pd.DataFrame,
+    front: pd.DataFrame,
+    links: pd.DataFrame,
+    series: Sequence[Series],
+    *,
+    notes: dict[str, list[str]],
 ) -> Panels:
     """Accuracy against speed: a panel per `panel` of `points`; all share both axes.
 
     `points`: panel, series, ms, psnr, low, high, ringed. `front`: panel, ms, psnr of the staircase. `links`: panel,
-    link, ms, psnr. `notes`: subtitles by panel.
+    link, ms, psnr. `notes`: lines of the subtitle by panel.
     """
     reach = max(LEAST_REACH_DB, float(points["psnr"].max() - points["psnr"].min()))
     low, high = (
@@ -70,7 +75,7 @@ def speed(
             layers.append(mark.mark_rule(strokeDash=[2, 4]).encode(x=at["x"]))
             text = mark.mark_text(clip=True, dy=-6, dx=4, align="left", color=DIM)
             layers.append(text.encode(**at, text="text:N"))
-        panels.append(layered(layers, f"{panel}", (380, 330), notes.get(str(panel), "")))
+        panels.append(layered(layers, f"{panel}", (380, 330), notes.get(str(panel), ())))
     return tuple(panels)
 
 
@@ -172,9 +177,9 @@ def least_width(columns: int) -> int:
     return round(LEAST_SCALE * CELL[0] * (columns + 2))
 
 
-def layered(layers: Sequence[alt.Chart], title: str, size: tuple[int, int], note: str = "") -> alt.LayerChart:
+def layered(layers: Sequence[alt.Chart], title: str, size: tuple[int, int], note: Sequence[str] = ()) -> alt.LayerChart:
     """Layers as one panel, whose series the page can hide."""
-    heading = alt.TitleParams(title, subtitle=note) if note else alt.TitleParams(title)
+    heading = alt.TitleParams(title, subtitle=list(note)) if note else alt.TitleParams(title)
     drawn: Any = alt.layer(*layers)
     chart: alt.LayerChart = drawn.properties(width=size[0], height=size[1]).add_params(
         alt.param(name="hidden", value=[])

@@ -30,6 +30,14 @@ class Bullets:
     items: tuple[str, ...]
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Facts:
+    """Texts with a label each."""
+
+    kind: ClassVar[str] = "facts"
+    items: tuple[tuple[str, str], ...]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Table:
     """A table of texts: the index names the rows; columns are titles, or pairs of a group and a title.
@@ -102,7 +110,7 @@ class Flipbook:
     chart: Figure
 
 
-Block = Text | Bullets | Table | Figure | Strips | Flipbook
+Block = Text | Bullets | Facts | Table | Figure | Strips | Flipbook
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

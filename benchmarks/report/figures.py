@@ -20,7 +20,7 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
     styles = dict(zip(methods, vega.series_of(methods), strict=True))
     frames = tables.values(scene, FRAME_MS, methods)
     points, front, links = [], [], []
-    notes: dict[str, str] = {}
+    notes: dict[str, list[str]] = {}
     for split in RANKED_SPLITS:
         panel = SPLIT_NAMES[split].words.capitalize()
         samples = samples_of(tables.of(scene), foreground(split))
@@ -43,13 +43,13 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
         subtitles += [
             f"{styles[m].title} {span.mean:.1f} dB, below the chart" for m, span in spans.items() if m not in shown
         ]
-        notes[panel] = "; ".join(subtitles)
+        notes[panel] = subtitles
     if not points:
         return None
     series = tuple(styles.values())
     front_table = pd.DataFrame(front, columns=["panel", "ms", "psnr"])
     link_table = pd.DataFrame(links, columns=["panel", "link", "ms", "psnr"])
-    caption = "Up and to the left is better. Grey staircase: the front of the methods that no other beats in both."
+    caption = "Accuracy against speed: up and left is better. Grey staircase: the methods that none beats in both."
     if links:
         caption += " Hollow: given the exact surface, a bound and no competitor; the dashed line joins it with the same"
         caption += " method on its own template."
@@ -71,10 +71,10 @@ def training_figure(tables: RunTables, scene: str) -> Figure | None:
     methods = [m for m in tables.methods(scene) if (curves["method"] == m).sum() > 1]
     if not methods:
         return None
-    title = "Training"
+    title = "Accuracy against training time"
     caption = "Foreground PSNR of reserved training views, which no step sees, over seconds of training. First seed;"
     return line_figure(
-        curves[curves["method"].isin(methods)].assign(panel=""),
+        curves[curves["method"].isin(methods)].assign(panel=title),
         methods,
         name=f"training_{scene}",
         title=title,

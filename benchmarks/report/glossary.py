@@ -38,7 +38,7 @@ GLOSSARY = {
     "than the clock's where they were stopped or shared a core, more where they used several.",
     "not isolated": "Trained where the system could not isolate the method's process: the truth was not given to it, "
     "and access to it was watched, but not made impossible.",
-    "gap": "PSNR on training views minus PSNR here: overfitting.",
+    "gap": "PSNR on training views minus PSNR here. Large: overfitting. Below zero: the images here are easier.",
     "settled": "Seconds of training after which no score of reserved views differs by more than 0.3 dB from the last.",
     "steps": "How many steps of the optimiser training took.",
     "cameras seen": "How many of the capture's training cameras the method learned from.",
@@ -60,6 +60,16 @@ GLOSSARY = {
     "truth.",
     "scene": "What a capture shows: a body, its clothes, its motion and its light.",
     "cell": "One method trained once on one capture.",
+}
+ROWS = {  # what our main rows are
+    "ash": "the paper: Gaussians on a deforming mesh, drawn by networks that see the motion",
+    "ash_plus": "ASH with this project's additions",
+    "ddc": "a deforming mesh with a texture by networks",
+    "ddc_plus": "DDC with the same additions",
+    "ash_truth": "a bound, not ranked",
+    "ddc_truth": "a bound, not ranked",
+    "wo_mot": "ASH without motion as input",
+    "wo_disp": "ASH without displacement of Gaussians",
 }
 FORMS = {
     **{term.lower(): term for term in GLOSSARY},

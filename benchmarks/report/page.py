@@ -19,7 +19,7 @@ from benchmarks.report import author_table, content, escaping, glossary, section
 from benchmarks.report.author_table import AuthorTable
 from benchmarks.report.content import Report, Section
 from benchmarks.report.pictures import Album
-from benchmarks.report.scene import FEW_WORST, MANY, WORST, SceneData, scene_report
+from benchmarks.report.scene import FEW_WORST, MANY, WORST, SceneData, SceneReport, scene_report
 from benchmarks.report.vega import Figure
 from benchmarks.suites.archive import write_archive
 from benchmarks.suites.runs import Run, results_of
@@ -62,17 +62,19 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
         )
         for scene in run_tables.scenes
     ]
+    first, others = _first_sections(scenes, run.command)
     curves = [*sections.training_cost(run_tables), *sections.template_errors(run_tables)]
     novelty = sections.novelty(run_tables)
     report = Report(
         title=f"Report of suite {run.suite}",
         sections=(
             Section(title="", blocks=(content.Text(text=run.about[:1].upper() + run.about[1:] + "."),)),
+            *first,
             *([Section(title="Tables of the suite", blocks=_blocks(own))] if own else []),
             *sections.ablations(run_tables, None if chosen_on is None else RunTables(results_of(chosen_on))),
             *sections.stabilities(run_tables),
             *curves,
-            *(section for scene in scenes for section in scene.sections),
+            *others,
             *novelty,
             *sections.beside_the_paper(run_tables, run.suite),
             *sections.failed_cells(results, len(run.cells) - len(results)),
@@ -91,7 +93,18 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
     for name, data in files.items():
         write_atomic(run.folder / name, data)
     shown = [line for table in own for line in (tables.plain(table.shown), table.caption, "")]
-    return [*(shown or _terminal(run_tables, [*curves, *novelty])), f"report: {run.folder / 'report.html'}"]
+    lines = _terminal(run_tables, [*curves, *novelty], smoke=sentences.smoke(results), with_tables=not own)
+    return [*lines, *shown, f"report: {run.folder / 'report.html'}"]
+
+
+def _first_sections(scenes: Sequence[SceneReport], command: str) -> tuple[Sequence[Section], Sequence[Section]]:
+    """What stands first, the opening of a single scene or the findings of all; and the other sections of scenes."""
+    every = [section for scene in scenes for section in scene.sections]
+    if len(scenes) == 1:
+        return every[:1], every[1:]
+    findings = [(scene.sections[0].title, scene.sections[0].headline) for scene in scenes]
+    again = [("Again", command)] if command else []
+    return [Section(title="Results by scene", blocks=(content.Facts(items=(*findings, *again)),))], every
 
 
 def write_tables(
@@ -188,8 +201,8 @@ def _without_formulas(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(**{name: rows[name].map(escaping.csv_text) for name in ("scene", "method", "capture")})
 
 
-def _terminal(run_tables: RunTables, curves: list[Section]) -> list[str]:
-    """Findings, remarks and a short table of each scene."""
+def _terminal(run_tables: RunTables, curves: list[Section], *, smoke: bool, with_tables: bool) -> list[str]:
+    """Findings, what must be known to read them, and a short table of each scene."""
     lines = [
         item
         for section in curves
@@ -199,11 +212,11 @@ def _terminal(run_tables: RunTables, curves: list[Section]) -> list[str]:
     ]
     lines += [""] if lines else []
     for scene in run_tables.scenes:
-        perceptual = "lpips" if (run_tables.of(scene)["metric"] == "lpips").any() else "flip"
-        columns = [*tables.quality_columns(("psnr", perceptual)), *tables.cost_columns(("frame_ms", "train_s"))]
+        columns = [*tables.main_columns(run_tables, scene), *tables.cost_columns(("frame_ms", "train_s"))]
         short = tables.build(run_tables, scene, columns, title="")
-        remarks = (f"- {remark}" for remark in sentences.remarks(run_tables, scene))
-        lines += [sentences.headline(run_tables, scene), *remarks, "", tables.plain(short), ""]
+        facts = (f"- {label}: {text}" for label, text in sentences.facts(run_tables, scene))
+        lines += [sentences.headline(run_tables, scene, smoke=smoke), *facts, ""]
+        lines += [tables.plain(short), ""] if with_tables else []
     return lines
 
 

@@ -1,4 +1,4 @@
-"""Subject by subject: how far ASH is ahead on each capture, and how far scores spread between captures and seeds."""
+"""Subject by subject: how far ASH is ahead on each capture, and how the methods draw every subject."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,8 +9,8 @@ import pandas as pd
 
 from ash.capture.formats import load_capture
 from benchmarks.analysis.results import RANKED_SPLITS, RunTables, foreground, samples_of
-from benchmarks.analysis.statistics import spreads
 from benchmarks.analysis.style import SPLIT_NAMES, is_ours, style_of
+from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.schema import CellResult
 from benchmarks.report import pictures
 from benchmarks.report.content import Block, Bullets, Strips, Table, Text
@@ -20,11 +20,8 @@ from benchmarks.suites.runs import Run
 REFERENCE = "ash"
 RIVALS = ("ddc", "wo_mot", "ash_plus", "ddc_plus")  # of many rows, those that are shown, and the user's own
 FEW = 5
+MARGIN_DB = METRICS["psnr"].abs_tol  # below which nobody is ahead
 FEW_SUBJECTS = 4  # whose pictures are shown at twice their size
-NOTE = (
-    "Foreground PSNR. Standard deviations: between captures (subjects in their outfits), and between trainings of one "
-    "capture from other seeds; n/a where no capture has two seeds, then the spread between captures contains theirs."
-)
 
 
 def leads(tables: RunTables, scene: str) -> pd.DataFrame:
@@ -65,31 +62,15 @@ def blocks(tables: RunTables, scene: str) -> tuple[Block, ...]:
     return (
         Bullets(items=tuple(sentences)),
         *split_tables,
-        _spread_table(tables, scene, [REFERENCE, *others]),
-        Text(text=NOTE, note=True),
+        Text(text="Foreground PSNR.", note=True),
     )
 
 
 def _sentence(lead: pd.Series, split: str, method: str) -> str:
     words, title, count = SPLIT_NAMES[split].words, style_of(method).title, len(lead)
-    span = f"{lead.min():+.2f} to {lead.max():+.2f} dB"
-    if (lead == 0).all():
-        return f"On {words} ASH and {title} are equal on all {count} subjects, within 0.01 dB."
-    if (lead > 0).any():
-        return f"On {words} ASH is ahead of {title} on {(lead > 0).sum()} of {count} subjects, by {span}."
-    return f"On {words} ASH is ahead of {title} on none of {count} subjects; the differences are {span}."
-
-
-def _spread_table(tables: RunTables, scene: str, methods: Sequence[str]) -> Table:
-    texts: dict[tuple[str, str], list[str]] = {}
-    for split in RANKED_SPLITS:
-        samples = samples_of(tables.of(scene), foreground(split))
-        components = [spreads(samples.get(method, {})) for method in methods]
-        for title, values in zip(
-            ("between captures [dB]", "between seeds [dB]"), zip(*components, strict=True), strict=True
-        ):
-            texts[SPLIT_NAMES[split].title, title] = ["n/a" if v is None else f"{v:.2f}" for v in values]
-    return Table(title="Spread of scores", frame=pd.DataFrame(texts, index=[style_of(m).title for m in methods]))
+    ahead, behind = (int((sign * lead > MARGIN_DB).sum()) for sign in (1, -1))
+    text = f"On {words} {style_of(REFERENCE).title} minus {title} is {lead.min():+.2f} to {lead.max():+.2f} dB: "
+    return f"{text}ahead by more than {MARGIN_DB:g} dB on {ahead} of {count} subjects, behind on {behind}."
 
 
 def pictured(

@@ -10,29 +10,32 @@ from ash.capture.formats import load_capture
 from ash.files import InputError
 from benchmarks.analysis import differences, paper
 from benchmarks.analysis.error_attribution import REGIONS
-from benchmarks.analysis.results import HELD_OUT_SPLITS, MOTION_SPLITS, RANKED_SPLITS, Quantity, RunTables, foreground
+from benchmarks.analysis.results import HELD_OUT_SPLITS, MOTION_SPLITS, RANKED_SPLITS, Quantity, RunTables
 from benchmarks.analysis.style import SPLIT_NAMES, is_ours, style_of
 from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.schema import CellResult
 from benchmarks.report import charts, figures, people, pictures, sentences, tables, vega
-from benchmarks.report.content import Block, Bullets, Flipbook, Mark, Section, Strips, Table, Text
+from benchmarks.report.content import Block, Facts, Flipbook, Mark, Section, Strips, Table, Text
+from benchmarks.report.glossary import ROWS
 from benchmarks.report.pictures import Album, Shown
 from benchmarks.report.vega import Figure
 from benchmarks.suites.runs import Run
 
-COSTS = (
-    *("frame_ms", "stg1_ms", "stg2_ms", "stg3_ms", "stg4_ms", "train_s", "train_cpu_s", "settled_s", "steps"),
-    *("train_cameras", "train_frames", "peak_rss_mb", "params", "gaussians"),
-)
+COSTS = ("frame_ms", "train_s", "peak_rss_mb", "params", "gaussians")  # the others stand folded
 ON_SHEETS = ("ash", "ddc", "ash_plus", "ddc_plus", "ash_truth", "ddc_truth")
 AT_MOST_ON_SHEETS = 5
 WORST, FEW_WORST, MANY = 3, 1, 24  # worst frames of each method; of more than so many methods on all scenes, one
 SHEETS = {"pictures": "Truth, methods and errors", "pictures_people": "All subjects", "worst": "The worst frames"}
+HELD_OUT = {
+    "novel_view": "cameras that no method was trained on",
+    "near_pose": "a second take of a motion that was trained on",
+    "novel_pose": "motion and cameras that no method was trained on",
+    "far_pose": "motion unlike any that was trained on",
+}
 COLOURS = ("blue", "orange", "red", "ochre", "grey")  # of the regions
-SMOKE_TESTS = ("ci",)  # sizes and presets
 QUALITY_NOTE = (
-    "Quality on the foreground, LPIPS on the whole frame. Where rows have several values, best and second best are "
-    "marked among the methods that see only training views."
+    "Quality on the foreground, LPIPS on the whole frame. Where rows have several values, yellow is the best mean and "
+    "orange the second, which may be chance: verdicts stand under the differences."
 )
 APART_NOTE = "Those below the line were given the exact surface, and are not ranked."
 VALUES_NOTE = (
@@ -45,10 +48,9 @@ COST_NOTE = (
     "time measured from outside. Memory: the peak of the cell's process, Python and libraries included."
 )
 DIFFERENCES_NOTE = (
-    "Foreground PSNR. p: Holm's correction over all rows of the table. Verdict on the method in the corner: better or "
-    f"worse if p is below 5 % and the difference above {METRICS['psnr'].abs_tol:g} dB; equivalent if the interval lies "
-    "within that margin; unclear otherwise. Detectable: the smallest true difference that this design finds with 80 % "
-    "power."
+    "Foreground PSNR. Verdict on the method in the corner: better or worse if p is below 5 % and the difference above "
+    f"{METRICS['psnr'].abs_tol:g} dB; equivalent if the interval lies within that margin; unclear otherwise. p is the "
+    "chance of such a difference between equal methods, corrected for all rows of the table (Holm)."
 )
 DETECTABLE_NOTE = (
     "The smallest true difference that so many captures (subjects in this outfit) show with 80 % power, from the "
@@ -75,10 +77,9 @@ class SceneData:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SceneReport:
-    """A scene's sections, its main tables (for LaTeX and terminals), and its sheets of pictures by file name."""
+    """A scene's sections, and its sheets of pictures by file name."""
 
     sections: tuple[Section, ...]
-    tables: tuple[Table, ...]
     sheets: dict[str, bytes]
 
 
@@ -89,25 +90,33 @@ def scene_report(data: SceneData) -> SceneReport:
     exposed = sentences.exposed(data.results)
     doubts = [Text(text=doubt, note=True) for doubt in sentences.doubts(data.results)]
     seen = [Text(text=each, note=True) for each in sentences.training_views(run_tables, scene)]
-    asked = [foreground("train_view"), *tables.quality_columns(("psnr", "ssim", "lpips", "flip"))]
+    asked = tables.main_columns(run_tables, scene)
     quality = tables.build(run_tables, scene, asked, title=f"Accuracy on {scene}", exposed=exposed)
     costs = tables.cost_columns(COSTS)
     cost = tables.build(run_tables, scene, costs, title=f"Cost on {scene}", exposed=exposed)
     more = _other_numbers(run_tables, scene, [*asked, *costs])
     ranked = differences.differences(run_tables, scenes=(scene,))
-    note = " ".join(
-        (QUALITY_NOTE, *((APART_NOTE,) if quality.below else ()), VALUES_NOTE, detectable(run_tables, scene, ranked))
-    )
+    note = " ".join((QUALITY_NOTE, *((APART_NOTE,) if quality.below else ()), VALUES_NOTE))
     picture_sections, sheets = _picture_sections(data, capture, shown, trouble)
-    training = figures.training_figure(run_tables, scene)
+    smoke = sentences.smoke(data.results)
+    headline = sentences.headline(run_tables, scene, smoke=smoke)
+    charts_first = [figures.speed_figure(run_tables, scene), figures.training_figure(run_tables, scene)]
+    opening = Facts(items=tuple(_facts(data, capture, smoke=smoke)))
     sections = [
-        Section(title=scene, headline=sentences.headline(run_tables, scene), blocks=tuple(_opening(data, capture))),
-        Section(title=quality.title, blocks=(_untitled(quality), *seen, Text(text=note, note=True), *doubts)),
+        Section(title=scene, headline=headline, blocks=(opening, *(chart for chart in charts_first if chart))),
+        Section(title=quality.title, blocks=(_untitled(quality), *seen, Text(text=note, note=True))),
         Section(title=cost.title, blocks=(_untitled(cost), Text(text=COST_NOTE, note=True), *doubts)),
-        Section(title=f"Differences to ASH on {scene}", blocks=tuple(difference_blocks(run_tables, scene, ranked))),
+        Section(
+            title=f"Differences to ASH on {scene}",
+            blocks=tuple(difference_tables(run_tables, scene, ranked, title="")),
+        ),
         Section(title=f"Subject by subject on {scene}", blocks=people.blocks(run_tables, scene)),
         *picture_sections,
-        Section(title=f"Training on {scene}", blocks=(training,) if training else ()),
+        Section(
+            title=f"For specialists: statistics of {scene}",
+            blocks=tuple(statistics_blocks(run_tables, scene, ranked)),
+            folded=True,
+        ),
         Section(title=f"All other numbers of {scene}", blocks=more, folded=True),
         Section(
             title=f"The same renders of {scene} by other conventions",
@@ -115,86 +124,81 @@ def scene_report(data: SceneData) -> SceneReport:
             folded=True,
         ),
     ]
-    return SceneReport(sections=tuple(s for s in sections if s.blocks), tables=(quality, cost, *more), sheets=sheets)
+    return SceneReport(sections=tuple(s for s in sections if s.blocks), sheets=sheets)
 
 
-def what_was_compared(data: SceneData, capture: Capture | None) -> str:
-    """One paragraph: methods, scene, subjects, images, cameras, frames, preset and budget."""
-    run_tables, scene, config = data.tables, data.scene, data.results[0].config
-    rows = run_tables.of(scene)
-    methods = run_tables.methods(scene)
+def _facts(data: SceneData, capture: Capture | None, *, smoke: bool) -> list[tuple[str, str]]:
+    """What a reader asks first: what was compared on which data, what came out, how sure it is, how to run it again."""
+    run_tables, scene = data.tables, data.scene
+    rows, methods = run_tables.of(scene), run_tables.methods(scene)
     presets = ", ".join(dict.fromkeys(result.config.preset for result in data.results if result.brought is None))
-    folders, subjects = (list(map(str, rows[name].unique())) for name in ("capture", "subject"))
-    shown = f"capture {folders[0]}" if len(folders) == 1 else f"{len(folders)} captures, {folders[0]} to {folders[-1]}"
-    who = f"subject{'s' if subjects[1:] else ''} {', '.join(subjects)}"
     here, elsewhere = ([m for m in methods if (m in run_tables.brought) is brought] for brought in (False, True))
-    names = ["; ".join(style_of(method).title for method in some) for some in (here, elsewhere)]
-    parts = [f"{_count(len(here), 'method')} ({names[0]}) were trained with preset {presets}"] if here else []
-    parts += [f"pictures of {_count(len(elsewhere), 'method')} ({names[1]}) were brought"] if elsewhere else []
-    text = f"{' and '.join(parts)} on scene {scene} ({shown}; {who})"
-    text = text[:1].upper() + text[1:]
+    meanings = {m: f" ({ROWS[m]})" if m in ROWS and is_ours(m) else "" for m in methods}
+    names = ["; ".join(style_of(m).title + meanings[m] for m in some) for some in (here, elsewhere)]
+    compared = (
+        [f"{_count(len(here), 'method')}, sizes and training steps of preset {presets}: {names[0]}."] if here else []
+    )
+    compared += [f"Pictures of {_count(len(elsewhere), 'method')} from elsewhere: {names[1]}."] if elsewhere else []
+    subjects = list(map(str, rows["subject"].unique()))
+    truth = "synthetic, its true surface known; " if (rows["metric"] == "template_mm").any() else ""
+    footage = f"Scene {scene}, {truth}subject{'s' if subjects[1:] else ''} {', '.join(subjects)}"
     if capture is not None:
         camera, train = next(iter(capture.cameras.values())), capture.splits["train"]
-        text += f": {_count(len(train.cameras), 'camera')}, {_count(len(train.frames), 'frame')}"
-        text += f", each seen by {len(train.parts[0])} of the cameras in turn," if train.parts else ""
-        text += f" of {camera.width}x{camera.height} pixels"
-    text += "."
+        footage += f". Training: {_count(len(train.cameras), 'camera')}, {_count(len(train.frames), 'frame')}"
+        footage += f", each seen by {len(train.parts[0])} of the cameras in turn," if train.parts else ""
+        footage += f" of {camera.width}x{camera.height} pixels"
     tests = []
     images = run_tables.images[run_tables.images["scene"] == scene][["split", "camera", "frame"]].drop_duplicates()
     for split, images_of_split in images[images["split"].isin(HELD_OUT_SPLITS)].groupby("split", sort=False):
-        cameras, frames = (_count(images_of_split[name].nunique(), name) for name in ("camera", "frame"))
-        tests.append(f"{len(images_of_split)} images of {SPLIT_NAMES[str(split)].words} ({cameras}, {frames})")
-    if tests:
-        text += f" They are scored on {', '.join(tests[:-1])}{' and ' if tests[1:] else ''}{tests[-1]}."
-    seconds = rows[(rows["metric"] == "train_s") & (rows["status"] == "done")]["value"]
-    if len(seconds):
-        text += f" A training took {seconds.min():.0f} to {seconds.max():.0f} s on one core,"
-        text += f" {_count(run_tables.seeds, 'seed')} each."
-    if config.size in SMOKE_TESTS or set(presets.split(", ")) & set(SMOKE_TESTS):
-        text += " This is a smoke test: it shows that every part works, not which method is better."
-    return text
+        counts = (_count(images_of_split[name].nunique(), name) for name in ("camera", "frame"))
+        what = f"{SPLIT_NAMES[str(split)].words}, {HELD_OUT[str(split)]}"
+        tests.append(f"{_count(len(images_of_split), 'image')} of {what} ({', '.join(counts)})")
+    of_scene = [c for c in data.run.cells if c.config.scene == scene and not c.config.axis]
+    unfinished = len(of_scene) - len(data.results)
+    known = dict(sentences.facts(run_tables, scene))
+    if smoke:
+        known.pop("Smallest sufficient", None)
+    missing = [known.pop("Missing", "")]
+    missing += [f"{unfinished} of {len(of_scene)} trainings are not finished."] if unfinished > 0 else []
+    facts = {
+        "Compared": " ".join(compared),
+        "Data": f"{footage}.",
+        "Held out": f"{'; '.join(tests)}." if tests else "",
+        **known,
+        "Missing": " ".join(filter(None, missing)) or "Nothing: every method was trained and scored.",
+        "Again": f"{command} (code and versions: Provenance, below)" if (command := data.run.command) else "",
+    }
+    return [(label, text) for label, text in facts.items() if text]
 
 
-def detectable(run_tables: RunTables, scene: str, ranked: pd.DataFrame) -> str:
-    """The smallest difference that a table of the scene can show, in one sentence."""
-    known = ranked.dropna(subset=["detectable"]).groupby("split", sort=False)["detectable"]
-    smallest = [
-        f"{images_of_split.quantile(interpolation='higher'):.2f} dB on {SPLIT_NAMES[split].words}"
-        for split, images_of_split in known
-    ]
-    if not smallest:
-        return "One value per row: differences between rows have no verdict."
-    text = f"Smallest detectable difference, median row: {' and '.join(smallest)}"
-    if run_tables.captures(scene) > 1:
-        return f"{text} ({run_tables.captures(scene)} captures, compared in pairs)."
-    return f"{text} (seeds of one capture: it holds for this subject)."
-
-
-def difference_blocks(run_tables: RunTables, scene: str, ranked: pd.DataFrame) -> list[Block]:
-    """The differences with intervals and verdicts, and what more captures would show."""
+def difference_tables(run_tables: RunTables, scene: str, rows: pd.DataFrame, *, title: str) -> list[Block]:
+    """The differences with intervals and verdicts."""
+    if not rows["p"].notna().any():
+        return []
+    test = "people, paired t" if run_tables.captures(scene) > 1 else "seeds, Welch"
     blocks: list[Block] = []
-    if not ranked["p"].notna().any():
-        return blocks
+    for reference, table in rows.groupby("reference", sort=False):
+        columns = {
+            "split": table["split"].map(lambda split: SPLIT_NAMES[split].title),
+            "verdict": table["verdict"],
+            "difference [dB]": table["mean"].map("{:+.2f}".format),
+            f"95 % interval [{test}]": [f"[{r.low:+.2f}, {r.high:+.2f}]" for r in table.itertuples()],
+            "p [Holm]": table["p"].map("{:.2g}".format),
+        }
+        frame = pd.DataFrame(columns).set_axis(table["method"].map(lambda method: style_of(method).title))
+        marks: dict[tuple[int, int], Mark] = {(i, 2): "strong" for i, p in enumerate(table["p"]) if p < 0.05}
+        corner = f"{style_of(str(reference)).title} minus"
+        blocks.append(Table(title=title, corner=corner, frame=frame, marks=marks))
+    return [*blocks, Text(text=DIFFERENCES_NOTE, note=True)]
+
+
+def statistics_blocks(run_tables: RunTables, scene: str, ranked: pd.DataFrame) -> list[Block]:
+    """Templates, differences on other splits, and how small a difference more captures would show."""
+    learned = sentences.templates(run_tables, scene)
+    blocks: list[Block] = [Text(text=learned)] if learned else []
     others = tuple(split for split in MOTION_SPLITS if split not in RANKED_SPLITS)
     beside = differences.differences(run_tables, splits=others, scenes=(scene,))
-    test = "captures, paired t" if run_tables.captures(scene) > 1 else "seeds, Welch"
-    for title, rows in (("", ranked), ("Near and far novel poses", beside)):
-        for reference, table in rows.groupby("reference", sort=False):
-            frame = pd.DataFrame(
-                {
-                    "split": table["split"].map(lambda split: SPLIT_NAMES[split].title),
-                    "difference [dB]": table["mean"].map("{:+.2f}".format),
-                    f"95 % interval [{test}]": [f"[{r.low:+.2f}, {r.high:+.2f}]" for r in table.itertuples()],
-                    "p [Holm]": table["p"].map("{:.2g}".format),
-                    "detectable [dB]": table["detectable"].map("{:.2f}".format),
-                    "verdict": table["verdict"],
-                }
-            ).set_axis(table["method"].map(lambda method: style_of(method).title))
-            marks: dict[tuple[int, int], Mark] = {(i, 1): "strong" for i, p in enumerate(table["p"]) if p < 0.05}
-            blocks.append(
-                Table(title=title, corner=f"{style_of(str(reference)).title} minus", frame=frame, marks=marks)
-            )
-    blocks.append(Text(text=DIFFERENCES_NOTE, note=True))
+    blocks += difference_tables(run_tables, scene, beside, title="Near and far novel poses")
     effects = differences.detectable_effects(ranked)
     if len(effects):
         span = [f"{r.median:.2f} to {r.worst:.2f}" if r.captures > 1 else "none" for r in effects.itertuples()]
@@ -205,15 +209,6 @@ def difference_blocks(run_tables: RunTables, scene: str, ranked: pd.DataFrame) -
         blocks += [Table(title="Detectable with more captures", corner="split", frame=frame)]
         blocks += [Text(text=DETECTABLE_NOTE, note=True)]
     return blocks
-
-
-def _opening(data: SceneData, capture: Capture | None) -> list[Block]:
-    figure = figures.speed_figure(data.tables, data.scene)
-    blocks: list[Block] = [Text(text=what_was_compared(data, capture))]
-    blocks.append(Bullets(items=tuple(sentences.remarks(data.tables, data.scene))))
-    blocks += [figure] if figure else []
-    front = sentences.frontier(data.tables, data.scene)
-    return [*blocks, Bullets(items=front)] if front else blocks
 
 
 def _untitled(table: Table) -> Table:

@@ -160,7 +160,7 @@ def _sufficient(tables: RunTables, chosen_on: RunTables | None) -> list[Block]:
             both = (style_of(chosen.name).title, style_of(chosen.best).title)
             judged.append((scene, title, *both, f"{change.mean:+z.2f}{interval}", change.verdict))
     blocks: list[Block] = []
-    if rows:
+    if rows and (chosen_on or len(tables.scenes) > 1):  # A single scene says it in its opening.
         heads = ("split", "cheapest sufficient", "frame [ms]", "parameters", "loss at most [dB]", "best")
         frame = pd.DataFrame(rows, columns=["scene", *heads, "frame of the best [ms]"]).set_index("scene")
         blocks += [Table(corner="scene", frame=frame), Text(text=SUFFICIENT_NOTE, note=True)]

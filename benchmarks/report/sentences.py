@@ -2,19 +2,35 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from itertools import chain
 
+import pandas as pd
+
 from benchmarks.analysis import paper, pareto
-from benchmarks.analysis.results import FRAME_MS, RANKED_SPLITS, Quantity, RunTables, compare, foreground
-from benchmarks.analysis.statistics import Comparison
-from benchmarks.analysis.style import EXACT, PAIRS, SPLIT_NAMES, style_of
+from benchmarks.analysis.differences import differences
+from benchmarks.analysis.results import (
+    FRAME_MS,
+    HELD_OUT_SPLITS,
+    RANKED_SPLITS,
+    Quantity,
+    RunTables,
+    compare,
+    foreground,
+)
+from benchmarks.analysis.statistics import corrected
+from benchmarks.analysis.style import EXACT, PAIRS, SPLIT_NAMES, listed, style_of
+from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.registry import is_oracle
 from benchmarks.cell.schema import CellResult
 from synth.person.cast import VALIDATION
 
-TOO_CLOSE_DB = 0.1
+MARGIN_DB = METRICS["psnr"].abs_tol
 CLOCKS_APART_S, CLOCKS_APART = 5.0, 0.5  # seconds, and share of the shorter: what a busy machine does not explain
 FEW_METHODS = 6
+SMOKE_TESTS = ("ci",)  # sizes and presets
+FEW_NAMED = 3  # in a headline
+PSNR_IS = "PSNR on the person's pixels; higher is better, 1 dB more is an error smaller by a fifth."
 FOR_VALIDATION = (
     f"Subjects from {VALIDATION} on are for validation: choose by these numbers, confirm on other subjects."
 )
@@ -26,7 +42,7 @@ DRAWN_BY = {
 
 def titles(methods: Sequence[str]) -> str:
     """Methods for readers."""
-    return ", ".join(style_of(method).title for method in methods)
+    return listed([style_of(method).title for method in methods])
 
 
 def sentence(text: str) -> str:
@@ -34,69 +50,172 @@ def sentence(text: str) -> str:
     return text.removesuffix(".") + "."
 
 
-def headline(tables: RunTables, scene: str) -> str:
-    """Whose training had not reached its plateau; then the finding of a scene, with its certainty."""
-    short = _with_outcome(tables, scene, "not plateau")
-    first = f"Not at their plateau when training ended: {sentence(titles(short))} " if short else ""
+def headline(tables: RunTables, scene: str, *, smoke: bool = False) -> str:
+    """What a scene shows, with its certainty; first of all whose training had not reached its plateau.
+
+    `smoke`: sizes or steps are those of a smoke test, of which no method is said to be better.
+    """
+    if smoke:
+        return f"Smoke test on {scene}: it shows that every part runs, and not which method is better."
+    short, count = _with_outcome(tables, scene, "not plateau"), len(tables.methods(scene))
+    names = titles(short) if len(short) <= FEW_NAMED else f"{len(short)} of {count} methods"
+    names = "every method" if len(short) == count > 1 else names
+    first = f"Not at their plateau when training ended: {sentence(names)} " if short else ""
     return first + _finding(tables, scene)
 
 
 def _finding(tables: RunTables, scene: str) -> str:
+    """The verdict on each pair, and where there is none on the two best methods."""
     if pairs := [pair for pair in PAIRS if set(pair) <= set(tables.methods(scene))]:
-        return " ".join(_pair(tables, scene, *pair) for pair in pairs)
+        ranked = differences(tables, scenes=(scene,))
+        return f"On {scene}, {' '.join(_pair(tables, scene, ranked, *pair) for pair in pairs)}"
     means = tables.values(scene, foreground(), tables.methods(scene, oracles=False))
-    ranked = sorted(means, key=lambda name: -means[name])
-    if not ranked:
+    first, *others = sorted(means, key=lambda name: -means[name]) or [""]
+    if not first:
         return f"On {scene}, no method was ranked on novel views."
-    if len(ranked) == 1:
-        return f"On {scene}, {sentence(f'{style_of(ranked[0]).title} has {means[ranked[0]]:.1f} dB on novel views')}"
-    return _pair(tables, scene, *ranked[:2], splits=("novel_view",))
+    if not others:
+        return f"On {scene}, {sentence(f'{style_of(first).title} has {means[first]:.1f} dB on novel views')}"
+    compared = {other: compare(tables.of(scene), first, other, foreground()) for other in others}
+    tests = {other: each for other, each in compared.items() if each is not None}
+    rows = [
+        {"method": other, "split": "novel_view", **asdict(each), "verdict": each.verdict}
+        for other, each in zip(tests, corrected([*tests.values()]), strict=True)
+    ]
+    return f"On {scene}, {_pair(tables, scene, pd.DataFrame(rows), first, others[0])}"
 
 
-def _pair(tables: RunTables, scene: str, first: str, second: str, *, splits: Sequence[str] = RANKED_SPLITS) -> str:
-    """Two methods by split: what is known of the difference, and both means."""
+def _pair(tables: RunTables, scene: str, ranked: pd.DataFrame, first: str, second: str) -> str:
+    """Two methods by split: the verdict of `ranked`, the table of differences; of single values the numbers alone."""
     names = style_of(first).title, style_of(second).title
     if lost := [method for method in (first, second) if tables.failed(scene, method)]:
-        return f"On {scene}, {titles(lost)} failed: {names[0]} and {names[1]} cannot be compared."
-    parts = []
-    for split in splits:
-        means = tables.values(scene, foreground(split), (first, second))
-        compared = compare(tables.of(scene), first, second, foreground(split))
-        if len(means) == 2 and compared is not None:
-            numbers = f"{means[first]:.1f} and {means[second]:.1f} dB"
-            parts.append(f"{_standing(compared, numbers)} on {SPLIT_NAMES[split].words}")
+        return f"{titles(lost)} failed: {names[0]} and {names[1]} cannot be compared."
+    parts: dict[str, list[str]] = {}  # by what is said of the splits
+    for row in ranked[ranked["method"] == second].itertuples() if len(ranked) else ():
+        words = f"on {SPLIT_NAMES[row.split].words}"
+        if math.isnan(row.p):
+            means = tables.values(scene, foreground(row.split), (first, second))
+            numbers = f"{means[first]:.1f} and {means[second]:.1f} dB {words}"
+            parts.setdefault(f"{names[0]} and {names[1]} have ", []).append(numbers)
+            continue
+        best, worst = names if row.mean > 0 else names[::-1]
+        ends = sorted((abs(row.low), abs(row.high)))
+        how = f"{best} is better than {worst} "
+        text = f"{words} by {abs(row.mean):.1f} dB (95 % interval {ends[0]:.1f} to {ends[1]:.1f})"
+        if row.verdict == "equivalent":
+            how, text = f"{names[0]} and {names[1]} are equal within {MARGIN_DB:g} dB ", words
+        elif row.verdict == "unclear":
+            how = f"no difference between {names[0]} and {names[1]} is shown "
+            text = f"{words} ({row.mean:+.1f} dB, 95 % interval {row.low:+.1f} to {row.high:+.1f}"
+            text += f"; p {row.p:.2g}, corrected for all rows)" if row.low * row.high > 0 else ")"
+        parts.setdefault(how, []).append(text)
     if not parts:
-        return f"On {scene}, {names[0]} and {names[1]} were not both scored."
-    verdict = "" if tables.unit(scene) else "; one value of each, hence no verdict"
-    return f"On {scene}, {names[0]} against {names[1]}: {' and '.join(parts)}{verdict}."
+        return f"{names[0]} and {names[1]} were not both scored."
+    text = "; ".join(how + " and ".join(texts) for how, texts in parts.items())
+    return f"{text}{'' if tables.unit(scene) else ', one training of each: chance is not ruled out'}."
 
 
-def _standing(compared: Comparison, numbers: str) -> str:
-    """The verdict on a difference of PSNR, with its interval; of single values the difference alone."""
-    difference = f"{compared.mean:+.1f} dB"
-    if math.isnan(compared.p):
-        return f"{difference} ({numbers})"
-    words = "not shown to differ" if compared.verdict == "unclear" else compared.verdict
-    return f"{words} ({difference} [{compared.low:+.1f}, {compared.high:+.1f}]; {numbers})"
+def facts(tables: RunTables, scene: str) -> list[tuple[str, str]]:
+    """What else must be known to read the numbers: a label and a text each."""
+    lines = [
+        ("Scores", f"{PSNR_IS} {_scores(tables, scene)} {_exact(tables, scene)}"),
+        ("How sure", _certainty(tables, scene)),
+        ("Smallest sufficient", _sufficient(tables, scene)),
+        ("Weakest", _weakest(tables, scene)),
+        ("Time", f"{_training(tables, scene)} {_cost(tables, scene)}"),
+        ("Limits", f"{_noise(tables, scene)} {_template(tables, scene)}"),
+        ("Missing", _missing(tables, scene)),
+    ]
+    return [(label, text.strip()) for label, text in lines if text.strip()]
 
 
-def remarks(tables: RunTables, scene: str) -> list[str]:
-    """What else must be known to read the numbers: the exact surface, cost, template, noise, seeds, failures."""
-    lines = [FOR_VALIDATION] if tables.for_validation(scene) else []
-    lines += [_exact(tables, scene), _cost(tables, scene), _template(tables, scene), _noise(tables, scene)]
+def _scores(tables: RunTables, scene: str) -> str:
+    """Foreground PSNR of the methods, the best first; of many, the main pairs and the best."""
+    parts = []
+    for split in RANKED_SPLITS:
+        names = [name for name in tables.methods(scene, oracles=False) if tables.whole(scene, name)]
+        means = tables.values(scene, foreground(split), names)
+        order = sorted(means, key=lambda name: -means[name])
+        if len(order) > FEW_METHODS:
+            order = [name for name in order if name in (order[0], *chain(*PAIRS))]
+        if order:
+            scores = listed([f"{style_of(name).title} {means[name]:.1f} dB" for name in order])
+            parts.append(f"On {SPLIT_NAMES[split].words}: {scores}.")
+    return " ".join(parts)
+
+
+def _certainty(tables: RunTables, scene: str) -> str:
+    people, seeds = tables.captures(scene), tables.seeds
+    note = f" {FOR_VALIDATION}" if tables.for_validation(scene) else ""
+    if people == seeds == 1:
+        return f"One training of each method on one person: no verdicts. --seeds 3 or --subjects 8 gives them.{note}"
+    text = f"{seeds} trainings (seeds) of each method, on one person: other people may differ (--subjects 8)."
+    if people > 1:
+        each = "one training" if seeds == 1 else f"{seeds} trainings"
+        text = f"{people} people, {each} of each method per person; methods are compared on the same person."
+    return f"{text} A 95 % interval holds the true difference in 95 of 100 such experiments.{note}"
+
+
+def _sufficient(tables: RunTables, scene: str) -> str:
+    """The cheapest method that loses next to nothing, by split."""
+    parts: dict[str, list[str]] = {}
+    for split in RANKED_SPLITS:
+        competing = pareto.candidates(tables, scene, split)
+        if len(competing) < 2:
+            continue
+        if (found := pareto.smallest_sufficient(competing)) is None:
+            return "Not known from one value of each."
+        title, best = style_of(found.name).title, style_of(found.best).title
+        text = f"{title}, the fastest that loses less than {pareto.SUFFICIENT_DB} dB to {best} (95 % confidence)"
+        if found.name == found.best:
+            text = f"{title}, the best; no faster method is known to lose less than {pareto.SUFFICIENT_DB} dB"
+        parts.setdefault(text, []).append(SPLIT_NAMES[split].words)
+    return " ".join(f"On {' and '.join(words)}: {text}." for text, words in parts.items())
+
+
+def _weakest(tables: RunTables, scene: str) -> str:
+    """The split on which the methods score lowest, and the methods that draw every frame alike."""
+    names = [name for name in tables.methods(scene, oracles=False) if tables.whole(scene, name)]
+    means = {split: tables.values(scene, foreground(split), names) for split in HELD_OUT_SPLITS}
+    means = {split: values for split, values in means.items() if values}
+    text = ""
+    if len(means) > 1:
+        split = min(means, key=lambda split: sum(means[split].values()) / len(means[split]))
+        order = sorted(means[split], key=lambda name: means[split][name])
+        ends = dict.fromkeys((order[0], order[-1]))
+        scores = " to ".join(f"{means[split][name]:.1f} dB ({style_of(name).title})" for name in ends)
+        text = f"Scores are lowest on {SPLIT_NAMES[split].words}: {scores}. The worst frames are shown below."
+    if dead := _with_outcome(tables, scene, "dead"):
+        text += sentence(f" The decoders have the same output in every frame: {titles(dead)}")
+    return text
+
+
+def _training(tables: RunTables, scene: str) -> str:
+    rows = tables.of(scene)
+    seconds = rows[(rows["metric"] == "train_s") & (rows["status"] == "done")]["value"]
+    if not len(seconds):
+        return ""
+    span = dict.fromkeys(f"{value:.0f}" for value in (seconds.min(), seconds.max()))
+    return f"A training took {' to '.join(span)} s on one core."
+
+
+def _missing(tables: RunTables, scene: str) -> str:
+    lines = []
+    if failed := [method for method in tables.methods(scene) if tables.failed(scene, method)]:
+        lines.append(sentence(f"Failed, and scored with the worst value: {titles(failed)}"))
+    if not (tables.of(scene)["metric"] == "lpips").any():
+        lines.append("LPIPS was not measured.")
+    if short := _with_outcome(tables, scene, "not plateau"):
+        names = titles(short) if set(short) < set(tables.methods(scene)) else "every method"
+        lines.append(sentence(f"Training ended before its plateau: {names}"))
+    return " ".join(lines)
+
+
+def templates(tables: RunTables, scene: str) -> str:
+    """What each template was learned from; the ridge weight is that of its regularisation."""
     outcomes = tables.outcomes[tables.outcomes["scene"] == scene]
     learned = outcomes[outcomes["template"] != ""].drop_duplicates(["method", "template"])
     kinds = [f"{template} ({titles([*rows['method']])})" for template, rows in learned.groupby("template", sort=False)]
-    lines.append(f"Templates: {'; '.join(kinds)}." if kinds else "")
-    if dead := _with_outcome(tables, scene, "dead"):
-        lines.append(sentence(f"The decoders have the same output in every frame: {titles(dead)}"))
-    if failed := [method for method in tables.methods(scene) if tables.failed(scene, method)]:
-        lines.append(sentence(f"Failed, and scored with the worst value: {titles(failed)}"))
-    if not tables.unit(scene):
-        lines.append("One value per row: no verdicts. --seeds 3 gives intervals over seeds, --subjects 8 over people.")
-    elif tables.captures(scene) == 1:
-        lines.append("One capture: intervals are over seeds and hold for this subject; --subjects 8 adds others.")
-    return [remark for remark in lines if remark]
+    return f"Templates, and the weight of their regularisation (ridge): {'; '.join(kinds)}." if kinds else ""
 
 
 def _exact(tables: RunTables, scene: str) -> str:
@@ -104,10 +223,7 @@ def _exact(tables: RunTables, scene: str) -> str:
     if len(means) < 2 or not tables.whole(scene, *EXACT.values()):
         return ""
     ash, ddc = means.values()
-    numbers = f"(ASH {ash:.1f}, DDC {ddc:.1f} dB on novel views)"
-    if abs(ash - ddc) < TOO_CLOSE_DB:
-        return f"Given the exact surface, the two are level {numbers}."
-    return f"Given the exact surface, {'ASH' if ash > ddc else 'the mesh'} leads by {abs(ash - ddc):.1f} dB {numbers}."
+    return f"Given the exact surface, on novel views: ASH {ash:.1f}, DDC {ddc:.1f} dB."
 
 
 def _cost(tables: RunTables, scene: str) -> str:
@@ -118,7 +234,7 @@ def _cost(tables: RunTables, scene: str) -> str:
         ends = [pick(frame_ms, key=lambda name: frame_ms[name]) for pick in (min, max)]
         frame_ms = {name: ms for name, ms in frame_ms.items() if name in (*chain(*PAIRS), *ends)}
     parts = [f"{style_of(method).title} {ms:.0f} ms" for method, ms in frame_ms.items()]
-    return f"A frame takes {', '.join(parts)} on one core." if parts else ""
+    return f"A frame takes {listed(parts)} on one core." if parts else ""
 
 
 def _template(tables: RunTables, scene: str) -> str:
@@ -161,6 +277,11 @@ def training_views(tables: RunTables, scene: str) -> list[str]:
     return lines
 
 
+def smoke(results: Sequence[CellResult]) -> bool:
+    """Whether sizes or presets are those of smoke tests."""
+    return any(r.config.size in SMOKE_TESTS or (r.brought is None and r.config.preset in SMOKE_TESTS) for r in results)
+
+
 def exposed(results: Sequence[CellResult]) -> tuple[str, ...]:
     """Methods that were not isolated; oracles are not meant to be."""
     methods = (r.config.method for r in results if r.isolated is False and not is_oracle(r.config.method))
@@ -185,13 +306,20 @@ def doubts(results: Sequence[CellResult]) -> tuple[str, ...]:
     for device in sorted({r.drawn_on for r in results} - {"", "cpu"}):
         drawn = dict.fromkeys(r.config.method for r in results if r.drawn_on == device)
         lines.append(f"{titles([*drawn])}: drawn on {device}, so that milliseconds are not those of one core.")
+    return (*lines, *_clocks(results))
+
+
+def _clocks(results: Sequence[CellResult]) -> list[str]:
+    """Trainings whose two clocks contradict each other: the farthest apart in words, the others as a count."""
+    apart: dict[str, list[tuple[float, str]]] = {}
     for result in results:
         wall, cpu = (result.value("speed", "", f"train_{clock}_s") for clock in ("wall", "cpu"))
         if wall is None or cpu is None or abs(wall - cpu) < CLOCKS_APART_S + CLOCKS_APART * min(wall, cpu):
             continue
         why = "it was stopped, or shared its core" if wall > cpu else "it used more than one core"
-        lines.append(f"{result.config.title} trained {wall:.0f} s by the clock and {cpu:.0f} s of CPU time: {why}.")
-    return tuple(lines)
+        text = f"{result.config.title} trained {wall:.0f} s by the clock and {cpu:.0f} s of CPU time: {why}"
+        apart.setdefault(why, []).append((abs(wall - cpu), text))
+    return [f"{max(found)[1]}{f'; likewise {len(found) - 1} more' if found[1:] else ''}." for found in apart.values()]
 
 
 def _reported(result: CellResult) -> str:
@@ -205,20 +333,3 @@ def _reported(result: CellResult) -> str:
     text = f"{style_of(result.config.method).title}: brought pictures, rendered elsewhere; what it saw is not known."
     text += " Without alpha: only the whole frame is scored." if brought.alpha == "none" else ""
     return f"{text} Reported by its authors, not measured here: {', '.join(parts)}." if parts else text
-
-
-def frontier(tables: RunTables, scene: str) -> tuple[str, ...]:
-    """The front of accuracy and speed, and the smallest sufficient method, by split."""
-    lines = []
-    for split in RANKED_SPLITS:
-        competing = pareto.candidates(tables, scene, split)
-        if len(competing) < 2:
-            continue
-        text = f"On {SPLIT_NAMES[split].words}, no method beats {titles(pareto.front(competing))} in both accuracy and"
-        text += " speed."
-        if (sufficient := pareto.smallest_sufficient(competing)) is not None:
-            text += f" Smallest sufficient: {style_of(sufficient.name).title}, the cheapest that loses less than"
-            text += f" {pareto.SUFFICIENT_DB} dB to {style_of(sufficient.best).title}"
-            text += f" (95 % bound {sufficient.loss_bound_db:.2f} dB)."
-        lines.append(text)
-    return tuple(lines)

@@ -27,6 +27,12 @@ def quality_columns(metrics: Sequence[str]) -> list[Quantity]:
     return [Quantity(s, "full", m) if m in ON_WHOLE_FRAMES else foreground(s, m) for s, m in asked]
 
 
+def main_columns(tables: RunTables, scene: str) -> list[Quantity]:
+    """PSNR and LPIPS on all held-out splits; FLIP where LPIPS was not measured."""
+    has_lpips = (tables.of(scene)["metric"] == "lpips").any()
+    return quality_columns(("psnr", "lpips" if has_lpips else "flip"))
+
+
 def cost_columns(metrics: Sequence[str]) -> list[Quantity]:
     """Times and sizes."""
     return [Quantity("memory" if metric in MEMORY else "speed", "", metric) for metric in metrics]

@@ -33,9 +33,11 @@ for (const button of document.querySelectorAll("thead button")) {
   });
 }
 
-// Charts: drawn when they come into sight, without eval; the legend's buttons hide and show series in all panels.
+// Charts: drawn when they come into sight or are printed, without eval; the legend's buttons hide and show series in all panels.
 const views = new Map();
 const draw = async (box) => {
+  if (box.dataset.begun) return;
+  box.dataset.begun = "yes";
   const theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
   const options = { mode: "vega-lite", ast: true, renderer: "svg", actions: false, tooltip: { theme } };
   const spec = read(box.querySelector("script"));
@@ -60,6 +62,8 @@ for (const figure of document.querySelectorAll("[data-chart]")) {
 
 // Pictures: one moment of one camera at a time; all methods in a strip, two of them on one stage.
 const setUp = (box) => {
+  if (box.dataset.begun) return;
+  box.dataset.begun = "yes";
   const find = (name) => box.querySelector(`[data-${name}]`);
   const { tracks, names } = read(box.querySelector("script"));
   const [track, frame, number, left, right, zoom, edge] =
@@ -133,6 +137,39 @@ const setUp = (box) => {
 };
 whenSeen(document.querySelectorAll("[data-player]"), setUp);
 whenSeen(document.querySelectorAll("img[data-picture]"), (image) => paint(image, image.dataset.picture));
+// Any picture at its full size; a click or the wheel enlarges it.
+const full = document.getElementById("full"), big = new Image();
+const enlarge = (times) => {
+  big.dataset.zoom = Math.min(8, Math.max(1, big.dataset.zoom * times));
+  big.width = big.naturalWidth * big.dataset.zoom;
+};
+for (const image of document.querySelectorAll("img[data-picture]")) {
+  const open = async () => {
+    big.src = image.src; big.alt = image.alt;
+    await big.decode();
+    big.dataset.zoom = Math.max(1, Math.floor(Math.min(innerWidth / 2 / big.naturalWidth, innerHeight / 2 / big.naturalHeight)));
+    enlarge(1); full.append(big); full.showModal();
+  };
+  image.addEventListener("click", open);
+  image.addEventListener("keydown", (event) => { if (event.key === "Enter") open(); });
+}
+big.addEventListener("click", () => enlarge(2));
+big.addEventListener("wheel", (event) => { event.preventDefault(); enlarge(event.deltaY < 0 ? 1.25 : 0.8); }, { passive: false });
+// What is lazy comes soon after the page is there, so that a print or a PDF is whole; folded parts print unfolded.
+const lazy = [...document.querySelectorAll(".panels > .vega")];
+const rest = async () => {
+  for (const box of lazy) if (box.clientWidth) { await draw(box); await new Promise((done) => setTimeout(done)); }
+};
+(window.requestIdleCallback ?? setTimeout)(rest);
+addEventListener("beforeprint", () => {
+  for (const fold of document.querySelectorAll("details:not([open])")) { fold.open = true; fold.dataset.folded = "yes"; }
+  document.querySelectorAll("img[data-picture]").forEach((image) => paint(image, image.dataset.picture));
+  document.querySelectorAll("[data-player]").forEach(setUp);
+  lazy.forEach(draw);
+});
+addEventListener("afterprint", () => {
+  for (const fold of document.querySelectorAll("details[data-folded]")) { fold.open = false; delete fold.dataset.folded; }
+});
 for (const link of document.querySelectorAll("a.term")) {
   link.addEventListener("click", () => {
     const fold = document.querySelector(link.hash)?.closest("details");

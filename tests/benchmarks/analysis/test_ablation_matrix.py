@@ -136,11 +136,11 @@ def test_without_an_interval_there_is_no_matrix_but_a_sentence() -> None:
 def test_the_smallest_sufficient_row_and_one_that_other_subjects_chose() -> None:
     levels = {"ash": 27.0, "wo_mot": 26.95, "mlp": 26.9, "ddc": 24.0, "ash_truth": 30.0}
     there = RunTables(run("tight", levels))
-    (section,) = sections.ablations(there)
+    assert sections.ablations(there) == [], "of a single scene its opening says it"
+    (section,) = sections.ablations(there, there)
     assert isinstance(table := section.blocks[0], Table)
     assert list(table.frame.index) == ["tight", "tight"]
     assert table.frame.iloc[0].tolist()[:4] == ["Novel view", "ASH", "12.0", "2M"], "of equal costs the first"
-    assert sections.ablations(RunTables(run("tight", {"ash": 27.0, "wo_mot": 26.9}))) == []
     judged = {table.title: table for table in blocks_of(sections.ablations(there, there), Table)}
     texts = judged["Chosen on subjects for validation"].frame.iloc[0].tolist()
     assert texts[:3] == ["Novel view", "ASH", "ASH"] and texts[4] == "equivalent"

@@ -14,8 +14,7 @@ from benchmarks.analysis.results import COLUMNS, RunTables, compare, foreground
 from benchmarks.analysis.statistics import detectable
 from benchmarks.cell.schema import failed_result
 from benchmarks.report.content import Table
-from benchmarks.report.scene import detectable as detectable_sentence
-from benchmarks.report.scene import difference_blocks
+from benchmarks.report.scene import difference_tables, statistics_blocks
 
 ROUNDS, TABLES = 300, 80
 
@@ -88,15 +87,13 @@ def test_what_more_captures_show_follows_from_the_spread_over_captures() -> None
 def test_a_report_says_what_was_compared_and_what_could_be_found() -> None:
     many = RunTables(people({"ash": (20.0, 25.0, 30.0), "ddc": (19.0, 24.2, 29.2)}))
     ranked = differences(many)
-    main, more = (b for b in difference_blocks(many, "loose", ranked) if isinstance(b, Table))
-    assert list(main.frame.columns)[2] == "95 % interval [captures, paired t]"
+    (main,) = (b for b in difference_tables(many, "loose", ranked, title="") if isinstance(b, Table))
+    assert list(main.frame.columns)[1:4] == ["verdict", "difference [dB]", "95 % interval [people, paired t]"]
     assert main.frame.index[0] == "DDC" and main.frame["verdict"].tolist() == ["better", "better"]
-    assert more.frame.iloc[0, 0] == "none"
-    said = detectable_sentence(many, "loose", ranked)
-    assert "Smallest detectable difference, median row: 0." in said and "3 captures, compared in pairs" in said
+    (more,) = (b for b in statistics_blocks(many, "loose", ranked) if isinstance(b, Table))
+    assert more.title == "Detectable with more captures" and more.frame.iloc[0, 0] == "none"
     one = RunTables(people({"ash": (20.0,), "ddc": (19.0,)}, seeds=(0.0, 0.1, 0.3)))
-    (main,) = (b for b in difference_blocks(one, "loose", differences(one)) if isinstance(b, Table))
-    assert list(main.frame.columns)[2] == "95 % interval [seeds, Welch]"
+    (main,) = (b for b in difference_tables(one, "loose", differences(one), title="") if isinstance(b, Table))
+    assert list(main.frame.columns)[3] == "95 % interval [seeds, Welch]"
     single = RunTables([cell("ash", 20.0), cell("ddc", 19.0)])
-    assert difference_blocks(single, "loose", differences(single)) == []
-    assert "no verdict" in detectable_sentence(single, "loose", differences(single))
+    assert difference_tables(single, "loose", differences(single), title="") == []

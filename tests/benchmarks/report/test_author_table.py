@@ -71,7 +71,10 @@ def test_marks_and_differences_are_over_people_in_pairs() -> None:
     assert table.shown.frame.index.tolist() == ["ASH", "w/o mot.", "no_displacement", "NA"] and table.breaks == (1, 3)
     row = table.numbers.query("method == 'wo_mot' and metric == 'psnr'").iloc[0]
     assert row["difference"] == pytest.approx(-3.95) and row["difference_low"] < -3.95 < row["difference_high"]
-    assert "4 people, 1 seed." in table.caption and "in pairs, over people" in table.caption
+    assert "Scene loose: 4 people, 1 seed each." in table.caption and "in pairs, over people" in table.caption
+    assert "Bold and yellow: better than every other row" in table.caption
+    tie = made({"ash": LEVELS["ash"], "wo_mot": LEVELS["ash"]}, marks=["bold"])
+    assert tie.shown.marks == {} and "Bold" not in tie.caption and "No row is significantly better" in tie.caption
 
 
 def test_one_value_has_no_mark_and_no_interval() -> None:
