@@ -188,9 +188,14 @@ def psnr_of_the_whole_frame(patch: Patch) -> None:
     patch.setattr(metrics, "psnr", lambda a, b, region=None: sound(a, b, None))
 
 
-def median_for_mean(patch: Patch) -> None:
-    numbers = type("Numbers", (), {"mean": staticmethod(np.median), "__getattr__": lambda _, name: getattr(np, name)})()
-    patch.setattr(evaluation, "np", numbers)
+def means_by(mean: Callable[[Any], float]) -> Callable[[Patch], None]:
+    """Means over images are taken by something else."""
+
+    class Numbers:
+        def __getattr__(self, name: str) -> Any:
+            return mean if name == "mean" else getattr(np, name)
+
+    return lambda patch: patch.setattr(evaluation, "np", Numbers())
 
 
 def seed_ignored(patch: Patch) -> None:
@@ -281,11 +286,13 @@ DEFECTS: dict[str, Defect] = {
         reason="from step 16 on (step 16 -> 12)",
         config=training(steps=12),
     ),
-    "no averaging": Defect(about="weights are not averaged", layer="quality", config=training(ema=0.0)),
+    "no averaging": Defect(
+        about="weights are not averaged", layer="training", reason="step 16 on (train_psnr", config=training(ema=0.0)
+    ),
     "whole frame": Defect(
         about="PSNR is of the whole frame", layer="protocol", reason="foreground psnr", plant=psnr_of_the_whole_frame
     ),
-    "median": Defect(about="means are medians", layer="protocol", reason="mean ", plant=median_for_mean),
+    "median": Defect(about="means are medians", layer="protocol", reason="mean ", plant=means_by(np.median)),
 }
 HARMLESS: dict[str, Defect] = {
     "nothing": Defect(about="the same code", layer=None),
@@ -300,6 +307,6 @@ HARMLESS: dict[str, Defect] = {
     "same score another way": Defect(
         about="means are summed in another order",
         layer=None,
-        plant=lambda patch: patch.setattr(evaluation.np, "mean", lambda values: math.fsum(values) / len(values)),
+        plant=means_by(lambda values: math.fsum(values) / len(values)),
     ),
 }

@@ -18,6 +18,7 @@ from markdown_it import MarkdownIt
 from ash.files import InputError, read_json, write_json
 from benchmarks import cli, provenance
 from benchmarks.cell.schema import CHECKPOINT, Cell, CellResult, Summary, Timing, ViewScore
+from benchmarks.commands import arguments
 from benchmarks.gate import against, history, summary
 from benchmarks.gate.baseline import Accepted, Baseline, Entry, GateFile, read_baseline, row_of, write_baseline
 from benchmarks.gate.checks import FAILING, Check, of_exact_change, outcome
@@ -251,38 +252,38 @@ def test_a_method_in_another_repository(
     """Unchanged, changed in its rendering alone, accepted, and another suite."""
     monkeypatch.chdir(tmp_path)
     fakes.use(tmp_path, monkeypatch)
-    source = tmp_path / "own_method.py"
+    source = tmp_path / "dimmable.py"
     source.write_text(METHOD)
-    suite = fakes.write_suite(tmp_path, capture, "own_method:mine", name="gate")
+    suite = fakes.write_suite(tmp_path, capture, "dimmable:mine", name="gate")
     command = ["gate", "--baseline", "base"]
-    assert cli.main([*command, "--suite", str(suite), "--seeds", "4", "--update-baseline"]) == cli.DONE
+    assert cli.main([*command, "--suite", str(suite), "--seeds", "4", "--update-baseline"]) == arguments.DONE
     told = read_json(tmp_path / "base" / "gate.json")
     write_json(tmp_path / "base" / "gate.json", {**told, "machine": "another"})  # Others may be at work beside us.
-    assert cli.main([*command, "--history", "history"]) == cli.DONE
+    assert cli.main([*command, "--history", "history"]) == arguments.DONE
     told = capsys.readouterr().out
     assert "gate: passed, unchanged" in told
     assert "not judged             cost: memory and times: the baseline was made on another" in told
-    assert (tmp_path / "history" / "index.html").read_text().count("<svg") == 3
+    assert (tmp_path / "history" / "index.html").read_text().count("<svg") == 2
 
     source.write_text(METHOD + "\nclass Dim(FakeAvatar):\n    def render(self, *args, **more):\n"
         "        return 0.9 * super().render(*args, **more)\n"
         "\ndef mine(capture, *, seed, preset):\n    return Dim(capture, detail=0.9, seed=seed)\n")  # fmt: skip
-    assert cli.main([*command, "--out", "dim", "--markdown", "m.md", "--junit", "j.xml"]) == cli.FAILED
+    assert cli.main([*command, "--out", "dim", "--markdown", "m.md", "--junit", "j.xml"]) == arguments.FAILED
     told = capsys.readouterr().out
     assert "rendering changed: 26 of 26 pictures" in told and "exact" in told
     assert (tmp_path / "dim" / "rendering_0.png").read_bytes()[:4] == b"\x89PNG"
     assert "worse" in (tmp_path / "m.md").read_text() and "<failure" in (tmp_path / "j.xml").read_text()
-    row = "boxes · mine"
-    assert cli.main([*command, "--out", "dim", "--accept", row, "--because", "darker is wanted"]) == cli.DONE
-    assert cli.main([*command, "--out", "dim"]) == cli.DONE
+    row = "boxes · dimmable:mine"
+    assert cli.main([*command, "--out", "dim", "--accept", row, "--because", "darker is wanted"]) == arguments.DONE
+    assert cli.main([*command, "--out", "dim"]) == arguments.DONE
     told = capsys.readouterr().out
     assert "Accepted at" in told and "darker is wanted" in told
 
-    fakes.write_suite(tmp_path, capture, "own_method:mine", "fake_good", name="gate")
-    assert cli.main([*command, "--suite", str(suite)]) == cli.WRONG_INPUT
+    fakes.write_suite(tmp_path, capture, "dimmable:mine", "fake_good", name="gate")
+    assert cli.main([*command, "--suite", str(suite)]) == arguments.WRONG_INPUT
     assert "expected the content of base/gate.toml" in capsys.readouterr().err
-    assert cli.main([*command, "--accept", "nothing", "--because", "x"]) == cli.WRONG_INPUT
-    assert cli.main([*command, "--accept", row]) == cli.WRONG_INPUT
+    assert cli.main([*command, "--accept", "nothing", "--because", "x"]) == arguments.WRONG_INPUT
+    assert cli.main([*command, "--accept", row]) == arguments.WRONG_INPUT
 
 
 def test_a_gate_is_started_in_a_repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -83,9 +83,9 @@ def test_it_sorts_filters_and_shows_any_picture(board: Path, visit: Visitor) -> 
     assert page.locator(names).first.inner_text().startswith("fake_bad")
     assert "Abacus" in page.inner_text("#hint") and "do not compare" in page.inner_text("#hint")
     sent = page.locator(names, has_text="sent.zip")
-    assert "n/a" in sent.inner_text().split()
+    unknown = sent.inner_text().split().count("n/a")  # LPIPS, which was not measured, among them
     page.select_option("#machine", index=1)
-    assert "n/a" not in sent.inner_text().split()
+    assert sent.inner_text().split().count("n/a") < unknown
     page.select_option("#region", "full")
     assert page.locator("#board thead", has_text="(whole frame)").count() == 0
     sent.locator("a").click()
