@@ -3,21 +3,24 @@
 SUITE.toml                                 the suite; its content counts, not its name
 run.json, cells/KEY/{config,result}.json   every number of every seed, as a run has them
 cells/KEY/{log.jsonl, model.safetensors, images/}
-                                           of the first seed of each row: the beginning of its training log, the
+                                           of the first seed of each row but oracles: the beginning of its training log, the
                                            trained avatar, and some of its pictures
 gate.json                                  the least times of these avatars, and the changes that were accepted
 """
 
+import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from ash.capture.typed import from_json
 from ash.files import InputError, open_regular, read_json, write_atomic, write_json
 from benchmarks.cell.evaluation import spread
+from benchmarks.cell.registry import is_oracle
 from benchmarks.cell.schema import (
     CHECKPOINT,
     Cell,
@@ -186,21 +189,26 @@ def _write_cells(entries: Sequence[Entry], made: Path) -> None:
         folder = made / "cells" / entry.cell.config.key
         # Of a capture's folder the name says enough: it is searched where captures are kept.
         told = {"capture_folder": entry.cell.capture_folder.resolve().name}
-        write_json(folder / "config.json", read_json(entry.cell.folder / "config.json") | told)
-        write_result(folder, entry.result)
+        _write_compact(folder / "config.json", read_json(entry.cell.folder / "config.json") | told)
+        _write_compact(folder / "result.json", read_json(entry.cell.folder / "result.json"))
     first = entries[0]
     folder = made / "cells" / first.cell.config.key
     if (log := first.cell.folder / "log.jsonl").exists():
         with open_regular(log, most=LARGEST_LOG) as file:
             write_atomic(folder / "log.jsonl", b"".join(islice(file, LOG_LINES)))
     checkpoint = first.cell.folder / CHECKPOINT
-    if checkpoint.exists() and checkpoint.stat().st_size <= LARGEST_CHECKPOINT:
+    kept = checkpoint.exists() and checkpoint.stat().st_size <= LARGEST_CHECKPOINT
+    if kept and not is_oracle(first.cell.config.method):  # An oracle's rendering is its method's.
         shutil.copyfile(checkpoint, folder / CHECKPOINT)
         for view in stored_views(first.result):
             source = prediction_path(first.cell.folder, view)
             target = prediction_path(folder, view)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, target)
+
+
+def _write_compact(path: Path, content: Any) -> None:
+    write_atomic(path, json.dumps(content, sort_keys=True, allow_nan=False, separators=(",", ":")).encode())
 
 
 def with_row(baseline: Baseline, row: str, entries: Sequence[Entry], because: str) -> tuple[Run, tuple[Accepted, ...]]:
