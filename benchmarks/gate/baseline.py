@@ -1,11 +1,10 @@
 """What a change is compared with: a run of code that is known to be good, small enough for a repository.
 
-SUITE.toml                                 the suite; its content counts, not its name
-run.json, cells/KEY/{config,result}.json   every number of every seed, as a run has them
-cells/KEY/{log.jsonl, model.safetensors, images/}
-                                           of the first seed of each row but oracles: the beginning of its training log, the
-                                           trained avatar, and some of its pictures
-gate.json                                  the least times of these avatars, and the changes that were accepted
+- `SUITE.toml`: the suite. Its content counts, not its name.
+- `run.json`, `cells/KEY/config.json` and `result.json`: every number of every seed, as a run has them.
+- Of the first seed of each row `log.jsonl`, the beginning of its training log, and of all but oracles
+  `model.safetensors`, the trained avatar, and `images/`, some of its pictures.
+- `gate.json`: the least times of these avatars, and the changes that were accepted.
 """
 
 import json
