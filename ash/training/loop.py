@@ -163,9 +163,6 @@ class Trainer:
             weight = 1 - min(self.config.ema, (1 + self.steps) / (10 + self.steps))
             torch._foreach_lerp_(list(self.average.values()), self.averaged, weight)
         self.steps += 1
-        if self.steps <= FIRST_STEPS:
-            gradients = [p.grad for p in self.learner.module.parameters() if p.grad is not None]
-            self._write_log(loss, gradient=float(torch.stack([g.double().norm() for g in gradients]).norm()))
         self._look(loss)
 
     def _look(self, loss: Tensor) -> None:
@@ -173,7 +170,7 @@ class Trainer:
         if self.images.reserved and (is_eval_step(self.steps) or self.has_ended):
             self._score()
         self.state = update(self.state, self.config, step=self.steps, seconds=self._elapsed())
-        regular = self.steps % LOG_EVERY == 1 and self.steps > FIRST_STEPS
+        regular = self.steps <= FIRST_STEPS or self.steps % LOG_EVERY == 1
         if regular or self.has_ended or self._score_of_this_step() is not None:
             self._write_log(loss)
         if self.config.snapshots:
@@ -195,8 +192,11 @@ class Trainer:
         self.load()
         self.rate_scale = 0.5
 
-    def _write_log(self, loss: Tensor, **more: float) -> None:
-        row = {"step": self.steps, "seconds": round(self._elapsed(), 3), "loss": float(loss.detach()), **more}
+    def _write_log(self, loss: Tensor) -> None:
+        row = {"step": self.steps, "seconds": round(self._elapsed(), 3), "loss": float(loss.detach())}
+        if self.steps <= FIRST_STEPS:
+            gradients = [p.grad for p in self.learner.module.parameters() if p.grad is not None]
+            row["gradient"] = float(torch.stack([gradient.double().norm() for gradient in gradients]).norm())
         if (psnr := self._score_of_this_step()) is not None:
             row["train_psnr"] = psnr
         self.log.parent.mkdir(parents=True, exist_ok=True)

@@ -18,7 +18,7 @@ from ash.capture.formats import load_capture
 from ash.capture.novelty import novelty_deg
 from ash.files import read_arrays
 from benchmarks.cell import metrics
-from benchmarks.cell.schema import Cell, CellResult, View, ViewScore, stored_prediction
+from benchmarks.cell.schema import Cell, CellResult, ViewScore, stored_prediction
 from synth.truth.pixels import depth, normals, pixel_truth, points, surface_truth
 
 REGION_COLOURS = ("#2f6fde", "#dd6b20", "#c2415c", "#b8860b", "#c9ced6")
@@ -104,7 +104,7 @@ def _attribution(
     novelty_rank: float,
 ) -> ErrorAttribution:
     truth = metrics.on_black(capture.image(view.camera, view.frame))
-    predicted = stored_prediction(cell, capture, View(split=view.split, camera=view.camera, frame=view.frame))
+    predicted = stored_prediction(cell, capture, view)
     masks = metrics.foreground(truth), metrics.foreground(predicted)
     regions = region_map(capture, view.camera, view.frame, *masks, visible_triangles)
     error = ((truth[..., :3].astype(float) - predicted[..., :3]) ** 2).sum(-1)

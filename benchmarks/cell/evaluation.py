@@ -89,7 +89,7 @@ def draw_all(cell: Cell, capture: Capture, client: MethodClient) -> MethodOutput
         write_image(
             prediction_path(cell.folder, view), metrics.quantise(client.draw(view, capture.cameras[view.camera]))
         )
-    agreement_db = min(_agreement(image, stored_prediction(cell, capture, view)) for view, image in shown)
+    agreement_db = min(agreement(image, stored_prediction(cell, capture, view)) for view, image in shown)
     if agreement_db < LEAST_AGREEMENT_DB:
         measured = f"{agreement_db:.1f} dB, expected {LEAST_AGREEMENT_DB:.0f} or more"
         raise MethodFailed("crashed", f"a timed picture differs from the one that was scored by {measured}")
@@ -192,7 +192,8 @@ def _timing(capture: Capture, client: MethodClient, views: list[View]) -> tuple[
     return timing, pictures
 
 
-def _agreement(shown: np.ndarray, scored: np.ndarray) -> float:
+def agreement(shown: np.ndarray, scored: np.ndarray) -> float:
+    """PSNR, dB, between two pictures of the same view, uint8 RGBA on black, where either shows something."""
     region = metrics.foreground(shown) | metrics.foreground(scored)
     return metrics.psnr(shown[..., :3], scored[..., :3], region if region.any() else None)
 

@@ -7,7 +7,7 @@ Pictures are RGBA, straight or premultiplied as info.json says, or RGB on black.
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -21,21 +21,11 @@ from ash.files import LIMITS, InputError, hash_of, hash_sources, open_regular, r
 from benchmarks.cell import metrics
 from benchmarks.cell.evaluation import evaluated_views, quality_summary, scored_views
 from benchmarks.cell.schema import Brought, Cell, CellResult, Summary, prediction_path
+from benchmarks.problems import Problems
 
 LARGEST_INFO = 1 << 16  # bytes
 LARGEST_NUMBER, LONGEST_TEXT = 1e12, 200  # of info.json
 MOST_FILES = 1000  # below images/ besides those that are expected; more are not listed
-MOST_LINES = 100
-
-
-class BadPredictions(InputError):
-    """A folder of pictures that cannot be scored; `lines` names each problem, at most `MOST_LINES` of them."""
-
-    def __init__(self, lines: Sequence[str]) -> None:
-        super().__init__(lines[0] + (f" (and {len(lines) - 1} more)" if len(lines) > 1 else ""))
-        self.lines = [str(InputError(line)) for line in lines[:MOST_LINES]]
-        if len(lines) > MOST_LINES:
-            self.lines.append(f"and {len(lines) - MOST_LINES} more")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -52,7 +42,7 @@ def open_predictions(folder: Path, capture: Capture, *, info: Path | None = None
 
     Raises:
         InputError: info.json is wrong.
-        BadPredictions: a picture is missing, too much, of another size, or damaged.
+        Problems: a picture is missing, too much, of another size, or damaged.
     """
     brought = read_info(info or folder / "info.json", may_be_absent=info is None)
     views = evaluated_views(capture)
@@ -74,7 +64,7 @@ def open_predictions(folder: Path, capture: Capture, *, info: Path | None = None
     if len(bands) > 1:
         lines.append(f"{folder}: some pictures have alpha and some have none, expected all or none")
     if lines:
-        raise BadPredictions(lines)
+        raise Problems(lines)
     if bands == {3}:
         brought = replace(brought, alpha="none")
     code = hash_of([digest.hexdigest(), repr(brought), hash_sources(Path(__file__).parent)])[:16]

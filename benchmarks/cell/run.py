@@ -40,7 +40,6 @@ from benchmarks.cell.schema import (
     MethodFailed,
     Provenance,
     TrainingTime,
-    View,
     failed_result,
     prediction_path,
     read_cell,
@@ -185,11 +184,10 @@ def rescore_cell(cell: Cell) -> CellResult:
     """Recompute every quality from the stored predictions and write the result anew; costs stay as measured."""
     before = _finished(cell)
     capture = _capture_of(cell)
-    views = [View(split=view.split, camera=view.camera, frame=view.frame) for view in before.views]
-    scored = scored_views(cell, capture, views, alpha=before.has_alpha)
+    scored = scored_views(cell, capture, before.views, alpha=before.has_alpha)
     for old, new in zip(before.views, scored, strict=True):
         if old.prediction != new.prediction:
-            name = prediction_path(cell.folder, View(split=new.split, camera=new.camera, frame=new.frame))
+            name = prediction_path(cell.folder, new)
             raise InputError(f"{name}: altered since it was scored (SHA-256 differs from result.json)")
     recomputed = quality_summary(cell, capture, scored)
     names = {(row.split, row.region, row.metric) for row in recomputed}

@@ -129,12 +129,9 @@ class CellConfig:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class ViewScore:
+class ViewScore(View):
     """Scores of one image. `scores` maps (region, metric) to its value."""
 
-    split: str
-    camera: str
-    frame: int
     prediction: str  # SHA-256 of the pixels
     scores: dict[tuple[str, str], float]
 

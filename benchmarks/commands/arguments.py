@@ -19,6 +19,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_
 from ash.fields import Leaf, apply_overrides, changed, leaves, suggest
 from ash.files import InputError
 from benchmarks.aliases import OLD_FIELDS, OLD_SIZES
+from benchmarks.problems import Problems
 
 Command = Callable[[], int]  # Does its work, and returns the exit code.
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -86,6 +87,13 @@ CountIfAny = Annotated[int | None, whole(1)]
 Names = Annotated[tuple[str, ...], Argument(metavar="A,B", read=_names)]
 Folder = Annotated[Path, Argument(metavar="DIR")]
 File = Annotated[Path, Argument(metavar="FILE")]
+
+
+def refuse_all(problems: Problems) -> int:
+    """Print every problem in a line of its own; returns the exit code."""
+    for line in problems.lines:
+        print(f"ash-bench: {line}", file=sys.stderr)
+    return WRONG_INPUT
 
 
 def own_name() -> str:

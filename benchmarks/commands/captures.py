@@ -21,7 +21,9 @@ from benchmarks.commands.arguments import (
     Positional,
     Repeated,
     Seed,
+    refuse_all,
 )
+from benchmarks.problems import Problems
 
 if TYPE_CHECKING:
     from synth.scene import Scene, Take
@@ -191,17 +193,15 @@ class ImportCommand:
 
     def __call__(self) -> int:
         """Check the whole, then write it."""
-        from benchmarks.importing.footage import BadFootage, HeldOut, import_footage, read_footage
+        from benchmarks.importing.footage import HeldOut, import_footage, read_footage
         from benchmarks.importing.overlap import overlap_table
 
         test = HeldOut(cameras=self.test_cameras, frames=_first_and_last(self.test_frames))
         try:
             footage = read_footage(self.footage, cameras=self.cameras, test=test)
             capture, overlaps = import_footage(footage, self.out, name=self.name, least_iou=self.least_iou)
-        except BadFootage as error:
-            for line in error.lines:
-                print(f"ash-bench: {line}", file=sys.stderr)
-            return WRONG_INPUT
+        except Problems as problems:
+            return refuse_all(problems)
         print(overlap_table(overlaps))
         for name, split in capture.splits.items():
             print(f"{name}: {len(split.cameras)} cameras, {len(split.frames)} frames, {split.count} images")

@@ -38,13 +38,17 @@ class GateCommand:
 
     def __call__(self) -> int:
         """Judge today's code, make it the baseline, or accept a change."""
-        if self.accept is not None:
-            return self._accept(self.accept)
-        if self.because:
+        from ash.files import run_lock
+
+        if self.because and self.accept is None:
             raise InputError("--because goes with --accept ROW")
-        if self.init is not None:
-            return self._start(self.init)
-        return self._update() if self.update_baseline else self._judge()
+        self.out.mkdir(parents=True, exist_ok=True)
+        with run_lock(self.out):
+            if self.accept is not None:
+                return self._accept(self.accept)
+            if self.init is not None:
+                return self._start(self.init)
+            return self._update() if self.update_baseline else self._judge()
 
     def _start(self, method: str) -> int:
         from benchmarks.gate.starting import WORKFLOW, start

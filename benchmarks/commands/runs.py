@@ -14,7 +14,6 @@ from benchmarks.commands.arguments import (
     DONE,
     FAILED,
     INTERRUPTED,
-    WRONG_INPUT,
     Argument,
     Count,
     CountIfAny,
@@ -24,9 +23,11 @@ from benchmarks.commands.arguments import (
     Positional,
     Repeated,
     Seed,
+    refuse_all,
     typed,
 )
 from benchmarks.commands.devices import CPU, DeviceName, DeviceNameIfAny, chosen_device, gpus_for, on_device
+from benchmarks.problems import Problems
 
 if TYPE_CHECKING:
     from benchmarks.suites.runs import Run as RunOnDisk
@@ -321,7 +322,6 @@ class ScoreCommand:
         """One cell of brought pictures."""
         from ash.capture.formats import load_capture
         from ash.files import require_plain
-        from benchmarks.cell.predictions import BadPredictions
         from benchmarks.cell.registry import BROUGHT
         from benchmarks.cell.run import run_cell
         from benchmarks.cell.schema import write_config
@@ -344,10 +344,8 @@ class ScoreCommand:
         )
         try:
             cell = cell_for(spec, self.capture, self.out, info=self.info)
-        except BadPredictions as error:
-            for line in error.lines:
-                print(f"ash-bench: {line}", file=sys.stderr)
-            return WRONG_INPUT
+        except Problems as problems:
+            return refuse_all(problems)
         write_config(cell)
         return _tell(cell.folder, run_cell(cell))
 

@@ -2,12 +2,12 @@
 
 import shutil
 import subprocess
+from functools import partial
 from pathlib import Path
 
 from ash.files import InputError
-from benchmarks.cell.run import evaluate_cell
 from benchmarks.cell.schema import Cell, CellResult, result_of
-from benchmarks.gate.baseline import Entry, frozen_cell
+from benchmarks.gate.baseline import Entry, drawn_again
 from benchmarks.gate.checks import Check
 from benchmarks.gate.statistical import least_times, time_checks
 
@@ -42,12 +42,12 @@ def checkout_of(revision: str, out: Path) -> Path:
     return tree
 
 
-def interleaved(row: str, entry: Entry, capture: Path, identity: str, out: Path, tree: Path) -> list[Check]:
-    """Times of a frozen avatar, drawn in turn by another checkout and by this code."""
+def interleaved(row: str, entry: Entry, here: Cell, out: Path, tree: Path) -> list[Check]:
+    """Times of a baseline's avatar, drawn in turn by another checkout and by this code; `here`: see `drawn_again`."""
     before, after = [], []
     for _ in range(ROUNDS):
-        before.append(_drawn_by(tree, frozen_cell(entry, capture, identity, out / "against")))
-        after.append(evaluate_cell(frozen_cell(entry, capture, identity, out)))
+        before.append(drawn_again(entry, here, out / "against", partial(_drawn_by, tree)))
+        after.append(drawn_again(entry, here, out))
     least = [least_times(r.timing for r in results if r.timing is not None) for results in (before, after)]
     return time_checks(row, *least)
 

@@ -7,34 +7,34 @@
 - `gate.json`: the least times of these avatars, and the changes that were accepted.
 """
 
-import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 from ash.capture.typed import from_json
 from ash.files import InputError, open_regular, read_json, write_atomic, write_json
 from benchmarks.cell.evaluation import spread
 from benchmarks.cell.registry import is_oracle
+from benchmarks.cell.run import evaluate_cell
 from benchmarks.cell.schema import (
     CHECKPOINT,
     Cell,
     CellConfig,
     CellResult,
-    View,
+    ViewScore,
+    is_trained,
     prediction_path,
     printable,
-    read_cell,
     result_of,
     write_config,
     write_result,
 )
 from benchmarks.provenance import commit
-from benchmarks.suites.runs import RUN_FILE, Run, description_of, read_run
+from benchmarks.suites.archive import numbers_of
+from benchmarks.suites.runs import Run, read_run
 
 FILE = "gate.json"
 LOG_LINES = 16  # of a training log
@@ -157,10 +157,10 @@ def write_baseline(folder: Path, suite: Path, run: Run, file: GateFile) -> None:
     if folder.exists() and any(folder.iterdir()) and not (folder / FILE).exists():
         raise InputError(f"{folder}: expected a baseline, an empty folder or none")
     with _replacing(folder) as made:
+        for name, content in numbers_of(run):
+            write_atomic(made / name, content)
         for entries in rows.values():
-            _write_cells(entries, made)
-        keys = [entry.cell.config.key for entries in rows.values() for entry in entries]
-        write_json(made / RUN_FILE, description_of(run) | {"cells": keys, "command": ""})
+            _write_first(entries[0], made / "cells" / entries[0].cell.config.key)
         write_atomic(made / f"{suite.stem}.toml", suite.read_bytes())
         write_json(made / FILE, asdict(file))
 
@@ -169,8 +169,14 @@ def write_baseline(folder: Path, suite: Path, run: Run, file: GateFile) -> None:
 def _replacing(folder: Path) -> Iterator[Path]:
     """A new folder beside `folder`, which takes its place when the body is done."""
     made, old = (folder.with_name(f".{folder.name}.{what}") for what in ("new", "old"))
-    for path in (made, old):
-        shutil.rmtree(path, ignore_errors=True)
+
+    def tidy() -> None:
+        if old.exists() and not folder.exists():  # Something ended this between the two renames.
+            old.rename(folder)
+        for path in (made, old):
+            shutil.rmtree(path, ignore_errors=True)
+
+    tidy()
     made.mkdir(parents=True)
     try:
         yield made
@@ -178,36 +184,26 @@ def _replacing(folder: Path) -> Iterator[Path]:
             folder.rename(old)
         made.rename(folder)
     finally:
-        for path in (made, old):
-            shutil.rmtree(path, ignore_errors=True)
+        tidy()
 
 
-def _write_cells(entries: Sequence[Entry], made: Path) -> None:
-    """The cells of a row: numbers of all, and the avatar of the first."""
-    for entry in entries:
-        folder = made / "cells" / entry.cell.config.key
-        # Of a capture's folder the name says enough: it is searched where captures are kept.
-        told = {"capture_folder": entry.cell.capture_folder.resolve().name}
-        _write_compact(folder / "config.json", read_json(entry.cell.folder / "config.json") | told)
-        _write_compact(folder / "result.json", read_json(entry.cell.folder / "result.json"))
-    first = entries[0]
-    folder = made / "cells" / first.cell.config.key
+def _write_first(first: Entry, folder: Path) -> None:
+    """Of the first seed of a row the beginning of its log, the avatar and some of its pictures."""
     if (log := first.cell.folder / "log.jsonl").exists():
         with open_regular(log, most=LARGEST_LOG) as file:
             write_atomic(folder / "log.jsonl", b"".join(islice(file, LOG_LINES)))
-    checkpoint = first.cell.folder / CHECKPOINT
-    kept = checkpoint.exists() and checkpoint.stat().st_size <= LARGEST_CHECKPOINT
-    if kept and not is_oracle(first.cell.config.method):  # An oracle's rendering is its method's.
-        shutil.copyfile(checkpoint, folder / CHECKPOINT)
-        for view in stored_views(first.result):
-            source = prediction_path(first.cell.folder, view)
-            target = prediction_path(folder, view)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, target)
+    if keeps_avatar(first.cell):
+        names = [Path(CHECKPOINT), *(prediction_path(Path(), view) for view in stored_views(first.result))]
+        for name in names:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(first.cell.folder / name, folder / name)
 
 
-def _write_compact(path: Path, content: Any) -> None:
-    write_atomic(path, json.dumps(content, sort_keys=True, allow_nan=False, separators=(",", ":")).encode())
+def keeps_avatar(cell: Cell) -> bool:
+    """Whether a baseline keeps the avatar of a row's first cell; the rendering of an oracle is its method's."""
+    checkpoint = cell.folder / CHECKPOINT
+    kept = is_trained(cell) and checkpoint.stat().st_size <= LARGEST_CHECKPOINT
+    return kept and not is_oracle(cell.config.method)
 
 
 def with_row(baseline: Baseline, row: str, entries: Sequence[Entry], because: str) -> tuple[Run, tuple[Accepted, ...]]:
@@ -218,25 +214,25 @@ def with_row(baseline: Baseline, row: str, entries: Sequence[Entry], because: st
     return replace(read_run(baseline.folder), cells=cells), (*baseline.file.accepted, told)
 
 
-def stored_views(result: CellResult) -> list[View]:
+def stored_views(result: CellResult) -> list[ViewScore]:
     """The views whose pictures a baseline keeps: `PICTURES` of each split, spread evenly."""
-    views = [View(split=v.split, camera=v.camera, frame=v.frame) for v in result.views]
-    by_split = [[view for view in views if view.split == split] for split in dict.fromkeys(v.split for v in views)]
+    by_split = [[v for v in result.views if v.split == split] for split in dict.fromkeys(v.split for v in result.views)]
     return [of_one[index] for of_one in by_split for index in spread(len(of_one), PICTURES)]
 
 
-def is_frozen(entry: Entry) -> bool:
-    """Whether the baseline has the avatar of a cell."""
-    return (entry.cell.folder / CHECKPOINT).is_file()
+def drawn_again(entry: Entry, here: Cell, out: Path, draw: Callable[[Cell], CellResult] = evaluate_cell) -> CellResult:
+    """The result of a baseline's avatar, copied to `out` and drawn by today's code, or by `draw`.
 
+    `here`: a cell of the same row on this machine, whose capture is drawn; it may be rounded by another processor.
 
-def frozen_cell(entry: Entry, capture_folder: Path, identity: str, out: Path) -> Cell:
-    """A copy of a baseline's cell in `out`, on this machine's capture, for today's code to draw."""
+    Raises:
+        InputError: the avatar cannot be drawn.
+    """
     folder = out / entry.cell.config.key
     shutil.rmtree(folder, ignore_errors=True)
-    config = replace(entry.cell.config, capture=identity)
-    cell = replace(entry.cell, folder=folder, config=config, capture_folder=capture_folder)
+    config = replace(entry.cell.config, capture=here.config.capture)
+    cell = Cell(config=config, folder=folder, capture_folder=here.capture_folder)
     write_config(cell)
     write_result(folder, replace(entry.result, config=config))
     shutil.copyfile(entry.cell.folder / CHECKPOINT, folder / CHECKPOINT)
-    return read_cell(folder)
+    return draw(cell)

@@ -16,10 +16,9 @@ import numpy as np
 
 from ash.capture.dataset import Capture
 from ash.files import open_regular
-from benchmarks.cell import metrics
-from benchmarks.cell.evaluation import image_summary, scored_views
+from benchmarks.cell.evaluation import agreement, image_summary, scored_views
 from benchmarks.cell.metrics import METRICS
-from benchmarks.cell.schema import Cell, CellResult, View, ViewScore, stored_prediction
+from benchmarks.cell.schema import Cell, CellResult, View, stored_prediction
 from benchmarks.gate.baseline import LARGEST_LOG, LOG_LINES, Entry, stored_views
 from benchmarks.gate.checks import GATED, Check, Verdict, of_exact_change
 
@@ -68,9 +67,7 @@ def worst_picture(before: Cell, after: Cell, result: CellResult, capture: Captur
     for view in stored_views(result):
         old, new = (stored_prediction(cell, capture, view) for cell in (before, after))
         if not np.array_equal(old, new):
-            region = metrics.foreground(old) | metrics.foreground(new)
-            psnr = metrics.psnr(new[..., :3], old[..., :3], region if region.any() else None)
-            found.append(Worst(view=view, before=old, after=new, psnr=psnr))
+            found.append(Worst(view=view, before=old, after=new, psnr=agreement(new, old)))
     return min(found, key=lambda each: each.psnr, default=None)
 
 
@@ -158,5 +155,5 @@ def equal_seeds(row: str, entries: Sequence[Entry]) -> Check | None:
     return Check(row=row, layer="training", name="seeds", verdict="worse", detail=detail)
 
 
-def _place(view: View | ViewScore) -> str:
+def _place(view: View) -> str:
     return f"{view.split.replace('_', ' ')}, {view.camera}, frame {view.frame}"

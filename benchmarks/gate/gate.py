@@ -16,10 +16,9 @@ from pathlib import Path
 
 from ash.capture.formats import load_capture
 from ash.files import InputError
-from benchmarks.cell.run import evaluate_cell
 from benchmarks.cell.schema import Cell, CellResult, result_of
 from benchmarks.gate.against import interleaved
-from benchmarks.gate.baseline import Baseline, Entry, frozen_cell, is_frozen, row_of
+from benchmarks.gate.baseline import Baseline, Entry, drawn_again, keeps_avatar, row_of
 from benchmarks.gate.checks import Check
 from benchmarks.gate.exact import (
     Worst,
@@ -30,6 +29,7 @@ from benchmarks.gate.exact import (
     worst_picture,
 )
 from benchmarks.gate.statistical import (
+    Pairs,
     Quality,
     count_checks,
     judge_quality,
@@ -39,14 +39,12 @@ from benchmarks.gate.statistical import (
     training_time,
 )
 from benchmarks.provenance import processor_name
-from benchmarks.suites.captures import make_capture, require_intact
 from benchmarks.suites.progress import Progress
-from benchmarks.suites.runs import Run, RunOptions, cell_for, require_runnable, run_missing, write_run
+from benchmarks.suites.runs import Run, RunOptions, prepared, require_runnable, run_missing
 from benchmarks.suites.suites import Suite
 
 TRAINED = 2  # seeds of every row, so that a seed that is ignored is seen
 TIMED = 5  # drawings of a frozen avatar for a baseline's times; of a run one, and more while a time fails
-Pairs = dict[str, tuple[Sequence[Entry], Sequence[Entry]]]  # by row: before and after, seeds in order
 FROZEN = "frozen"  # folder of avatars that were drawn again
 
 
@@ -72,7 +70,7 @@ def judge(
         InputError: the suite has no row in common with the baseline.
     """
     seeds = max(len(entries) for entries in baseline.rows.values())
-    run, by_row = cells_of(suite.narrowed(seeds=max(seeds, 1)), options)
+    run, by_row = cells_of(suite.narrowed(seeds=seeds), options)
     shared = [row for row in baseline.rows if row in by_row]
     if not shared:
         raise InputError(
@@ -97,25 +95,17 @@ def judge(
         checks += _cost_checks(baseline, pairs, drawn, times)
     else:
         for row in drawn:
-            here = by_row[row][0].capture_folder
-            identity = by_row[row][0].config.capture
-            checks += interleaved(row, _first(baseline, row), here, identity, options.out / FROZEN, against)
+            checks += interleaved(row, _first(baseline, row), by_row[row][0], options.out / FROZEN, against)
     return Judgement(checks=tuple(checks), run=run, times=times, worst=worst)
 
 
 def cells_of(suite: Suite, options: RunOptions) -> tuple[Run, dict[str, list[Cell]]]:
     """The suite's captures, its run on disk, and its cells by row; nothing is trained."""
     require_runnable(suite, options)
-    folders = {spec: make_capture(spec, options.data, workers=options.workers) for spec in suite.captures}
-    for folder in folders.values():
-        require_intact(folder)
-    cells = [cell_for(spec, folders[spec.capture], options.out) for spec in suite.cells]
+    run = prepared(suite, options)
     by_row: dict[str, list[Cell]] = {}
-    for cell in cells:
+    for cell in run.cells:
         by_row.setdefault(row_of(cell.config), []).append(cell)
-    run = Run(folder=options.out, suite=suite.name, about=suite.about, command=options.command, cells=tuple(cells))
-    options.out.mkdir(parents=True, exist_ok=True)
-    write_run(run)
     return run, by_row
 
 
@@ -131,9 +121,8 @@ def times_of(entries: Mapping[str, Sequence[Entry]], out: Path) -> dict[str, dic
     for row, seeds in entries.items():
         first = seeds[0]
         times[row] = training_time(seeds)
-        if is_frozen(first):
-            identity = first.cell.config.capture
-            results = [_drawn_again(first, first.cell.capture_folder, identity, out / FROZEN) for _ in range(TIMED)]
+        if keeps_avatar(first.cell):
+            results = [drawn_again(first, first.cell, out / FROZEN) for _ in range(TIMED)]
             times[row] |= least_times(result.timing for result in results if result.timing is not None)
         progress.finish(row)
     progress.close()
@@ -158,10 +147,6 @@ def _row_checks(baseline: Baseline, by_row: Mapping[str, Sequence[Cell]]) -> lis
     ]
 
 
-def _drawn_again(entry: Entry, capture_folder: Path, identity: str, out: Path) -> CellResult:
-    return evaluate_cell(frozen_cell(entry, capture_folder, identity, out))
-
-
 def _draw_frozen(
     baseline: Baseline,
     by_row: Mapping[str, Sequence[Cell]],
@@ -173,7 +158,7 @@ def _draw_frozen(
 
     Returns results of each: the one that was judged, then ever new ones, for times; and the worst pictures.
     """
-    frozen = [row for row in rows if is_frozen(_first(baseline, row))]
+    frozen, out = [row for row in rows if keeps_avatar(_first(baseline, row).cell)], options.out / FROZEN
     drawn: dict[str, Iterator[CellResult]] = {}
     worst: dict[str, Worst] = {}
     progress = Progress("frozen avatars", len(frozen), expected_s=15.0, workers=1)
@@ -186,26 +171,26 @@ def _draw_frozen(
             told = "the truth has other bytes here, rounded by another processor"
             checks.append(Check(row=row, layer="protocol", verdict="not judged", detail=told))
         try:
-            result = _drawn_again(entry, here.capture_folder, capture.identity, options.out / FROZEN)
+            result = drawn_again(entry, here, out)
         except InputError as error:
             told = f"the frozen avatar cannot be drawn any more: {error}"
             checks.append(Check(row=row, layer="rendering", verdict="worse", detail=told))
             continue
-        after = replace(entry.cell, folder=options.out / FROZEN / entry.cell.config.key)
+        after = replace(entry.cell, folder=out / entry.cell.config.key)
         found = worst_picture(entry.cell, after, entry.result, capture)
         if found is not None:
             worst[row] = found
         checks += rendering_checks(row, entry.result, result, found)
-        drawn[row] = _results(result, entry, here.capture_folder, capture.identity, options.out / FROZEN)
+        drawn[row] = _results(result, entry, here, out)
         progress.finish(row)
     progress.close()
     return drawn, worst
 
 
-def _results(first: CellResult, entry: Entry, capture: Path, identity: str, out: Path) -> Iterator[CellResult]:
+def _results(first: CellResult, entry: Entry, here: Cell, out: Path) -> Iterator[CellResult]:
     yield first
     while True:
-        yield _drawn_again(entry, capture, identity, out)
+        yield drawn_again(entry, here, out)
 
 
 def _train(

@@ -22,7 +22,7 @@ OTHER_TRAINING = 1.25  # ratio of the least training times, either way
 STAGE_FLOOR = 0.1  # stages below this share of the reference workload are noise
 MORE_MEMORY = 1.10
 
-Pairs = Mapping[str, tuple[Sequence[Entry], Sequence[Entry]]]  # by row: before and after, seeds in order
+Pairs = dict[str, tuple[Sequence[Entry], Sequence[Entry]]]  # by row: before and after, seeds in order
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

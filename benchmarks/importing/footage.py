@@ -36,8 +36,8 @@ from ash.capture.novelty import novelty_deg
 from ash.files import LIMITS, InputError, hash_of, open_regular, require_plain, write_image
 from benchmarks.importing.cameras import find_camera_file, read_any_cameras
 from benchmarks.importing.overlap import Overlap, template_overlaps
+from benchmarks.problems import Problems
 
-MOST_LINES = 100  # of problems that are listed
 MOST_FILES = 1 << 20  # of a camera
 PERSON = (0.5, 2.6)  # least and largest extent of a template, metres
 FARTHEST_CAMERA = 50.0  # from the person, metres
@@ -46,16 +46,6 @@ UNITS = {"centimetres": 100, "millimetres": 1000}
 NUMBERED = re.compile(r".*?(\d{1,9})\.(?:png|jpg|jpeg)", re.IGNORECASE)
 
 Files = dict[str, dict[int, Path]]  # by camera and frame
-
-
-class BadFootage(InputError):
-    """Footage that makes no capture; `lines` names each problem, at most `MOST_LINES` of them."""
-
-    def __init__(self, lines: Sequence[str]) -> None:
-        super().__init__(lines[0] + (f" (and {len(lines) - 1} more)" if len(lines) > 1 else ""))
-        self.lines = [str(InputError(line)) for line in lines[:MOST_LINES]]
-        if len(lines) > MOST_LINES:
-            self.lines.append(f"and {len(lines) - MOST_LINES} more")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -92,7 +82,7 @@ def read_footage(folder: Path, *, cameras: Path | None = None, test: HeldOut | N
 
     Raises:
         InputError: a part is missing or damaged, or its lengths are no metres.
-        BadFootage: cameras and pictures do not match, or pictures are missing.
+        Problems: cameras and pictures do not match, or pictures are missing.
     """
     skeleton = read_skeleton(folder / "skeleton.json")
     joints = len(skeleton.names)
@@ -106,7 +96,7 @@ def read_footage(folder: Path, *, cameras: Path | None = None, test: HeldOut | N
         masks, more = _pictures(folder / "masks", rig)
         problems += more
     if problems:
-        raise BadFootage(problems)
+        raise Problems(problems)
     frames = sorted(set().union(*images.values()))
     if frames[-1] >= len(motion.dofs):
         raise InputError(f"{folder}/images: frame {frames[-1]}, and motion.npz ends with {len(motion.dofs) - 1}")
@@ -126,7 +116,7 @@ def read_footage(folder: Path, *, cameras: Path | None = None, test: HeldOut | N
                 count = f"{len(missing)} of {len(frames)} frames are missing"
                 problems.append(f"{folder / what / name}: {count}, the first is {missing[0]}")
     if problems:
-        raise BadFootage(problems)
+        raise Problems(problems)
     return footage
 
 
@@ -140,7 +130,7 @@ def import_footage(
 
     Raises:
         InputError: `out` is not empty, or the name is not plain.
-        BadFootage: a picture is damaged or of another size, a mask is empty or full, or a camera's masks are elsewhere
+        Problems: a picture is damaged or of another size, a mask is empty or full, or a camera's masks are elsewhere
             than the template.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -159,11 +149,11 @@ def import_footage(
             except InputError as error:
                 problems.append(str(error))
         if problems:
-            raise BadFootage(problems)
+            raise Problems(problems)
         _write_parts(footage, made, scene)
         overlaps = template_overlaps(load_capture(made))
         if apart := [row for row in overlaps if row.iou < least_iou]:
-            raise BadFootage(
+            raise Problems(
                 [
                     f"{footage.folder}: camera {row.camera}: masks and posed template overlap by {row.iou:.2f} (IoU),"
                     f" expected {least_iou:g} or more: do its name, axes, units and frame numbers fit?"

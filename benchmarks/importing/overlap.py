@@ -8,8 +8,9 @@ import torch
 
 from ash.capture.dataset import Camera, Capture
 from ash.mesh.rasterizing import rasterize_mesh
+from benchmarks.cell.evaluation import spread
 from benchmarks.cell.metrics import foreground, silhouette_iou
-from synth.posing import dual_quaternion_skinning, skinning_transforms
+from synth.export.formats import posed_template
 
 FRAMES = 8  # of each camera, evenly taken
 
@@ -23,12 +24,6 @@ class Overlap:
     worst: float  # the least
     worst_frame: int
     offset_px: tuple[float, float]  # how far right and down of the template the mask's middle lies, mean over frames
-
-
-def posed_template(capture: Capture, frame: int) -> np.ndarray:
-    """Vertices `[v, 3]` in metres of the template as the skeleton alone moves it in a frame."""
-    transforms = skinning_transforms(capture.skeleton, capture.motion.dofs[[frame]])[0]
-    return dual_quaternion_skinning(capture.template.vertices, capture.template.skin_weights, transforms)
 
 
 def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
@@ -54,7 +49,10 @@ def template_overlaps(capture: Capture) -> list[Overlap]:
     for split in capture.splits.values():
         for camera, frame in split.views:
             frames.setdefault(camera, set()).add(frame)
-    chosen = {name: _spread(sorted(frames[name])) for name in capture.cameras if name in frames}
+    chosen = {}
+    for name in (name for name in capture.cameras if name in frames):
+        taken = sorted(frames[name])
+        chosen[name] = [taken[i] for i in spread(len(taken), FRAMES)]
     posed = {frame: posed_template(capture, frame) for frame in set().union(*chosen.values())}
     return [_overlap(capture, name, {frame: posed[frame] for frame in chosen[name]}) for name in chosen]
 
@@ -76,10 +74,6 @@ def _overlap(capture: Capture, name: str, posed: dict[int, np.ndarray]) -> Overl
         worst_frame=worst_frame,
         offset_px=(float(right), float(down)),
     )
-
-
-def _spread(frames: Sequence[int]) -> list[int]:
-    return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, FRAMES).round().astype(int))]
 
 
 def overlap_table(overlaps: Sequence[Overlap]) -> str:

@@ -27,11 +27,11 @@ from benchmarks.analysis.style import SPLIT_NAMES, style_of, titles_of
 from benchmarks.cell import metrics
 from benchmarks.cell.metrics import IMAGE_SPLITS, LPIPS_SCORES, METRICS, NOVELTY, VIEW_SCORES
 from benchmarks.cell.registry import is_oracle
-from benchmarks.cell.schema import BROUGHT_NOTE, Cell, CellResult, View, prediction_path, printable, result_of
+from benchmarks.cell.schema import BROUGHT_NOTE, Cell, CellResult, prediction_path, printable, result_of
 from benchmarks.report.escaping import csv_text
 from benchmarks.report.page import environment
 from benchmarks.suites.archive import LARGEST_PICTURE, PACK_FILE, unpacked
-from benchmarks.suites.runs import read_run
+from benchmarks.suites.runs import mixed_places, read_run
 from benchmarks.suites.verification import Kind, find_capture, verify_pack
 from synth.person.cast import VALIDATION
 
@@ -126,12 +126,8 @@ def _entries(number: int, source: Path, folder: Path, captures: Sequence[Path]) 
 
 def _places(entries: Sequence[Entry]) -> dict[str, str]:
     """The scene of each entry, by its name; scenes of one name that show different truths are told apart."""
-    shown: dict[tuple[str, int], set[str]] = {}
-    for entry in entries:
-        config = entry.cell.config
-        shown.setdefault((config.place, config.subject), set()).add(config.truth)
-    mixed = {place for (place, _), truths in shown.items() if len(truths) > 1}
     configs = {entry.name: entry.cell.config for entry in entries}
+    mixed = mixed_places(configs.values())
     return {
         name: f"{c.place} ({c.size}, {c.truth[:6]})" if c.place in mixed else c.place for name, c in configs.items()
     }
@@ -148,8 +144,7 @@ def _write_pictures(entries: Sequence[Entry], out: Path) -> tuple[set[str], dict
         identity = entry.cell.config.capture
         if entry.capture is not None and identity not in truths:
             truths[identity] = load_capture(entry.capture)
-        for scored in entry.result.views:
-            view = View(split=scored.split, camera=scored.camera, frame=scored.frame)
+        for view in entry.result.views:
             if (stored := prediction_path(entry.cell.folder, view)).is_file():
                 drawn.add(entry.name)
                 _write(prediction_path(out / "pictures" / entry.name, view), _pixels(stored)[..., :3])
@@ -260,9 +255,8 @@ def _machine(result: CellResult) -> str:
 def _cell(entry: Entry, place: str, pictures: set[str], truths: dict[str, str]) -> dict[str, Any]:
     config = entry.cell.config
     views = []
-    for scored in entry.result.views:
-        view = View(split=scored.split, camera=scored.camera, frame=scored.frame)
-        values = [scored.scores.get(name) for name in SCORES]
+    for view in entry.result.views:
+        values = [view.scores.get(name) for name in SCORES]
         shown = [None if value is None else float(f"{value:.5g}") for value in values]
         views.append([view.split, view.camera, view.frame, *shown])
     who = f", seed {config.seed}" + (f", {config.preset}" if config.preset else "")

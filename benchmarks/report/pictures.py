@@ -199,8 +199,7 @@ def _track(
 def compare(capture: Capture, shown: Sequence[Shown], view: ViewScore, *, with_errors: bool = True) -> Frames:
     """The comparison of several methods on one view, cropped to the subject, with FLIP errors below."""
     truth = metrics.on_black(capture.image(view.camera, view.frame))
-    place = View(split=view.split, camera=view.camera, frame=view.frame)
-    predictions = [stored_prediction(s.cell, capture, place) for s in shown]
+    predictions = [stored_prediction(s.cell, capture, view) for s in shown]
     crop = crop_of([truth, *predictions])
     ceiling = view.scores.get(("foreground", "noise_ceiling"))
     noise = "" if ceiling is None else f"noise ceiling {ceiling:.1f} dB"

@@ -21,7 +21,7 @@ from typing import Any
 from ash.capture.typed import from_json
 from ash.files import PACKED, PLAIN, InputError, disk_problem, open_regular, read_json, sha256_of
 from benchmarks.cell.metrics import IMAGE_SPLITS, PROTOCOL
-from benchmarks.cell.schema import CHECKPOINT, View, prediction_path, result_of
+from benchmarks.cell.schema import CHECKPOINT, prediction_path, result_of
 from benchmarks.provenance import commit, machine, versions
 from benchmarks.suites.runs import RUN_FILE, Run, description_of
 
@@ -51,7 +51,7 @@ class PackFile:
 
 def write_archive(run: Run, path: Path) -> None:
     """Write `run.json` and the `config.json` and `result.json` of every finished cell into a zip file."""
-    _write(path, _numbers(run))
+    _write(path, numbers_of(run))
 
 
 def write_pack(run: Run, path: Path) -> PackFile:
@@ -69,10 +69,9 @@ def write_pack(run: Run, path: Path) -> PackFile:
     pack = PackFile(schema=PACK_SCHEMA, protocol=PROTOCOL, files={}, checkpoints=checkpoints, **about)
 
     def entries() -> Iterator[tuple[str, bytes]]:
-        yield from _numbers(run)
+        yield from numbers_of(run)
         for cell, result in done:
-            for scored in result.views:
-                view = View(split=scored.split, camera=scored.camera, frame=scored.frame)
+            for view in result.views:
                 with open_regular(prediction_path(cell.folder, view), most=LARGEST_PICTURE) as file:
                     yield prediction_path(Path("cells") / result.config.key, view).as_posix(), file.read()
 
@@ -86,8 +85,10 @@ def write_pack(run: Run, path: Path) -> PackFile:
     return pack
 
 
-def _numbers(run: Run) -> Iterator[tuple[str, bytes]]:
-    """Of a capture's folder only the name is kept, of brought pictures none: where they lay says nothing to others."""
+def numbers_of(run: Run) -> Iterator[tuple[str, bytes]]:
+    """Name and content of `run.json` and of each finished cell's `config.json` and `result.json`.
+
+    Of a capture's folder only the name is kept, of brought pictures none: where they lay says nothing to others."""
     keys: list[str] = []
     for cell in run.cells:
         if (cell.folder / "result.json").exists():

@@ -4,7 +4,7 @@ import contextlib
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -156,6 +156,17 @@ def _require_importable(method: str, preset: str) -> None:
 
 
 def _run_suite(suite: Suite, options: RunOptions) -> Run:
+    run = prepared(suite, options)
+    run_missing(shard_of(run.cells, options.shard) if options.shard else run.cells, suite, options)
+    return run
+
+
+def prepared(suite: Suite, options: RunOptions) -> Run:
+    """The captures made, and the run with all its cells written down; none is run.
+
+    Raises:
+        InputError: a capture is damaged, or brought pictures cannot be scored.
+    """
     folders = {spec: make_capture(spec, options.data, workers=options.workers) for spec in suite.captures}
     for folder in folders.values():
         require_intact(folder)
@@ -170,7 +181,6 @@ def _run_suite(suite: Suite, options: RunOptions) -> Run:
         table=suite.table,
     )
     write_run(run)
-    run_missing(shard_of(cells, options.shard) if options.shard else cells, suite, options)
     return run
 
 
@@ -278,19 +288,6 @@ def read_run(folder: Path) -> Run:
     return Run(folder=folder, cells=cells, absent=absent, titles=titles, table=file.table, **names)
 
 
-def require_complete(run: Run) -> Run:
-    """The run, if every cell of it has a result.
-
-    Raises:
-        InputError: it was interrupted, or is one shard of several.
-    """
-    done = sum(result_of(cell) is not None for cell in run.cells)
-    if done < (total := len(run.cells) + len(run.absent)):
-        finish = f"; finish it with: {run.command}" if run.command else ""
-        raise InputError(f"{run.folder}: the run is incomplete, {done} of {total} cells have a result{finish}")
-    return run
-
-
 def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
     """The finished cells of several runs as one, to be reported in `out`; a cell that several have is taken once.
 
@@ -301,10 +298,7 @@ def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
     """
     runs = [read_run(folder) for folder in folders]
     cells = list({cell.config.key: cell for run in runs for cell in run.cells}.values())
-    shown: dict[tuple[str, int], set[str]] = {}
-    for cell in cells:
-        shown.setdefault((cell.config.place, cell.config.subject), set()).add(cell.config.truth)
-    mixed = {place for (place, _), truths in shown.items() if len(truths) > 1}
+    mixed = mixed_places(cell.config for cell in cells)
     if len({cell.config.subject >= VALIDATION for cell in cells}) > 1:
         raise InputError(
             f"{out}: people from {VALIDATION} on are there to choose by, expected a report without the others"
@@ -314,6 +308,14 @@ def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
     titles = {name: title for run in reversed(runs) for name, title in run.titles.items()}  # The first run's first.
     table = next((run.table for run in runs if run.table), ())
     return Run(folder=out, suite=out.name, about=about, command=command, cells=tuple(named), titles=titles, table=table)
+
+
+def mixed_places(configs: Iterable[CellConfig]) -> set[str]:
+    """Names of scenes that stand for different captures of one subject."""
+    shown: dict[tuple[str, int], set[str]] = {}
+    for config in configs:
+        shown.setdefault((config.place, config.subject), set()).add(config.truth)
+    return {place for (place, _), truths in shown.items() if len(truths) > 1}
 
 
 def require_for_choosing(run: Run) -> Run:

@@ -57,9 +57,7 @@ def export_colmap(capture: Capture, folder: Path, *, split: str = "train", frame
         images += [f"{index} " + " ".join(repr(float(v)) for v in pose) + f" {index} {name}.png", ""]
         write_image(folder / "images" / f"{name}.png", capture.image(name, frame))
     points = ["# POINT3D_ID X Y Z R G B ERROR TRACK"]
-    transforms = skinning_transforms(capture.skeleton, capture.motion.dofs[[frame]])[0]
-    posed = dual_quaternion_skinning(capture.template.vertices, capture.template.skin_weights, transforms)
-    for index, point in enumerate(posed, start=1):
+    for index, point in enumerate(posed_template(capture, frame), start=1):
         points.append(f"{index} " + " ".join(repr(float(v)) for v in point) + " 128 128 128 0")
     for name, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
         text = "\n".join(lines) + "\n"
@@ -67,6 +65,12 @@ def export_colmap(capture: Capture, folder: Path, *, split: str = "train", frame
     what = f"split {split}, frame {frame}, seen by {len(seeing)} of its {len(chosen.cameras)} cameras"
     _write_about(capture, folder, f"{what}; the points are the template's vertices, skinned to that frame")
     return folder
+
+
+def posed_template(capture: Capture, frame: int) -> np.ndarray:
+    """Vertices `[v, 3]` in metres of the template as the skeleton alone moves it in a frame."""
+    transforms = skinning_transforms(capture.skeleton, capture.motion.dofs[[frame]])[0]
+    return dual_quaternion_skinning(capture.template.vertices, capture.template.skin_weights, transforms)
 
 
 def _split(capture: Capture, name: str) -> Split:

@@ -325,12 +325,12 @@ def test_times_are_interleaved_with_another_checkout(
     launcher = tree / "ash-bench"
     launcher.write_text(f'#!/bin/sh\nexec {sys.executable} -m benchmarks.cli "$@"\n')
     launcher.chmod(0o755)
-    identity = entry.cell.config.capture
-    checks = against.interleaved("row", entry, capture, identity, tmp_path / "frozen", tree)
+    here = replace(entry.cell, capture_folder=capture)
+    checks = against.interleaved("row", entry, here, tmp_path / "frozen", tree)
     assert "time of frame" in {check.name for check in checks}
     launcher.write_text("#!/bin/sh\necho it broke >&2\nexit 1\n")
     with pytest.raises(InputError, match=r"tree cannot draw .*: it broke"):
-        against.interleaved("row", entry, capture, identity, tmp_path / "frozen", tree)
+        against.interleaved("row", entry, here, tmp_path / "frozen", tree)
     with pytest.raises(InputError, match="expected a revision that git knows"):
         against.checkout_of("no-such-revision", tmp_path)
 
