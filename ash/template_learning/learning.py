@@ -16,7 +16,7 @@ from ash.capture.dataset import Capture
 from ash.capture.formats import read_template_truth
 from ash.checkpoints import load_module, read_safetensors
 from ash.config import TemplateConfig
-from ash.devices import CPU
+from ash.devices import CPU, moved
 from ash.files import InputError, file_lock, hash_of, hash_sources, write_atomic
 from ash.template.graph import EmbeddedGraph
 from ash.template.template import (
@@ -138,7 +138,7 @@ def _track(
     graph: EmbeddedGraph, config: TemplateConfig, capture: Capture, device: torch.device
 ) -> tuple[Tracked, float]:
     start = time.perf_counter()
-    at_rest = _around(RestDeformation(capture.template), graph, config, capture).to(device)
+    at_rest = _around(RestDeformation(capture.template), moved(graph, CPU), config, capture).to(device)
     track = partial(track_images, graph=graph) if config.supervision == "images" else track_scans
     return track(capture, at_rest), time.perf_counter() - start
 
