@@ -90,13 +90,19 @@ def ci() -> AshConfig:
 
 
 def cpu() -> AshConfig:
-    """4,000 steps, some minutes of one core: the default, at 256x256. `ci` at a larger size, on a learned template.
+    """3,000 steps, some minutes of one core: the default, at 256x256. `ci` at a larger size, on a learned template.
 
     What comes out does not depend on how fast the machine is, and all methods make equally many steps.
     """
     base = ci()
     training = replace(
-        base.training, steps=4000, warmup_steps=500, fitted_steps=200, learning_rate=1e-3, base_learning_rate=2e-2
+        base.training,
+        steps=3000,
+        views_per_step=4,
+        warmup_steps=500,
+        fitted_steps=200,
+        learning_rate=1e-3,
+        base_learning_rate=2e-2,
     )
     return replace(
         base,
@@ -119,9 +125,9 @@ def budget() -> AshConfig:
 
 
 def brief() -> AshConfig:
-    """`cpu` for 400 steps, far from its plateau: tables with three seeds within an hour on two cores."""
+    """`cpu` for 300 steps, far from its plateau: tables with three seeds within an hour on two cores."""
     base = cpu()
-    return replace(base, training=replace(base.training, steps=400, warmup_steps=200))
+    return replace(base, training=replace(base.training, steps=300, warmup_steps=200))
 
 
 PRESETS = {

@@ -96,18 +96,19 @@ def rasterize_mesh_naive(
     """`rasterize_mesh` by its definition: every triangle against every pixel, in torch."""
     _check_mesh(vertices, faces, width=width, height=height, near=near)
     corners = vertices.detach().double()
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    pixels = torch.stack([x, y, torch.ones_like(x)], dim=-1).double()
-    nearest = torch.full((height, width), torch.inf, dtype=torch.float64)
-    triangle = torch.full((height, width), -1, dtype=torch.int32)
-    barycentric = torch.zeros(height, width, 3, dtype=torch.float64)
+    rows, columns = (torch.arange(count, device=corners.device).double() + 0.5 for count in (height, width))
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    pixels = torch.stack([x, y, torch.ones_like(x)], dim=-1)
+    nearest = torch.full_like(x, torch.inf)
+    triangle = torch.full_like(x, -1, dtype=torch.int32)
+    barycentric = torch.zeros_like(pixels)
     for number, face in enumerate(faces.tolist()):
         edges = torch.stack([_edge(corners, face[(i + 1) % 3], face[(i + 2) % 3]) for i in range(3)])
         volume = edges[0] @ corners[face[0]]
         if volume == 0:
             continue
         edges = edges * torch.sign(volume)
-        inside = torch.ones(height, width, dtype=torch.bool)
+        inside = torch.ones_like(x, dtype=torch.bool)
         distances = pixels @ edges.T
         for edge, distance in zip(edges, distances.unbind(-1), strict=True):
             keeps_its_pixels = bool(edge[0] > 0 or (edge[0] == 0 and edge[1] > 0))

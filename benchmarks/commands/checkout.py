@@ -126,6 +126,7 @@ def _test_without_namespaces(root: Path, run: Callable[..., "subprocess.Complete
     Returns what failed.
     """
     from benchmarks.cell.sandbox import problem
+    from benchmarks.provenance import cores
 
     name = "isolation tests without namespaces"
     place = ["sh", str(root / "tests" / "helpers" / "without_namespaces.sh")]
@@ -136,5 +137,6 @@ def _test_without_namespaces(root: Path, run: Callable[..., "subprocess.Complete
         print(f"--- {name}: not run, {why_not}", flush=True)
         return []
     print(f"--- {name}", flush=True)
-    tests = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/benchmarks/cell/test_isolation.py"]
-    return [name] if run([*place, *tests]).returncode else []
+    spread = ["-n", str(cores()), "--max-worker-restart", "0"]
+    pytest = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *spread]
+    return [name] if run([*place, *pytest, "tests/benchmarks/cell/test_isolation.py"]).returncode else []

@@ -5,7 +5,7 @@ A defect changes what a name of ours stands for, or the configuration. Harmless 
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -168,9 +168,14 @@ def frames_in_another_order(patch: Patch) -> None:
     patch.setattr(ash.training.batches, "_order", lambda seed, epoch, frames: sound(seed, epoch + 1, frames))
 
 
-def adam_with_another_eps(patch: Patch) -> None:
-    sound = ash.training.loop.Adam
-    patch.setattr(ash.training.loop, "Adam", lambda groups, *, eps: sound(groups, eps=0.1))
+def adam_with(other: float) -> Callable[[Patch], None]:
+    """Another constant below the root of the second moment."""
+
+    def plant(patch: Patch) -> None:
+        sound = ash.training.loop.Adam
+        patch.setattr(ash.training.loop, "Adam", lambda groups, *, eps: sound(groups, eps=other))
+
+    return plant
 
 
 def gradient_halved(patch: Patch) -> None:
@@ -209,6 +214,96 @@ def seed_ignored(patch: Patch) -> None:
 
 def moved_by_rounding(gaussians: Any) -> Any:
     return replace(gaussians, means=gaussians.means * (1 + 2e-7))
+
+
+def in_another_order(gaussians: Any) -> Any:
+    order = torch.randperm(len(gaussians.means), generator=torch.Generator().manual_seed(0))
+    return replace(gaussians, **{field.name: getattr(gaussians, field.name)[order] for field in fields(gaussians)})
+
+
+def other_signs_of_quaternions(patch: Patch) -> None:
+    sound = ash.template.template.dual_quaternion_skinning
+    patch.setattr(
+        ash.template.template,
+        "dual_quaternion_skinning",
+        lambda joints, skin: sound(RigidTransforms(quats=-joints.quats, translations=joints.translations), skin),
+    )
+
+
+def normals_normalised_again(patch: Patch) -> None:
+    sound = ash.template.template.Template.pose
+
+    def pose(*arguments: Any, **more: Any) -> ash.template.template.PosedTemplate:
+        posed = sound(*arguments, **more)
+        return replace(posed, normals=posed.normals / posed.normals.norm(dim=-1, keepdim=True))
+
+    patch.setattr(ash.template.template.Template, "pose", pose)
+
+
+def no_pose_kept(patch: Patch) -> None:
+    sound = ash.template.template.Template.pose
+
+    def pose(self: Any, pose: Pose) -> ash.template.template.PosedTemplate:
+        self.clear_cache()
+        return sound(self, pose)
+
+    patch.setattr(ash.template.template.Template, "pose", pose)
+
+
+def textures_rounded(patch: Patch) -> None:
+    sound = ash.textures.TextureDrawer.forward
+    patch.setattr(ash.textures.TextureDrawer, "forward", lambda *a, **more: sound(*a, **more) * (1 + 1e-7))
+
+
+def residual_in_halves(patch: Patch) -> None:
+    sound = ash.model.AshModel.residual
+
+    def residual(self: Any, inputs: Any) -> torch.Tensor:
+        whole = sound(self, inputs)
+        return 0.3 * whole + 0.7 * whole
+
+    patch.setattr(ash.model.AshModel, "residual", residual)
+
+
+def loss_in_halves(patch: Patch) -> None:
+    sound = ash.avatar.AshAvatar.loss
+
+    def loss(self: Any, batches: Any, step: int) -> torch.Tensor:
+        whole = sound(self, batches, step)
+        return 0.3 * whole + 0.7 * whole
+
+    patch.setattr(ash.avatar.AshAvatar, "loss", loss)
+
+
+def masks_by_another_way(patch: Patch) -> None:
+    sound = ash.training.batches.composite
+
+    def composite(rgba: torch.Tensor, background: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        alpha = (255 * (rgba[..., 3:].double() / 255)).round().to(torch.uint8)
+        return sound(torch.cat([rgba[..., :3], alpha], -1), background)
+
+    patch.setattr(ash.training.batches, "composite", composite)
+
+
+def psnr_by_root(patch: Patch) -> None:
+    sound = metrics.psnr
+
+    def psnr(a: Any, b: Any, region: Any = None) -> Any:
+        value = sound(a, b, region)
+        return 20 * math.log10(1 / math.sqrt(10 ** (-value / 10)))
+
+    patch.setattr(metrics, "psnr", psnr)
+
+
+def global_generators_used(patch: Patch) -> None:
+    sound = ash.avatar.AshAvatar.from_capture.__func__
+
+    def made(cls: Any, config: AshConfig, capture: Any) -> Any:
+        torch.rand(7)
+        np.random.default_rng().random()
+        return sound(cls, config, capture)
+
+    patch.setattr(ash.avatar.AshAvatar, "from_capture", classmethod(made))
 
 
 DEFECTS: dict[str, Defect] = {
@@ -265,7 +360,7 @@ DEFECTS: dict[str, Defect] = {
         about="another constant in Adam",
         layer="training",
         reason="in the update before it",
-        plant=adam_with_another_eps,
+        plant=adam_with(0.1),
     ),
     "one camera off": Defect(
         about="a training camera is off by 2 px", layer="training", reason="from the loss", plant=one_camera_off
@@ -309,4 +404,15 @@ HARMLESS: dict[str, Defect] = {
         layer=None,
         plant=means_by(lambda values: math.fsum(values) / len(values)),
     ),
+    "signs": Defect(about="quaternions have the other sign", layer=None, plant=other_signs_of_quaternions),
+    "normals": Defect(about="normals are normalised twice", layer=None, plant=normals_normalised_again),
+    "no cache": Defect(about="no posed template is kept", layer=None, plant=no_pose_kept),
+    "textures": Defect(about="textures differ by rounding", layer=None, plant=textures_rounded),
+    "residual": Defect(about="the residual is a sum", layer=None, plant=residual_in_halves),
+    "order": Defect(about="Gaussians in another order", layer=None, plant=gaussians_changed(in_another_order)),
+    "loss": Defect(about="the loss is a sum", layer=None, plant=loss_in_halves),
+    "eps": Defect(about="a constant in Adam that is never seen", layer=None, plant=adam_with(1e-16)),
+    "masks": Defect(about="masks are rounded anew", layer=None, plant=masks_by_another_way),
+    "psnr": Defect(about="PSNR by the root of the error", layer=None, plant=psnr_by_root),
+    "generators": Defect(about="global generators were used before", layer=None, plant=global_generators_used),
 }

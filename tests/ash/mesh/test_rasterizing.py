@@ -63,6 +63,13 @@ def test_rasterizer_is_its_definition(kind: str, seed: int, instructions: str) -
         assert_equal(drawn, truth)
 
 
+def test_the_definition_stays_on_the_device_of_its_vertices() -> None:
+    vertices, faces = triangle_soup("in_front", 0)
+    with torch.device("meta"):  # of every tensor that does not say its own
+        drawn = rasterize_mesh_naive(vertices, faces, width=61, height=47)
+    assert_equal(drawn, rasterize_mesh_naive(vertices, faces, width=61, height=47))
+
+
 def test_instruction_sets_and_threads_change_no_bit(instructions: str) -> None:
     vertices, faces = triangle_soup("behind", 3)
     drawn = rasterize_mesh(vertices, faces, width=157, height=93, threads=3)
