@@ -31,7 +31,8 @@ class GateCommand:
     junit: File | None = None  # write the checks there as JUnit
     update_baseline: bool = False  # make today's code the new baseline
     history: Folder | None = None  # append the run to this folder's history, and write its page of charts
-    against: str | None = None  # a revision of this checkout: times are interleaved with its code
+    # a revision of the repository that --method-path lies in, else of this checkout: draws in turn with today's code
+    against: str | None = None
     init: str | None = None  # package.module:factory: write gate/NAME.toml, its baseline and a GitHub workflow here
     accept: str | None = None  # a row of the last comparison, as it is printed: make what it is now its baseline
     because: str = ""  # with --accept: why; shown from then on
@@ -60,8 +61,8 @@ class GateCommand:
 
     def _judge(self) -> int:
         from ash.files import write_atomic
-        from benchmarks.gate.against import checkout_of
-        from benchmarks.gate.baseline import read_baseline
+        from benchmarks.gate.against import revision_of
+        from benchmarks.gate.baseline import keeps_avatar, read_baseline
         from benchmarks.gate.checks import FAILING, outcome
         from benchmarks.gate.gate import judge
         from benchmarks.gate.history import append
@@ -73,8 +74,12 @@ class GateCommand:
         suite = read_suite(baseline.suite)
         if self.suite is not None:
             self._require_own(baseline)
-        tree = None if self.against is None else checkout_of(self.against, self.out / "against")
-        judged = judge(baseline, suite, self._options(), minutes=self.minutes, against=tree)
+        revision = None
+        if self.against is not None:
+            cells = [entries[0].cell for entries in baseline.rows.values()]
+            drawn = dict.fromkeys(cell.config.source for cell in cells if keeps_avatar(cell))
+            revision = revision_of(self.against, drawn, self.out / "against")
+        judged = judge(baseline, suite, self._options(), minutes=self.minutes, against=revision)
         pictures = write_pictures(judged, self.out)
         print(terminal(baseline, judged, changed_since(baseline.commit)))
         for path in pictures:

@@ -6,18 +6,20 @@
 4. Quality, where 2 or 3 changed: scores in pairs of the same seed; seeds are added until the verdict is decided or the
    minutes are spent.
 5. Cost: counts of work; on a processor like the baseline's, peak memory and times. Times are those of the frozen
-   avatars, which take seconds to measure again, over a reference workload that is timed between the frames.
+   avatars, which take seconds to measure again, over a reference workload that is timed between the frames. Stored
+   times show only what is much slower; an earlier revision that draws in turn with today's code shows the rest.
 """
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from ash.capture.formats import load_capture
 from ash.files import InputError
 from benchmarks.cell.schema import Cell, CellResult, result_of
-from benchmarks.gate.against import interleaved
+from benchmarks.gate.against import Revision, interleaved
 from benchmarks.gate.baseline import Baseline, Entry, drawn_again, keeps_avatar, row_of
 from benchmarks.gate.checks import Check
 from benchmarks.gate.exact import (
@@ -44,7 +46,7 @@ from benchmarks.suites.runs import Run, RunOptions, prepared, require_runnable, 
 from benchmarks.suites.suites import Suite
 
 TRAINED = 2  # seeds of every row, so that a seed that is ignored is seen
-TIMED = 5  # drawings of a frozen avatar for a baseline's times; of a run one, and more while a time fails
+TIMED = 5  # drawings of a frozen avatar for a baseline's times; of a run one, and more while a time has risen
 FROZEN = "frozen"  # folder of avatars that were drawn again
 
 
@@ -59,12 +61,12 @@ class Judgement:
 
 
 def judge(
-    baseline: Baseline, suite: Suite, options: RunOptions, *, minutes: float, against: Path | None = None
+    baseline: Baseline, suite: Suite, options: RunOptions, *, minutes: float, against: Revision | None = None
 ) -> Judgement:
     """Run what is needed of a suite, and compare it with the baseline.
 
-    `minutes`: clock time that trainings beyond the first two seeds of a row may take. `against`: a checkout of other
-    code, with which times are interleaved in place of those of the baseline.
+    `minutes`: clock time that trainings beyond the first two seeds of a row may take. `against`: an earlier
+    revision that draws in turn with today's code; its times take the place of those of the baseline.
 
     Raises:
         InputError: the suite has no row in common with the baseline.
@@ -91,11 +93,12 @@ def judge(
     for row, (before, entries) in pairs.items():
         checks += count_checks(row, before[0].result, entries[0].result)
     times: dict[str, dict[str, float]] = {}
-    if against is None:
-        checks += _cost_checks(baseline, pairs, drawn, times)
-    else:
-        for row in drawn:
-            checks += interleaved(row, _first(baseline, row), by_row[row][0], options.out / FROZEN, against)
+    turns = {
+        row: partial(interleaved, row, _first(baseline, row), by_row[row][0], options.out / FROZEN, against)
+        for row in drawn
+        if against is not None and _first(baseline, row).cell.config.source in against.methods
+    }
+    checks += _cost_checks(baseline, pairs, drawn, turns, times)
     return Judgement(checks=tuple(checks), run=run, times=times, worst=worst)
 
 
@@ -246,37 +249,41 @@ def _cost_checks(
     baseline: Baseline,
     pairs: Pairs,
     drawn: Mapping[str, Iterator[CellResult]],
+    turns: Mapping[str, Callable[[], tuple[list[Check], dict[str, float]]]],
     times: dict[str, dict[str, float]],
 ) -> list[Check]:
-    """Memory and times, where the processor is the baseline's; a time that fails is measured again.
+    """Times in turn with a revision, by `turns`; on a processor like the baseline's, memory and stored times as well.
 
-    `times`: receives the least times of each row.
+    A stored time that is not unchanged is measured again. `times`: receives the least times of each row.
     """
-    if (here := processor_name()) != baseline.file.machine:
-        told = f"memory and times: the baseline was made on {baseline.file.machine}, this run on {here}"
-        return [Check(row="", layer="cost", verdict="not judged", detail=told)]
     checks = []
+    for row, turn in turns.items():
+        timed, times[row] = turn()
+        checks += timed
+    if (here := processor_name()) != baseline.file.machine:
+        told = f"memory and stored times: the baseline was made on {baseline.file.machine}, this run on {here}"
+        return [*checks, Check(row="", layer="cost", verdict="not judged", detail=told)]
     for row, (before, after) in pairs.items():
         checks.append(memory_check(row, before, after))
-        old = baseline.file.times.get(row, {})
-        if row in drawn:
-            timed, times[row] = _times_again(row, old, training_time(after), drawn[row])
+        old, training = baseline.file.times.get(row, {}), training_time(after)
+        if row in drawn and row not in turns:
+            timed, times[row] = _times_again(row, old, training, drawn[row])
             checks += timed
         else:
-            checks += time_checks(row, old, training_time(after))
+            checks += time_checks(row, old, training, stored=True)
     return checks
 
 
 def _times_again(
     row: str, old: Mapping[str, float], training: Mapping[str, float], results: Iterator[CellResult]
 ) -> tuple[list[Check], dict[str, float]]:
-    """The checks of times, after up to `2 * TIMED` more drawings where one fails, and the times."""
+    """The checks of stored times, after up to `2 * TIMED` more drawings where one is not unchanged, and the times."""
     timings = []
     for _ in range(1 + 2 * TIMED):
         timing = next(results).timing
         timings += [timing] if timing is not None else []
         times = {**least_times(timings), **training}
-        checks = time_checks(row, old, times)
-        if not any(check.verdict == "worse" and not check.name.endswith("training") for check in checks):
+        checks = time_checks(row, old, times, stored=True)
+        if all(check.verdict == "unchanged" for check in checks if check.name != "time of training"):
             break
     return checks, times

@@ -1,6 +1,7 @@
 """The gate: what it compares, what it says, and what it refuses."""
 
 import json
+import os
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -17,6 +18,7 @@ from markdown_it import MarkdownIt
 
 from ash.files import InputError, read_json, write_json
 from benchmarks import cli, provenance
+from benchmarks.cell.sandbox import METHOD_PATH
 from benchmarks.cell.schema import CHECKPOINT, Cell, CellResult, Summary, Timing, ViewScore
 from benchmarks.commands import arguments
 from benchmarks.gate import against, history, summary
@@ -162,25 +164,33 @@ def test_costs() -> None:
     assert memory_check(ROW, base, entries([25.0], mb=800.0)).verdict == "worse"
     old = least_times(e.result.timing for e in base if e.result.timing)
     assert old["frame"] == 2.0 and old["stg4"] == 1.0
-    for ms, verdict in ((12.0, "worse"), (11.0, "unchanged")):
+    for ms, in_turn, stored in ((5.0, "unchanged", "unchanged"), (11.0, "unchanged", "unchanged"),
+                                (11.5, "worse", "not judged"), (15.5, "worse", "not judged"),
+                                (16.5, "worse", "worse")):  # fmt: skip
         new = least_times(e.result.timing for e in entries([25.0], ms=ms) if e.result.timing)
-        checks = {check.name: check.verdict for check in time_checks(ROW, old, new)}
-        assert checks == {"time of frame": verdict, "time of stg4": verdict}, "stg1 is too short to be timed"
+        for told, verdict in ((False, in_turn), (True, stored)):
+            checks = {check.name: check.verdict for check in time_checks(ROW, old, new, stored=told)}
+            assert checks == {"time of frame": verdict, "time of stg4": verdict}, "stg1 is too short to be timed"
+    assert "--against REV does" in time_checks(ROW, {"frame": 2.0}, {"frame": 2.5}, stored=True)[0].detail
     times = training_time(base)
-    found = {f: time_checks(ROW, times, {"training": f * times["training"]})[0].verdict for f in (0.5, 1.1, 1.4)}
-    assert found == {0.5: "better than explained", 1.1: "unchanged", 1.4: "worse"}
+    found = [time_checks(ROW, times, {"training": f * times["training"]}, stored=True)[0] for f in (0.5, 1.1, 1.4, 1.7)]
+    assert [check.verdict for check in found] == ["unchanged", "unchanged", "not judged", "worse"]
+    assert "--against" not in found[2].detail, "trainings are not repeated in turn"
 
 
 @pytest.mark.parametrize(
-    ("quiet_at", "drawn", "verdict"), [(0, 1, "unchanged"), (3, 4, "unchanged"), (99, 11, "worse")]
+    ("quiet_at", "drawn", "slow_ms", "verdict"),
+    [(0, 1, 17.0, "unchanged"), (3, 4, 17.0, "unchanged"), (99, 11, 17.0, "worse"), (99, 11, 13.0, "not judged")],
 )
-def test_a_time_that_fails_is_measured_again_before_it_is_believed(quiet_at: int, drawn: int, verdict: str) -> None:
+def test_a_time_that_has_risen_is_measured_again_before_it_is_believed(
+    quiet_at: int, drawn: int, slow_ms: float, verdict: str
+) -> None:
     asked: list[int] = []
 
     def results() -> Iterator[CellResult]:
         while True:
             asked.append(1)
-            yield entry(0, 25.0, ms=10.0 if len(asked) > quiet_at else 15.0).result
+            yield entry(0, 25.0, ms=10.0 if len(asked) > quiet_at else slow_ms).result
 
     old = least_times([entry(0, 25.0).result.timing])
     checks, _ = _times_again(ROW, old, {}, results())
@@ -262,7 +272,7 @@ def test_a_method_in_another_repository(
     assert cli.main([*command, "--history", "history"]) == arguments.DONE
     told = capsys.readouterr().out
     assert "gate: passed, unchanged" in told
-    assert "not judged             cost: memory and times: the baseline was made on another" in told
+    assert "not judged             cost: memory and stored times: the baseline was made on another" in told
     assert (tmp_path / "history" / "index.html").read_text().count("<svg") == 2
 
     source.write_text(METHOD + "\nclass Dim(FakeAvatar):\n    def render(self, *args, **more):\n"
@@ -288,13 +298,20 @@ def test_a_method_in_another_repository(
 
 def test_a_gate_is_started_in_a_repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    fakes.use(tmp_path, monkeypatch)
-    suite = start("helpers.fakes:good", Path("gate"))
-    assert [row.of for row in read_suite(suite).methods] == ["helpers.fakes:good"]
+    fakes.use(tmp_path / "plugins", monkeypatch)
+    package = tmp_path / "src" / "started_here"
+    package.mkdir(parents=True)
+    (package / "avatar.py").write_text(METHOD)
+    monkeypatch.syspath_prepend(str(package.parent))
+    suite = start("started_here.avatar:mine", Path("gate"))
+    assert [row.of for row in read_suite(suite).methods] == ["started_here.avatar:mine"]
     workflow = (tmp_path / ".github/workflows/gate.yml").read_text()
-    assert "gate --baseline gate/baseline" in workflow and "{{ github.token }}" in workflow
+    assert "--method-path src gate --baseline gate/baseline" in workflow and "{{ github.token }}" in workflow
+    assert "--against ${{ github.event.pull_request.base.sha }}" in workflow and "fetch-depth: 0" in workflow
     with pytest.raises(InputError, match="is there already"):
-        start("helpers.fakes:good", Path("gate"))
+        start("started_here.avatar:mine", Path("gate"))
+    with pytest.raises(InputError, match="expected a module of the repository"):
+        start("helpers.fakes:good", Path("other"))
 
 
 def test_history_marks_a_step_with_its_commit_and_refuses_damage(tmp_path: Path) -> None:
@@ -314,25 +331,112 @@ def test_history_marks_a_step_with_its_commit_and_refuses_damage(tmp_path: Path)
             history.read(path)
 
 
-def test_times_are_interleaved_with_another_checkout(
-    base: Baseline, capture: Path, installed_fakes: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def git(folder: Path, *words: str) -> str:
+    who = ("-c", "user.name=a", "-c", "user.email=a@b")
+    return subprocess.run(["git", *who, *words], cwd=folder, check=True, capture_output=True, text=True).stdout
+
+
+def repository(folder: Path, module: str) -> Path:
+    """A git repository that holds a method."""
+    folder.mkdir()
+    (folder / f"{module}.py").write_text(METHOD)
+    git(folder, "init", "-q")
+    git(folder, "add", ".")
+    git(folder, "commit", "-qm", "the method")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("quiet_at", "rounds", "slow_ms", "verdict"),
+    [(0, 5, 11.5, "unchanged"), (6, 7, 11.5, "unchanged"), (99, 10, 11.5, "worse"), (99, 5, 20.0, "worse")],
+)
+def test_a_revision_and_today_draw_in_turns_and_longer_while_a_time_barely_fails(
+    quiet_at: int, rounds: int, slow_ms: float, verdict: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The other checkout is this one: what it draws is read back, and what it cannot draw is told."""
-    monkeypatch.setattr(against, "ROUNDS", 1)
+    drawn: list[str] = []
+
+    def draw(of: Entry, here: Cell, out: Path, by: object = None) -> CellResult:
+        drawn.append("before" if by else "today")
+        return entry(0, 25.0, ms=slow_ms if not by and drawn.count("today") <= quiet_at else 10.0).result
+
+    monkeypatch.setattr(against, "drawn_again", draw)
+    revision = against.Revision(name="r", command=(), method_path="", methods=frozenset())
+    old = entry(0, 25.0)
+    checks, times = against.interleaved(ROW, old, old.cell, Path(), revision)
+    assert {check.verdict for check in checks} == {verdict} and times["frame"] == (
+        slow_ms / 5 if verdict == "worse" else 2.0
+    )
+    turns = [drawn[2 * k : 2 * k + 2] for k in range(rounds)]
+    assert len(drawn) == 2 * rounds
+    assert turns[::2] == [["before", "today"]] * len(turns[::2])
+    assert turns[1::2] == [["today", "before"]] * len(turns[1::2])
+
+
+def test_what_a_revision_cannot_draw_is_not_judged(base: Baseline, capture: Path, tmp_path: Path) -> None:
+    """A change of the checkpoint's format, say, which comes with a baseline of its own."""
     entry = next(iter(base.rows.values()))[0]
-    tree = tmp_path / "tree"
-    tree.mkdir()
-    launcher = tree / "ash-bench"
-    launcher.write_text(f'#!/bin/sh\nexec {sys.executable} -m benchmarks.cli "$@"\n')
-    launcher.chmod(0o755)
-    here = replace(entry.cell, capture_folder=capture)
-    checks = against.interleaved("row", entry, here, tmp_path / "frozen", tree)
-    assert "time of frame" in {check.name for check in checks}
-    launcher.write_text("#!/bin/sh\necho it broke >&2\nexit 1\n")
-    with pytest.raises(InputError, match=r"tree cannot draw .*: it broke"):
-        against.interleaved("row", entry, here, tmp_path / "frozen", tree)
-    with pytest.raises(InputError, match="expected a revision that git knows"):
-        against.checkout_of("no-such-revision", tmp_path)
+    command = ("sh", "-c", "echo it broke >&2; exit 1")
+    revision = against.Revision(name="abc", command=command, method_path="", methods=frozenset())
+    (check,), _ = against.interleaved(ROW, entry, replace(entry.cell, capture_folder=capture), tmp_path, revision)
+    assert check.layer == "cost" and check.verdict == "not judged"
+    assert check.detail.startswith("--against: abc cannot draw") and check.detail.endswith(": it broke")
+
+
+def test_a_method_in_a_repository_of_its_own_is_timed_against_a_revision_of_it(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Unchanged, and twenty times slower with the same pictures. Only a factor above 5 fails: others may be at work."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(against, "ROUNDS", 1)
+    monkeypatch.setattr("benchmarks.gate.gate.TIMED", 1)
+    monkeypatch.setattr("benchmarks.gate.statistical.SLOWER", 5.0)
+    fakes.use(tmp_path / "plugins", monkeypatch)
+    source = repository(tmp_path / "theirs", "unhurried") / "unhurried.py"
+    suite = fakes.write_suite(tmp_path, capture, "unhurried:mine", name="gate")
+    command = ["--method-path", "theirs", "gate", "--baseline", "base"]
+    assert cli.main([*command, "--suite", str(suite), "--seeds", "2", "--update-baseline"]) == arguments.DONE
+    told = read_json(tmp_path / "base" / "gate.json")
+    write_json(tmp_path / "base" / "gate.json", {**told, "machine": "another"})
+
+    def verdicts(*, code: int) -> dict[str, list[str]]:
+        assert cli.main([*command, "--against", "HEAD", "--junit", "j.xml"]) == code, capsys.readouterr().out
+        cases = ElementTree.parse(tmp_path / "j.xml").getroot()
+        return {str(case.get("name")): [part.tag for part in case] for case in cases}
+
+    unchanged = verdicts(code=arguments.DONE)
+    assert unchanged["cost: time of frame"] == []
+    source.write_text(METHOD.replace("FakeAvatar(", "Slow(") + "\nclass Slow(FakeAvatar):\n"
+        "    def render(self, *args, **more):\n"
+        "        return [super(Slow, self).render(*args, **more) for _ in range(20)][0]\n")  # fmt: skip
+    slower = verdicts(code=arguments.FAILED)
+    assert slower["cost: time of frame"] == ["failure"] and slower["rendering"] == []
+    assert "worse                  boxes · unhurried:mine: cost: time of frame" in capsys.readouterr().out
+    assert git(tmp_path / "theirs", "status", "--porcelain").split() == ["M", "unhurried.py"]
+
+
+def test_revisions_that_cannot_be_told_apart_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def paths(*folders: Path) -> None:
+        monkeypatch.setenv(METHOD_PATH, os.pathsep.join(map(str, folders)))
+        monkeypatch.setattr(sys, "path", [*map(str, reversed(folders)), *before])
+
+    before, out = list(sys.path), tmp_path / "out"
+    theirs, second, plain = (tmp_path / name for name in ("theirs", "second", "plain"))
+    repository(theirs, "first_own")
+    repository(second, "second_own")
+    plain.mkdir()
+    (plain / "plain_own.py").write_text(METHOD)
+    paths(theirs, second, plain)
+    with pytest.raises(InputError, match="expected plain_own:mine in a checkout of ash-bench or under a --method-path"):
+        against.revision_of("HEAD", ["first_own:mine", "plain_own:mine"], out)
+    with pytest.raises(InputError, match="expected methods in one repository"):
+        against.revision_of("HEAD", ["first_own:mine", "second_own:mine"], out)
+    for unknown in ("no-such-revision", "--all"):
+        with pytest.raises(InputError, match="expected a revision that git knows"):
+            against.revision_of(unknown, ["first_own:mine"], out)
+    (plain / "first_own.py").write_text(METHOD)
+    paths(plain, theirs)  # As what is installed, `plain` comes first in every process but this one.
+    with pytest.raises(InputError, match="expected it not to be installed"):
+        against.revision_of("HEAD", ["first_own:mine"], out)
 
 
 def judgement(*checks: Check, suite: str = "boxes") -> Judgement:
@@ -392,20 +496,16 @@ def test_every_source_that_is_named_exists() -> None:
 
 
 def test_git_tells_which_files_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def git(*words: str) -> str:
-        who = ("-c", "user.name=a", "-c", "user.email=a@b")
-        return subprocess.run(["git", *who, *words], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
-
     monkeypatch.setattr(provenance, "__file__", str(tmp_path / "benchmarks" / "provenance.py"))
-    git("init", "-q")
+    git(tmp_path, "init", "-q")
     for name in ("same.py", "edited.py", "committed.py"):
         (tmp_path / name).write_text("1\n")
-    git("add", ".")
-    git("commit", "-qm", "base")
-    base = git("rev-parse", "--short=12", "HEAD").strip()
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-qm", "base")
+    base = git(tmp_path, "rev-parse", "--short=12", "HEAD").strip()
     assert provenance.changed_since(base) == ()
     (tmp_path / "committed.py").write_text("2\n")
-    git("commit", "-qam", "one more")
+    git(tmp_path, "commit", "-qam", "one more")
     (tmp_path / "edited.py").write_text("2\n")
     (tmp_path / "new.py").write_text("1\n")
     assert provenance.changed_since(f"{base}+") == ("committed.py", "edited.py", "new.py")
