@@ -152,7 +152,7 @@ def interleaved(
         except CannotDraw as error:
             return [Check(row=row, layer="cost", name="times", verdict="not judged", detail=str(error))], {}
         turns.reverse()
-        least = least_times(before), least_times(after)
+        least = least_times(before, beside=after), least_times(after, beside=before)
         unclear = any(check.verdict == "not judged" for check in time_checks(row, *least, stored=True))
         if number >= ROUNDS and not unclear:
             break

@@ -130,10 +130,13 @@ def memory_check(row: str, before: Sequence[Entry], after: Sequence[Entry]) -> C
     return Check(row=row, layer="cost", name="peak memory", verdict=verdict, detail=detail)
 
 
-def least_times(timings: Iterable[Timing]) -> dict[str, float]:
-    """Least times of a frame and its stages over the least of the reference workload, for noise only ever adds."""
+def least_times(timings: Iterable[Timing], *, beside: Iterable[Timing] = ()) -> dict[str, float]:
+    """Least times of a frame and its stages over the least of the reference workload, for noise only ever adds.
+
+    `beside`: timings of the same minutes, in which the reference workload had as good a chance.
+    """
     least: dict[str, float] = {}
-    reference = math.inf
+    reference = min((ms for timing in beside for ms in timing.reference_ms), default=math.inf)
     for timing in timings:
         measured = {"frame": timing.frame_ms, **timing.stage_ms}
         least |= {name: min(least.get(name, math.inf), *values) for name, values in measured.items()}
