@@ -877,8 +877,8 @@ tava = _row("tava")
 Differs from the publication: no mip encoding and no second, fine pass (all samples of a ray lie evenly in the shell, at
 the preset `paper` as many as both passes have); the posed template, skinned, tells where samples lie and nothing else,
 where TAVA has a box; skinning weights start as those of the nearest bone; shading is a factor of 0 to 2 by position and
-pose; roots that skinning folds over do not count. Smaller, but for `paper`: MLPs of 4x64 and 2x64 (8x256, 4x128), 24
-samples (64 + 64), 256 rays (1,024), 3 roots of at most 8 steps (5 of 50), the steps of the preset (300,000).
+pose; roots that skinning folds over do not count. Smaller, but for `paper`: MLPs of 4x64 and 2x64 (8x256, 4x128), 16
+samples in 4 cm (64 + 64), 256 rays, of `ci` 128 (1,024), 3 roots of 8 steps (5 of 50), the preset's steps (300,000).
 """
 
 neural_actor = _row("neural_actor")
@@ -887,7 +887,7 @@ neural_actor = _row("neural_actor")
 Differs from the publication: the texture is predicted by ASH's motion U-Net, end to end, where Neural Actor translates
 normal maps into images with a GAN and takes a ResNet's features of them; the loss has no term that draws alpha to 0 or
 1; the density starts as the inside of the body. Smaller, but for `paper`: MLPs of 4x64 (6x256), 16 channels (512), 24
-samples in the 6 cm shell (64), 512 rays (1,024), the steps of the preset (300,000).
+samples in the 6 cm shell (64), 512 rays (1,024), of `ci` 16 and 256; the steps of the preset (300,000).
 """
 
 hdhumans = _row("hdhumans")
