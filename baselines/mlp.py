@@ -45,9 +45,9 @@ class MlpDecoder(nn.Module):
         return self.layers(torch.cat([position, motion], 1))
 
 
-def encode(positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n e"]:
+def encode(positions: Float[Tensor, "n 3"], octaves: int = OCTAVES) -> Float[Tensor, "n e"]:
     """Positional encoding: metres, with sines and cosines of octaves from half a turn per metre up."""
-    angles = (positions[..., None] * torch.pi * 2.0 ** torch.arange(OCTAVES, device=positions.device)).flatten(1)
+    angles = (positions[..., None] * torch.pi * 2.0 ** torch.arange(octaves, device=positions.device)).flatten(1)
     return torch.cat([positions, angles.sin(), angles.cos()], 1)
 
 

@@ -72,6 +72,10 @@ STYLES = {
     "mlp": MethodStyle(title="w/ MLP", colour="#c2415c"),
     "mlp_base": MethodStyle(title="w/ MLP on learned texels", colour="#a0522d"),
     "smpl": MethodStyle(title="bare-body template", colour="#8d6e63"),
+    "tava": MethodStyle(title="TAVA", colour="#c2415c"),
+    "neural_actor": MethodStyle(title="Neural Actor", colour="#5b8c2a"),
+    "hdhumans": MethodStyle(title="HDHumans", colour="#9b59b6"),
+    "per_frame": MethodStyle(title="Gaussians per training frame", colour="#7a869a", reference="ash_plus"),
     # Suite `switches`.
     "warm_up_released": MethodStyle(title="warm-up as released", colour="#7a869a"),
     "warm_up_none": MethodStyle(title="no warm-up", colour="#b8860b"),

@@ -178,6 +178,7 @@ def test_our_suites_are_such_files() -> None:
         "switches",
         "speed",
         "paper",
+        "offline",
         "ci",
     }
     for name in suite_files():
