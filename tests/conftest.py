@@ -31,9 +31,9 @@ def pytest_sessionstart() -> None:
 
 LONG = (
     "test_tutorials", "test_kill", "test_isolation", "test_cli", "test_in_a_browser", "test_launcher", "test_captures",
-    "test_gate", "test_field", "test_readers", "test_cli_faults", "test_page", "test_defects", "test_files", "test_conformance",
-    "test_factors", "test_player", "test_switch_parts", "test_capture", "test_plugin", "test_engine",
-    "test_predictions", "test_cli_help", "test_outsiders", "test_ci_suite",
+    "test_gate", "test_field", "test_readers", "test_cli_faults", "test_page", "test_defects", "test_files",
+    "test_conformance", "test_factors", "test_player", "test_switch_parts", "test_capture", "test_plugin",
+    "test_engine", "test_predictions", "test_cli_help", "test_outsiders", "test_ci_suite",
 )  # fmt: skip
 
 
