@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ash.bounded_cache import BoundedCache
 from ash.capture.dataset import Camera, Capture, Pose
 from ash.config import AshConfig
 from ash.decoders import Decoders
@@ -54,7 +53,6 @@ class AshAvatar(TrainedAvatar):
         self.module.to(self.device)
         self.template, self.lattice = self.module.template, self.module.lattice
         self.analytic = analytic.to(self.device)
-        self._inputs = BoundedCache(self._make_inputs)  # A template that images do not move is frozen.
 
     def make_decoders(self, lattice: TexelLattice) -> nn.Module:
         """Stg. 3; see `AshModel`."""
@@ -95,12 +93,8 @@ class AshAvatar(TrainedAvatar):
 
     def _inputs_of(self, frame: int) -> FrameInputs:
         if self.module.refinement is None:
-            return self._inputs[frame]
+            return super()._inputs_of(frame)
         self.template.clear_cache()  # It moves with every step: all that is drawn from it is drawn anew.
-        return self.module.frame_inputs(Pose(self._motion, frame))
-
-    @torch.no_grad()
-    def _make_inputs(self, frame: int) -> FrameInputs:
         return self.module.frame_inputs(Pose(self._motion, frame))
 
     def _warm_up(self, images: TrainingImages) -> None:

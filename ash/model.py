@@ -47,12 +47,8 @@ class AshModel(MovingModule):
         self.lattice = lattice
         self.textures: TextureDrawer | None = None
         if decoders is not None:
-            self.textures = TextureDrawer(
-                lattice if config.shuffle == 1 else build_lattice(template.mesh, config.decoded_texels),
-                window=config.window,
-                yaw_normalise=config.yaw_normalise,
-                standardise=config.standardise,
-            )
+            decoded = lattice if config.shuffle == 1 else build_lattice(template.mesh, config.decoded_texels)
+            self.textures = TextureDrawer.of(config, decoded)
         self.decoders = decoders
         self._add_texels(initial)
         self.refinement: MotionRefinement | None = None

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ash.capture.dataset import Motion, Pose, TemplateMesh
+from ash.config import AtlasConfig
 from ash.devices import MovingModule
 from ash.files import InputError
 from ash.mesh.rasterizing import rasterize_mesh
@@ -183,6 +184,12 @@ class TextureDrawer(MovingModule):
         if standardise:
             self.register_buffer("mean", torch.zeros(6 * window, lattice.resolution, lattice.resolution))
             self.register_buffer("spread", torch.ones(6 * window, 1, 1))
+
+    @classmethod
+    def of(cls, config: AtlasConfig, lattice: TexelLattice) -> "TextureDrawer":
+        """As a configuration has them, on the lattice that is decoded."""
+        seen = {"yaw_normalise": config.yaw_normalise, "standardise": config.standardise}
+        return cls(lattice, window=config.window, **seen)
 
     def fit_normalization(self, template: Template, motion: Motion, frames: tuple[int, ...]) -> None:
         """Take mean and spread from the frames of a training motion."""

@@ -11,6 +11,7 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
+from ash.bounded_cache import BoundedCache
 from ash.capture.dataset import Camera, Capture, Pose
 from ash.checkpoints import contiguous_state, load_module, read_safetensors
 from ash.decoders import apart, decoding_in, decoding_precision
@@ -37,7 +38,8 @@ class TrainedAvatar(ABC):
     What decoders make of a frame is added to a static `base`.
     """
 
-    module: Any  # everything that a checkpoint holds; has `template`, `decode(inputs)` and `residual(inputs)`
+    # Everything that a checkpoint holds; has `template`, `frame_inputs(pose)`, `decode(inputs)` and `residual(inputs)`.
+    module: Any
 
     def __init__(self, config: Any, capture: Capture, template: Template) -> None:
         """`config` has `model`, `training`, `template`, `seed` and `device`, as `ash.config.AshConfig` has them.
@@ -49,6 +51,7 @@ class TrainedAvatar(ABC):
         self.template = template
         self._motion = capture.motion
         self._outcome: TrainingOutcome | None = None
+        self._inputs: BoundedCache[int, Any] = BoundedCache(self._make_inputs)
 
     @classmethod
     def from_capture(cls: type[Own], config: Any, capture: Capture) -> Own:
@@ -69,9 +72,13 @@ class TrainedAvatar(ABC):
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Adam's groups, each with its own `lr`."""
 
-    @abstractmethod
-    def _inputs_of(self, frame: int) -> DecoderInputs:
-        """What decoders take of a training frame."""
+    @torch.no_grad()
+    def _make_inputs(self, frame: int) -> Any:
+        return self.module.frame_inputs(Pose(self._motion, frame))
+
+    def _inputs_of(self, frame: int) -> Any:
+        """What decoders take of a training frame: posed once, as far as there is room, for the template is frozen."""
+        return self._inputs[frame]
 
     @abstractmethod
     def _draw(self, decoded: Tensor, inputs: Any, cameras: list[Camera], background: Tensor, step: int) -> Tensor:

@@ -16,7 +16,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 import ash.native.shading
-from ash.bounded_cache import BoundedCache
 from ash.capture.dataset import Camera, Capture, Pose, TemplateMesh
 from ash.config import AshConfig, AtlasConfig, TemplateConfig, TrainingConfig, check_device, one_of
 from ash.decoders import GLOBAL_FEATURES, GlobalFeatures, UNet, apart, as_batch, batched_inputs
@@ -187,19 +186,10 @@ class DdcAvatar(TrainedAvatar):
         initial = torch.full((3, config.texture, config.texture), GREY)
         if config.model.base:
             initial = initial_texture(capture, template, build_lattice(capture.template, config.texture))
-        textures = TextureDrawer(
-            build_lattice(capture.template, config.model.decoded_texels),
-            window=config.model.window,
-            yaw_normalise=config.model.yaw_normalise,
-            standardise=config.model.standardise,
-        )
+        textures = TextureDrawer.of(config.model, build_lattice(capture.template, config.model.decoded_texels))
         textures.fit_normalization(template, capture.motion, capture.splits["train"].frames)
         self.module = DdcModel(config, capture.template, template, textures, initial).to(self.device)
         self.template = self.module.template
-        # The template is frozen: each training frame is posed once, as far as there is room.
-        self._inputs: BoundedCache[int, MeshInputs] = BoundedCache(
-            lambda frame: self.module.frame_inputs(Pose(capture.motion, frame))
-        )
 
     @property
     def base(self) -> nn.Parameter:
@@ -221,9 +211,6 @@ class DdcAvatar(TrainedAvatar):
 
     def _warm_up(self, images: TrainingImages) -> None:
         """Nothing: the texture starts from the training images."""
-
-    def _inputs_of(self, frame: int) -> MeshInputs:
-        return self._inputs[frame]
 
     def _draw(
         self, decoded: Tensor, inputs: MeshInputs, cameras: list[Camera], background: Tensor, step: int

@@ -14,6 +14,7 @@ Formulas are those of the publications. The docstrings of the rows, at the end, 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from ash.bounded_cache import BoundedCache
 from ash.capture.dataset import Camera, Capture, Pose, Skeleton
 from ash.capture.formats import read_body
 from ash.config import AtlasConfig, TemplateConfig, TrainingConfig, check_device, one_of
@@ -224,8 +224,7 @@ def march(field: Field, rays: Rays, grid: ShellGrid, *, samples: int, jitter: Te
         ((order + 0.5) if jitter is None else (order + jitter)).expand(len(rays.origins), -1) / samples
     )
     density, rgb = _ask(field, rays, lengths)
-    through = torch.exp(-density * (stretches.length / samples)[:, None])
-    left = torch.cat([torch.ones_like(through[:, :1]), through.cumprod(1)], 1)
+    left = _light_left(density, stretches.length / samples)
     weights = left[:, :-1] - left[:, 1:]
     seen = (weights * lengths).sum(1) / weights.sum(1).clamp(min=1e-6)
     return Marched(rgb=(weights[..., None] * rgb).sum(1), alpha=1 - left[:, -1], length=seen)
@@ -255,6 +254,12 @@ def _ask(
     return density.reshape(count, samples), rgb.reshape(count, samples, 3)
 
 
+def _light_left(density: Float[Tensor, "r n"], step: Float[Tensor, " r"]) -> Float[Tensor, "r n+1"]:
+    """The share of light that comes through to each sample of a ray, and through the last."""
+    through = torch.exp(-density * step[:, None])
+    return torch.cat([torch.ones_like(through[:, :1]), through.cumprod(1)], 1)
+
+
 @torch.no_grad()
 def draw_rays(field: Field, rays: Rays, grid: ShellGrid, *, samples: int) -> Float[Tensor, "r 4"]:
     """`march` without gradients: rays that miss the shell, or through which no more light comes, ask nothing."""
@@ -267,8 +272,7 @@ def draw_rays(field: Field, rays: Rays, grid: ShellGrid, *, samples: int) -> Flo
         if len(rows) == 0:
             break
         density, rgb = _ask(field, rays[rows], places[rows, first : first + BLOCK])
-        through = torch.exp(-density * step[rows, None])
-        lights = left[rows, None] * torch.cat([torch.ones_like(through[:, :1]), through.cumprod(1)], 1)
+        lights = left[rows, None] * _light_left(density, step[rows])
         weights = lights[:, :-1] - lights[:, 1:]
         image[rows] += torch.cat([(weights[..., None] * rgb).sum(1), weights.sum(1, keepdim=True)], 1)
         left[rows] = lights[:, -1]
@@ -475,7 +479,11 @@ class SurfaceLookup:
 
     def __init__(self, posed: PosedTemplate, faces: Int[Tensor, "f 3"], ring: Int[Tensor, "v k"]) -> None:
         self.posed, self.faces, self.ring = posed, faces, ring
-        self.nearest = NearestPoint(posed.vertices)
+
+    @cached_property
+    def nearest(self) -> NearestPoint:
+        """Of the vertices. A field that asks for no surface point needs no tree."""
+        return NearestPoint(self.posed.vertices)
 
     @torch.no_grad()
     def of(self, points: Float[Tensor, "m 3"]) -> "SurfacePoints":
@@ -652,16 +660,11 @@ class FieldAvatar(TrainedAvatar):
     def __init__(self, config: FieldConfig, capture: Capture, template: Template) -> None:
         super().__init__(config, capture, template)
         torch.manual_seed(config.seed)
-        lattice = build_lattice(capture.template, config.model.decoded_texels)
-        seen = {"yaw_normalise": config.model.yaw_normalise, "standardise": config.model.standardise}
-        textures = TextureDrawer(lattice, window=config.model.window, **seen)
+        textures = TextureDrawer.of(config.model, build_lattice(capture.template, config.model.decoded_texels))
         if config.field.kind == "shell":
             textures.fit_normalization(template, capture.motion, capture.splits["train"].frames)
         self.module = FieldModel(config, template, textures).to(self.device)
         self.template = self.module.template
-        self._inputs: BoundedCache[int, FieldInputs] = BoundedCache(
-            lambda frame: self.module.frame_inputs(Pose(capture.motion, frame))
-        )
 
     @property
     def base(self) -> nn.Parameter:
@@ -680,9 +683,6 @@ class FieldAvatar(TrainedAvatar):
 
     def _has_decoders(self) -> bool:
         return self.module.has_texture
-
-    def _inputs_of(self, frame: int) -> FieldInputs:
-        return self._inputs[frame]
 
     def _uniform(self, random: np.random.Generator, *shape: int) -> Tensor:
         return torch.from_numpy(random.random(shape, np.float32)).to(self.device)

@@ -18,7 +18,7 @@ from benchmarks.cell.sandbox import METHOD_PATH
 from benchmarks.cell.schema import Cell, CellResult, Timing, result_of
 from benchmarks.gate.baseline import Entry, drawn_again
 from benchmarks.gate.checks import Check
-from benchmarks.gate.statistical import least_times, time_checks
+from benchmarks.gate.statistical import SLOWER, SLOWER_STORED, least_times, rises, time_checks
 
 ROUNDS = 5  # and up to as many more while a time fails by less than would be told of stored times
 ROOT = Path(__file__).resolve().parents[2]  # of ash-bench's checkout
@@ -153,7 +153,7 @@ def interleaved(
             return [Check(row=row, layer="cost", name="times", verdict="not judged", detail=str(error))], {}
         turns.reverse()
         least = least_times(before, beside=after), least_times(after, beside=before)
-        unclear = any(check.verdict == "not judged" for check in time_checks(row, *least, stored=True))
+        unclear = any(SLOWER <= rise < SLOWER_STORED for rise in rises(*least).values())
         if number >= ROUNDS and not unclear:
             break
     return time_checks(row, *least, stored=False), least[1]

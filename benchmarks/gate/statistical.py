@@ -152,6 +152,12 @@ def training_time(entries: Sequence[Entry]) -> dict[str, float]:
     return {"training": 1e3 * min(seconds) / min(references)} if seconds and references else {}
 
 
+def rises(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, float]:
+    """Ratios of the times that both have and that are long enough to be compared."""
+    both = {name: (old, after[name]) for name, old in before.items() if name in after}
+    return {name: new / old for name, (old, new) in both.items() if max(old, new) >= STAGE_FLOOR}
+
+
 def time_checks(row: str, before: Mapping[str, float], after: Mapping[str, float], *, stored: bool) -> list[Check]:
     """Times as ratios to the reference workload.
 
@@ -159,15 +165,14 @@ def time_checks(row: str, before: Mapping[str, float], after: Mapping[str, float
     """
     fails = SLOWER_STORED if stored else SLOWER
     checks = []
-    for name, old in before.items():
-        new = after.get(name)
-        if new is None or max(old, new) < STAGE_FLOOR or (stored and name not in WHOLE):
+    for name, rise in rises(before, after).items():
+        if stored and name not in WHOLE:
             continue
-        verdict: Verdict = "worse" if new >= fails * old else "not judged" if new >= SLOWER * old else "unchanged"
+        verdict: Verdict = "worse" if rise >= fails else "not judged" if rise >= SLOWER else "unchanged"
         told = f"a rise from {fails - 1:.0%} on fails"
         if verdict == "not judged":
             told = f"stored times cannot decide a rise below {fails - 1:.0%}"
             told += "" if name == "training" else "; --against REV does"
-        detail = f"{old:.4g} -> {new:.4g} times the reference workload ({new / old - 1:+.0%}; {told})"
+        detail = f"{before[name]:.4g} -> {after[name]:.4g} times the reference workload ({rise - 1:+.0%}; {told})"
         checks.append(Check(row=row, layer="cost", name=f"time of {name}", verdict=verdict, detail=detail))
     return checks

@@ -13,6 +13,7 @@ from ash.devices import CPU
 from ash.presets import MethodFactory
 from baselines.ablations import wo_disp, wo_mot, wo_mot_plus
 from baselines.ddc import ddc, ddc_plus
+from baselines.field import hdhumans, neural_actor, tava
 from baselines.mlp import mlp, mlp_base
 from baselines.oracle_texture import oracle_texture
 from baselines.static import static
@@ -30,6 +31,11 @@ RECIPES: dict[str, MethodFactory[Any]] = {
     "mlp": mlp,
     "mlp_base": mlp_base,
 }
+FIELDS: dict[str, MethodFactory[Any]] = {  # Their step on `meta` is that of the published size, in `test_field.py`.
+    "tava": tava,
+    "neural_actor": neural_actor.with_overrides({"field.surface": "template"}),
+    "hdhumans": hdhumans,
+}
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +44,7 @@ def tube(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 def avatar_of(name: str, capture: Capture) -> Any:
-    recipe = RECIPES[name]
+    recipe = (RECIPES | FIELDS)[name]
     return recipe.build(tiny(recipe.config("ci")), capture)
 
 
@@ -51,7 +57,7 @@ def test_a_training_step_stays_on_its_device(name: str, tube: Capture, monkeypat
     assert learned and all(parameter.device == META for parameter in learned)
 
 
-@pytest.mark.parametrize("name", RECIPES)
+@pytest.mark.parametrize("name", RECIPES | FIELDS)
 def test_nothing_of_a_step_is_made_on_the_default_device(name: str, tube: Capture) -> None:
     avatar = avatar_of(name, tube)
     with META:
@@ -60,9 +66,9 @@ def test_nothing_of_a_step_is_made_on_the_default_device(name: str, tube: Captur
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
-@pytest.mark.parametrize("name", RECIPES)
+@pytest.mark.parametrize("name", RECIPES | FIELDS)
 def test_a_gpu_learns_what_the_cpu_learns(name: str, tube: Capture) -> None:
-    recipe = RECIPES[name]
+    recipe = (RECIPES | FIELDS)[name]
     config = tiny(recipe.config("ci"))
     there, here = (recipe.build(replace(config, device=device), tube) for device in ("cuda", "cpu"))
     for learned, expected in zip(step_of(there, tube, torch.device("cuda")), step_of(here, tube, CPU), strict=True):

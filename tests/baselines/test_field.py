@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from ash.capture.dataset import Capture, Motion, Pose
 from ash.capture.formats import write_template
 from ash.config import TemplateConfig
-from ash.devices import CPU
 from ash.files import InputError
 from ash.presets import MethodFactory
 from ash.protocol import StageClock
@@ -416,14 +415,6 @@ def test_the_published_size_makes_a_step_without_numbers(
         avatar.module.zero_grad()
         avatar.loss([draw_batch(load_training_images(tube, META), avatar.config.training, 0, 3)], 3).backward()
         assert [name for name, p in avatar.module.named_parameters() if p.grad is not None] == ["refinement.rough"]
-
-
-@pytest.mark.parametrize("row", ROWS)
-def test_nothing_of_a_step_is_made_on_the_default_device(row: str, tube: Capture) -> None:
-    avatar = made(row, tube)
-    with META:
-        learned = step_of(avatar, tube, CPU)
-    assert learned and all(bool(torch.isfinite(parameter).all()) for parameter in learned)
 
 
 def test_the_bare_body_is_neural_actors_surface(tube: Capture, tmp_path: Path) -> None:

@@ -376,6 +376,22 @@ def test_a_revision_and_today_draw_in_turns_and_longer_while_a_time_barely_fails
     assert turns[1::2] == [["today", "before"]] * len(turns[1::2])
 
 
+def test_they_draw_longer_while_a_stage_alone_barely_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[str] = []
+
+    def draw(of: Entry, here: Cell, out: Path, by: object = None) -> CellResult:
+        drawn.append("before" if by else "today")
+        result = entry(0, 25.0).result
+        assert result.timing is not None
+        slow = replace(result.timing, stage_ms={"stg4": (5.8,)})
+        return result if by or drawn.count("today") > 6 else replace(result, timing=slow)
+
+    monkeypatch.setattr(against, "drawn_again", draw)
+    revision = against.Revision(name="r", command=(), method_path="", methods=frozenset())
+    checks, _ = against.interleaved(ROW, entry(0, 25.0), entry(0, 25.0).cell, Path(), revision)
+    assert len(drawn) == 14 and {check.verdict for check in checks} == {"unchanged"}
+
+
 def test_what_a_revision_cannot_draw_is_not_judged(base: Baseline, capture: Path, tmp_path: Path) -> None:
     """A change of the checkpoint's format, say, which comes with a baseline of its own."""
     entry = next(iter(base.rows.values()))[0]
