@@ -173,10 +173,12 @@ def test_costs() -> None:
             names = ("frame",) if told else ("frame", "stg4")  # stg1 is too short to be timed
             assert checks == {f"time of {name}": verdict for name in names}
     assert "--against REV does" in time_checks(ROW, {"frame": 2.0}, {"frame": 2.5}, stored=True)[0].detail
-    times = training_time(base)
+    times = {name: 1e3 * value for name, value in training_time(base).items()}
     found = [time_checks(ROW, times, {"training": f * times["training"]}, stored=True)[0] for f in (0.5, 1.1, 1.4, 1.7)]
     assert [check.verdict for check in found] == ["unchanged", "unchanged", "not judged", "worse"]
     assert "--against" not in found[2].detail, "trainings are not repeated in turn"
+    short = time_checks(ROW, {"training": 12.0}, {"training": 20.0}, stored=True)
+    assert short == [], "trainings of a fraction of a second are not compared"
 
 
 @pytest.mark.parametrize(
