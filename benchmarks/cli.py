@@ -42,6 +42,7 @@ COMMANDS = {
     "train": "runs:TrainCommand",
     "report": "runs:ReportCommand",
     "compare": "runs:CompareCommand",
+    "claims": "runs:ClaimsCommand",
     "eval": "runs:EvalCommand",
     "score": "runs:ScoreCommand",
     "pack": "sharing:PackCommand",

@@ -105,6 +105,12 @@ def draw_all(cell: Cell, capture: Capture, client: MethodClient) -> MethodOutput
     )
 
 
+def time_frames(cell: Cell, capture: Capture, client: MethodClient) -> Timing:
+    """The times alone that `draw_all` measures."""
+    client.load_test_views(cell.folder.resolve() / TEST_VIEWS, capture)
+    return _timing(capture, client, playback(evaluated_views(capture)))[0]
+
+
 def score_outputs(
     cell: Cell, capture: Capture, drawn: MethodOutputs, spent: TrainingTime, training: TrainingOutcome | None = None
 ) -> CellResult:

@@ -25,7 +25,14 @@ from ash.capture.manifest import verify_capture
 from ash.files import InputError, disk_problem
 from ash.protocol import Avatar
 from benchmarks import provenance
-from benchmarks.cell.evaluation import MethodOutputs, draw_all, quality_summary, score_outputs, scored_views
+from benchmarks.cell.evaluation import (
+    MethodOutputs,
+    draw_all,
+    quality_summary,
+    score_outputs,
+    scored_views,
+    time_frames,
+)
 from benchmarks.cell.predictions import open_predictions, score_predictions
 from benchmarks.cell.registry import BROUGHT, ORACLES, code_version, find_method, make_avatar, offered
 from benchmarks.cell.sandbox import WORK, add_method_paths, adopt_orphans, seen_by_method, watched
@@ -39,6 +46,7 @@ from benchmarks.cell.schema import (
     Killed,
     MethodFailed,
     Provenance,
+    Timing,
     TrainingTime,
     failed_result,
     prediction_path,
@@ -150,6 +158,21 @@ def evaluate_cell(cell: Cell, *, device: str | None = None) -> CellResult:
         raise InputError(f"{cell.folder}: {error or 'its process was killed'}; the result stays as it was") from error
     write_result(cell.folder, result)
     return result
+
+
+def time_cell(cell: Cell) -> Timing:
+    """Load a cell's checkpoint and time its frames; no picture and no result is written.
+
+    Raises:
+        InputError: the cell is unfinished, or its method does not load or draw any more.
+    """
+    _finished(cell)
+    capture = _capture_of(cell)
+    try:
+        with trained_client(cell, capture) as client:
+            return time_frames(cell, capture, client)
+    except (MethodFailed, Killed) as error:
+        raise InputError(f"{cell.folder}: {error or 'its process was killed'}") from error
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Commands that make, score and report cells and runs: run, train, eval, report, compare."""
+"""Commands that make, score and report cells and runs: run, train, eval, report, compare, claims."""
 
 import os
 import sys
@@ -239,6 +239,36 @@ class CompareCommand:
         print(write_comparison(read_run(self.before), read_run(self.after), out))
         print(out / "compare.html")
         return DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClaimsCommand:
+    """Judge claims by the rows of runs: what the ASH paper says, and what our README says.
+
+    A claim is a contrast of two rows on a scene, judged in pairs over people, within the run that has the most of them.
+    Exit code 1 where a claim that held in an earlier judgement (--before) does not hold any more.
+    """
+
+    runs: Positional[tuple[Path, ...]]  # folders of runs
+    claims: File | None = None  # other claims, as benchmarks/analysis/claims.toml has ours
+    before: File | None = None  # the claims.csv of an earlier judgement
+    out: Folder = Path("runs/claims")  # where claims.html, claims.md and claims.csv go
+
+    def __call__(self) -> int:
+        """Print the verdicts, and write the page."""
+        from benchmarks.analysis.claims import FILE, read_claims
+        from benchmarks.report.claims import write_claims
+        from benchmarks.suites.runs import read_run
+
+        if not self.runs:
+            raise InputError("expected the folder of a run")
+        lines, lost = write_claims(
+            [read_run(run) for run in self.runs], read_claims(self.claims or FILE), self.out, self.before
+        )
+        print("\n".join([*lines, str(self.out / "claims.html")]))
+        for claim in lost:
+            print(f"no longer holds: {claim}", file=sys.stderr)
+        return FAILED if lost else DONE
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,9 +18,9 @@ from pathlib import Path
 
 from ash.capture.formats import load_capture
 from ash.files import InputError
-from benchmarks.cell.schema import Cell, CellResult, result_of
+from benchmarks.cell.schema import Cell, CellResult, Timing, result_of
 from benchmarks.gate.against import Revision, interleaved
-from benchmarks.gate.baseline import Baseline, Entry, drawn_again, keeps_avatar, row_of
+from benchmarks.gate.baseline import Baseline, Entry, drawn_again, keeps_avatar, row_of, timed_again
 from benchmarks.gate.checks import Check
 from benchmarks.gate.exact import (
     Worst,
@@ -125,8 +125,7 @@ def times_of(entries: Mapping[str, Sequence[Entry]], out: Path) -> dict[str, dic
         first = seeds[0]
         times[row] = training_time(seeds)
         if keeps_avatar(first.cell):
-            results = [drawn_again(first, first.cell, out / FROZEN) for _ in range(TIMED)]
-            times[row] |= least_times(result.timing for result in results if result.timing is not None)
+            times[row] |= least_times(timed_again(first, first.cell, out / FROZEN) for _ in range(TIMED))
         progress.finish(row)
     progress.close()
     return times
@@ -156,13 +155,13 @@ def _draw_frozen(
     rows: Sequence[str],
     options: RunOptions,
     checks: list[Check],
-) -> tuple[dict[str, Iterator[CellResult]], dict[str, Worst]]:
+) -> tuple[dict[str, Iterator[Timing]], dict[str, Worst]]:
     """Draw the baseline's avatars by today's code, and judge protocol and rendering.
 
-    Returns results of each: the one that was judged, then ever new ones, for times; and the worst pictures.
+    Returns times of each: of the pictures that were judged, then ever new ones; and the worst pictures.
     """
     frozen, out = [row for row in rows if keeps_avatar(_first(baseline, row).cell)], options.out / FROZEN
-    drawn: dict[str, Iterator[CellResult]] = {}
+    drawn: dict[str, Iterator[Timing]] = {}
     worst: dict[str, Worst] = {}
     progress = Progress("frozen avatars", len(frozen), expected_s=15.0, workers=1)
     for row in frozen:
@@ -184,16 +183,17 @@ def _draw_frozen(
         if found is not None:
             worst[row] = found
         checks += rendering_checks(row, entry.result, result, found)
-        drawn[row] = _results(result, entry, here, out)
+        drawn[row] = _timings(result, entry, here, out)
         progress.finish(row)
     progress.close()
     return drawn, worst
 
 
-def _results(first: CellResult, entry: Entry, here: Cell, out: Path) -> Iterator[CellResult]:
-    yield first
+def _timings(first: CellResult, entry: Entry, here: Cell, out: Path) -> Iterator[Timing]:
+    if first.timing is not None:
+        yield first.timing
     while True:
-        yield drawn_again(entry, here, out)
+        yield timed_again(entry, here, out)
 
 
 def _train(
@@ -248,7 +248,7 @@ def _judge_quality(
 def _cost_checks(
     baseline: Baseline,
     pairs: Pairs,
-    drawn: Mapping[str, Iterator[CellResult]],
+    drawn: Mapping[str, Iterator[Timing]],
     turns: Mapping[str, Callable[[], tuple[list[Check], dict[str, float]]]],
     times: dict[str, dict[str, float]],
 ) -> list[Check]:
@@ -275,13 +275,12 @@ def _cost_checks(
 
 
 def _times_again(
-    row: str, old: Mapping[str, float], training: Mapping[str, float], results: Iterator[CellResult]
+    row: str, old: Mapping[str, float], training: Mapping[str, float], measured: Iterator[Timing]
 ) -> tuple[list[Check], dict[str, float]]:
     """The checks of stored times, after up to `2 * TIMED` more drawings where one is not unchanged, and the times."""
     timings = []
     for _ in range(1 + 2 * TIMED):
-        timing = next(results).timing
-        timings += [timing] if timing is not None else []
+        timings.append(next(measured))
         times = {**least_times(timings), **training}
         checks = time_checks(row, old, times, stored=True)
         if all(check.verdict == "unchanged" for check in checks if check.name != "time of training"):

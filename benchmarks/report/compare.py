@@ -53,7 +53,7 @@ def write_comparison(before: Run, after: Run, out: Path) -> str:
     Raises:
         InputError: the runs have no row in common, or one of them has no finished cell.
     """
-    old, new = _rows(before), _rows(after)
+    old, new = cells_by_row(before), cells_by_row(after)
     if not set(old) & set(new):
         raise InputError(f"{before.folder} and {after.folder}: no scene and method in common, expected at least one")
     table = changes(old, new)
@@ -141,7 +141,12 @@ def printed(table: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def _rows(run: Run) -> Rows:
+def cells_by_row(run: Run) -> Rows:
+    """The finished cells of every row, by scene and method.
+
+    Raises:
+        InputError: there is none.
+    """
     results_of(run)  # Refuses a run without any.
     rows: Rows = {}
     for cell in run.cells:

@@ -190,13 +190,13 @@ def test_a_time_that_has_risen_is_measured_again_before_it_is_believed(
 ) -> None:
     asked: list[int] = []
 
-    def results() -> Iterator[CellResult]:
+    def measured() -> Iterator[Timing]:
         while True:
             asked.append(1)
-            yield entry(0, 25.0, ms=10.0 if len(asked) > quiet_at else slow_ms).result
+            yield entry(0, 25.0, ms=10.0 if len(asked) > quiet_at else slow_ms).result.timing
 
     old = least_times([entry(0, 25.0).result.timing])
-    checks, _ = _times_again(ROW, old, {}, results())
+    checks, _ = _times_again(ROW, old, {}, measured())
     assert len(asked) == drawn and {check.verdict for check in checks} == {verdict}
 
 

@@ -1,0 +1,180 @@
+"""Claims, and what the rows of runs say of each: `claims.toml` holds those of the paper and of our README."""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import pandas as pd
+
+from ash.capture.typed import from_json
+from ash.files import InputError
+from benchmarks.analysis.results import Quantity, samples_of
+from benchmarks.analysis.statistics import Comparison, compare_samples, corrected
+from benchmarks.cell.metrics import METRICS
+from synth.person.cast import VALIDATION
+
+Expected = Literal["better", "worse", "equivalent", "not better", "not worse"]
+Verdict = Literal["confirmed", "confirmed but smaller", "not shown", "contradicted", "cannot be judged here"]
+HOLDS: tuple[Verdict, ...] = ("confirmed", "confirmed but smaller")
+FILE = Path(__file__).with_name("claims.toml")
+NO_SCENE = "no run of this scene"
+COLUMNS = [
+    *("name", "scene", "says", "where", "contrast", "paper", "effect", "low", "high", "p", "people", "unit"),
+    *("verdict", "because", "run"),
+]
+# What each verdict of `compare` on `a` makes of what was expected of it. What is missing was not shown.
+DECIDES: dict[Expected, dict[str, Verdict]] = {
+    "better": {"better": "confirmed", "equivalent": "contradicted", "worse": "contradicted"},
+    "worse": {"worse": "confirmed", "equivalent": "contradicted", "better": "contradicted"},
+    "equivalent": {"equivalent": "confirmed", "better": "contradicted", "worse": "contradicted"},
+    "not better": {"worse": "confirmed", "equivalent": "confirmed", "better": "contradicted"},
+    "not worse": {"better": "confirmed", "equivalent": "confirmed", "worse": "contradicted"},
+}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Claim:
+    """What is claimed, and the contrast that decides it: row `a` against row `b`. See `claims.toml`."""
+
+    name: str
+    says: str
+    where: str
+    a: str = ""
+    b: str = ""
+    scenes: tuple[str, ...] = ("",)
+    split: str = "novel_view"
+    region: str = "foreground"
+    metric: str = "psnr"
+    expect: Expected = "better"
+    least: float | None = None
+    paper: dict[str, float] = field(default_factory=dict)
+    condition: str = ""
+    experiment: str = ""
+    cannot: str = ""
+
+    @property
+    def quantity(self) -> Quantity:
+        """What is compared."""
+        return Quantity(self.split, self.region, self.metric)
+
+
+def read_claims(path: Path = FILE) -> tuple[Claim, ...]:
+    """The claims of a file.
+
+    Raises:
+        InputError: an entry is incomplete, or names what is not there.
+    """
+    try:
+        entries = tomllib.loads(path.read_text())["claim"]
+        claims = tuple(from_json(Claim, entry) for entry in entries)
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: expected entries [[claim]] ({error})") from error
+    for claim in claims:
+        if claim.metric not in METRICS:
+            raise InputError(f"{path}: {claim.name}: metric: expected {', '.join(METRICS)}, got {claim.metric!r}")
+        if not claim.cannot and not (claim.a and claim.b and all(claim.scenes)):
+            raise InputError(f"{path}: {claim.name}: expected a, b and scenes, or cannot")
+    names = [claim.name for claim in claims]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InputError(f"{path}: two claims are called {', '.join(twice)}")
+    return claims
+
+
+def judge(claims: Sequence[Claim], runs: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """Every claim on every scene of it: `COLUMNS`, `effect` is `a` minus `b`.
+
+    `runs`: rows as `analysis.results.load` has them, by the name of their run. A claim is judged within one run, that
+    with the most people; people for validation decide nothing. p is corrected over all claims (Holm). A claim about a
+    single person is not judged, for one person says nothing about others.
+    """
+    asked = [(claim, scene, *_compared_in(claim, scene, runs)) for claim in claims for scene in claim.scenes]
+    tests = iter(corrected([test for _, _, test, _, _ in asked if test is not None]))
+    records = []
+    for claim, scene, test, missing, run in asked:
+        test = None if test is None else next(tests)
+        verdict, because = ("cannot be judged here", missing) if test is None else _verdict(claim, scene, test)
+        records.append(
+            {
+                "name": claim.name,
+                "scene": scene,
+                "says": claim.says,
+                "where": claim.where,
+                "contrast": f"{claim.a} - {claim.b}" if claim.a else "",
+                "paper": claim.paper.get(scene),
+                **_numbers(test),
+                "unit": METRICS[claim.metric].unit,
+                "verdict": verdict,
+                "because": because,
+                "run": run,
+            }
+        )
+    return pd.DataFrame(records, columns=COLUMNS)
+
+
+def _compared_in(claim: Claim, scene: str, runs: Mapping[str, pd.DataFrame]) -> tuple[Comparison | None, str, str]:
+    """The comparison in the run that has the most people; or None, and why there is none; and the run's name."""
+    missing = "no run"
+    best: tuple[Comparison | None, str] = None, ""
+    for name, rows in runs.items():
+        test, why = _compared(claim, rows[(rows["scene"] == scene) & (rows["subject"] < VALIDATION)])
+        if test is None:
+            missing = why if missing in ("no run", NO_SCENE) else missing
+        elif best[0] is None or test.captures > best[0].captures:
+            best = test, name
+    return best[0], "" if best[0] else missing, best[1]
+
+
+def _compared(claim: Claim, rows: pd.DataFrame) -> tuple[Comparison | None, str]:
+    """The comparison over people, or why there is none."""
+    if claim.cannot:
+        return None, claim.cannot
+    if rows.empty:
+        return None, NO_SCENE
+    for method in (claim.a, claim.b):
+        cells = rows[rows["method"] == method]
+        if cells.empty:
+            return None, f"no row {method}"
+        if failed := int((cells.drop_duplicates(["seed", "capture"])["status"] != "done").sum()):
+            return None, f"{failed} cells of {method} failed"
+    samples, metric = samples_of(rows, claim.quantity), METRICS[claim.metric]
+    test = compare_samples(
+        samples.get(claim.a, {}),
+        samples.get(claim.b, {}),
+        margin=metric.abs_tol if claim.least is None else claim.least,
+        higher_is_better=metric.direction == "up",
+    )
+    if test is None:
+        return None, f"{metric.title} was not measured of both on a capture"
+    return (test, "") if test.captures else (None, "one person")
+
+
+def _numbers(test: Comparison | None) -> dict[str, Any]:
+    if test is None:
+        return dict.fromkeys(("effect", "low", "high", "p", "people"))
+    return {"effect": test.mean, "low": test.low, "high": test.high, "p": test.p, "people": test.captures}
+
+
+def _verdict(claim: Claim, scene: str, test: Comparison) -> tuple[Verdict, str]:
+    """The verdict, and what stands behind it."""
+    verdict = DECIDES[claim.expect].get(test.verdict, "not shown")
+    published = claim.paper.get(scene)
+    if verdict == "confirmed" and claim.expect in ("better", "worse") and published is not None:
+        far = test.high if published > 0 else test.low  # The end of the interval that lies nearest to the publication.
+        if abs(far) < abs(published):
+            verdict = "confirmed but smaller"
+    told = (claim.condition, "" if verdict in HOLDS else claim.experiment)
+    return verdict, "; ".join(filter(None, told))
+
+
+def broken(before: pd.DataFrame, after: pd.DataFrame) -> list[str]:
+    """The claims that held before and do not hold now; what cannot be judged any more is among them."""
+    held = before[before["verdict"].isin(HOLDS)]
+    now = after.set_index(["name", "scene"])["verdict"]
+    lost = []
+    for name, scene, verdict in zip(held["name"], held["scene"], held["verdict"], strict=True):
+        found = now.get((name, scene), "not asked")
+        if found not in HOLDS:
+            lost.append(f"{name}{scene and f', {scene}'}: {verdict} before, {found} now")
+    return lost

@@ -1,0 +1,151 @@
+"""Claims on trial: a page and a table of what the rows of runs say of each."""
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+
+from ash.capture.formats import load_capture
+from ash.files import InputError, write_atomic
+from benchmarks.analysis.claims import HOLDS, Claim, broken, judge
+from benchmarks.analysis.error_attribution import psnr_of
+from benchmarks.analysis.results import load
+from benchmarks.cell.metrics import METRICS
+from benchmarks.cell.schema import Cell, CellResult
+from benchmarks.report import pictures
+from benchmarks.report.compare import Rows, cells_by_row
+from benchmarks.report.content import Block, Bullets, Mark, Report, Section, Strip, Strips, Table, Text
+from benchmarks.report.page import render
+from benchmarks.report.pictures import Album, Shown
+from benchmarks.suites.runs import Run, results_of
+
+ABOUT = (
+    "A claim is judged by its contrast, the mean of the first row minus that of the second, in pairs over people; in "
+    "brackets the 95 % interval. Confirmed: p below 5 % after Holm's correction over all claims, and a difference "
+    "above the smallest that counts; or an interval within it, where the claim is that nothing is lost. Smaller: the "
+    "whole interval lies below the published difference. Contradicted: the opposite was found, or no difference that "
+    "counts. Not shown: neither. The avatars are small and the people synthetic: differences are compared with the "
+    "paper's, levels never."
+)
+ORDER = ("confirmed", "confirmed but smaller", "contradicted", "not shown", "cannot be judged here")
+Cells = list[tuple[Cell, CellResult]]  # of one row
+IN_IMAGES = ("psnr", "ssim", "flip", "lpips", "iou")
+
+
+def write_claims(
+    runs: Sequence[Run], claims: Sequence[Claim], out: Path, before: Path | None = None
+) -> tuple[list[str], list[str]]:
+    """Write claims.csv, claims.md and claims.html to `out`.
+
+    `before`: an earlier claims.csv. Returns lines for the terminal, and the claims that held before and do not now.
+
+    Raises:
+        InputError: a run has no finished cell, or `before` is no claims.csv.
+    """
+    earlier = None if before is None else _read(before)
+    table = judge(claims, {str(run.folder): load(results_of(run), _captures(run)) for run in runs})
+    lost = [] if earlier is None else broken(earlier, table)
+    write_atomic(out / "claims.csv", table.to_csv(index=False, float_format="%.6g").encode())
+    counts = table["verdict"].value_counts()
+    found = ", ".join(f"{verdict} {counts[verdict]}" for verdict in ORDER if verdict in counts)
+    headline = f"Of {len(table)} claims, each on its scene: {found}"
+    shown, album = printed(table), Album()
+    marks: dict[tuple[int, int], Mark] = {}
+    for row, verdict in enumerate(table["verdict"]):
+        if verdict in HOLDS or verdict == "contradicted":
+            marks[row, list(shown.columns).index("verdict")] = "best" if verdict in HOLDS else "second"
+    blocks: list[Block] = [Text(text=ABOUT), Table(frame=shown, corner="claim", marks=marks)]
+    if lost:
+        blocks.insert(0, Bullets(items=tuple(lost)))
+    groups = tuple(_pictures(claims, table, {str(run.folder): cells_by_row(run) for run in runs}, album))
+    page = [*blocks, Strips(file="", title="", groups=groups)] if groups else blocks
+    if links := [os.path.relpath(path, out) for run in runs if (path := run.folder / "report.html").exists()]:
+        page.append(Text(text=f"Reports of the runs: {', '.join(links)}."))
+    for form, content in (("html", page), ("md", blocks)):
+        section = Section(title="Claims", headline=f"{headline}.", blocks=tuple(content))
+        text = render(Report(title="ash-bench: claims", sections=(section,)), form, album)  # type: ignore[arg-type]
+        write_atomic(out / f"claims.{form}", text.encode())
+    judged = shown.loc[table["effect"].notna().to_numpy(), ["scene", "difference", "people", "verdict"]]
+    return [*([judged.to_string(), ""] if len(judged) else []), headline], lost
+
+
+def printed(table: pd.DataFrame) -> pd.DataFrame:
+    """The table as texts, by the name of the claim."""
+
+    def number(value: float | None, unit: str, sign: str = "+") -> str:
+        return "" if pd.isna(value) else f"{value:{sign}.3g}{unit and ' ' + unit}"
+
+    texts = pd.DataFrame(
+        {
+            "scene": row.scene,
+            "verdict": row.verdict,
+            "contrast": row.contrast,
+            "difference": ""
+            if pd.isna(row.effect)
+            else f"{number(row.effect, row.unit)} [{number(row.low, '')}, {number(row.high, '')}]",
+            "paper": number(row.paper, row.unit),
+            "people": "" if pd.isna(row.people) else str(int(row.people)),
+            "says": row.says,
+            "place": row.where,
+            "because": row.because,
+            "run": row.run,
+        }
+        for row in table.itertuples()
+    )
+    texts.index = pd.Index(table["name"])
+    return texts
+
+
+def _captures(run: Run) -> dict[str, str]:
+    return {cell.config.key: cell.capture_folder.name for cell in run.cells}
+
+
+def _read(path: Path) -> pd.DataFrame:
+    try:
+        table = pd.read_csv(path, keep_default_na=False)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: expected the claims.csv of an earlier judgement ({error})") from error
+    if missing := {"name", "scene", "verdict"} - set(table.columns):
+        raise InputError(
+            f"{path}: expected the claims.csv of an earlier judgement, {', '.join(sorted(missing))} missing"
+        )
+    return table
+
+
+def _pictures(
+    claims: Sequence[Claim], table: pd.DataFrame, runs: Mapping[str, Rows], album: Album
+) -> Iterator[tuple[str, tuple[Strip, ...]]]:
+    """Of each claim about pictures that was judged: truth and both rows, in the view of the median difference."""
+    by_name: Mapping[str, Claim] = {claim.name: claim for claim in claims}
+    strips: dict[tuple[str, ...], Strip] = {}
+    for name, scene, effect, run in zip(*(table[column] for column in ("name", "scene", "effect", "run")), strict=True):
+        claim = by_name[name]
+        if pd.isna(effect) or claim.metric not in IN_IMAGES:
+            continue
+        pair = runs[run][scene, claim.a], runs[run][scene, claim.b]
+        if (key := (run, scene, claim.a, claim.b, claim.split)) not in strips:
+            if (strip := _typical(pair, claim.split, album)) is None:
+                continue
+            strips[key] = strip
+        yield f"{name} on {scene}: {METRICS[claim.metric].title}", (strips[key],)
+
+
+def _typical(pair: tuple[Cells, Cells], split: str, album: Album) -> Strip | None:
+    """Of the first capture and seed that both rows have; None where they or the pictures are missing."""
+    ours, theirs = ({(cell.config.capture, cell.config.seed): (cell, r) for cell, r in cells} for cells in pair)
+    both = [key for key in ours if key in theirs]
+    if not both:
+        return None
+    shown = [Shown(cell=cell, result=result) for cell, result in (ours[both[0]], theirs[both[0]])]
+    views = [{(v.camera, v.frame): v for v in each.result.views if v.split == split} for each in shown]
+    if not all(each.result.has_alpha for each in shown) or not (shared := [key for key in views[0] if key in views[1]]):
+        return None
+    shared.sort(key=lambda key: psnr_of(views[0][key]) - psnr_of(views[1][key]))
+    try:
+        capture = load_capture(shown[0].cell.capture_folder)
+        frames = pictures.compare(capture, shown, views[0][shared[len(shared) // 2]], with_errors=False)
+    except InputError:
+        return None
+    return replace(frames, title=f"{frames.title}: the view of the median difference").strip(album)

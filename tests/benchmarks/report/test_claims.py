@@ -1,0 +1,214 @@
+"""Claims: their file, what decides them, and the command."""
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from helpers import cells
+
+from ash.files import InputError
+from benchmarks import cli
+from benchmarks.analysis.claims import Claim, broken, judge, read_claims
+from benchmarks.analysis.results import load
+from benchmarks.cell.schema import Cell, result_of, write_result
+from benchmarks.commands.arguments import FAILED
+from benchmarks.report.claims import write_claims
+from benchmarks.suites.files import find_suite, suite_files
+from benchmarks.suites.runs import Run, read_run
+
+PAPER = {"view_psnr": ("novel_view", "psnr"), "pose_psnr": ("novel_pose", "psnr")}
+PAPER |= {"view_lpips": ("novel_view", "lpips"), "pose_lpips": ("novel_pose", "lpips")}
+
+
+def test_every_contrast_can_be_run_by_a_suite_of_ours() -> None:
+    suites = [find_suite(name) for name in suite_files()]
+    rows = {
+        (scene.name, method)
+        for suite in suites
+        for scene in suite.scenes
+        for method in (scene.methods or [row.name for row in suite.methods])
+    }
+    judged = [claim for claim in read_claims() if not claim.cannot]
+    missing = [(c.name, s, m) for c in judged for s in c.scenes for m in (c.a, c.b) if (s, m) not in rows]
+    assert len(judged) > 30 and missing == []
+
+
+def test_published_differences_are_those_of_the_tables_beside_ours() -> None:
+    """`paper.toml` and `cameras.toml` have the paper's numbers; a row is a method or, of others, its title."""
+    given: dict[tuple[str, str], dict[str, float]] = {}
+    for table in (*find_suite("paper").table, *find_suite("cameras").table):
+        for row in (row for group in table.rows for row in group):
+            name = row.method or {"HDHumans": "hdhumans", "NA": "neural_actor", "TAVA": "tava"}[row.title]
+            given[table.scene, name] = dict(row.given)
+    checked = 0
+    for claim in read_claims():
+        for scene, difference in claim.paper.items():
+            column = next(k for k, asked in PAPER.items() if asked == (claim.split, claim.metric))
+            expected = given[scene, claim.a][column] - given[scene, claim.b][column]
+            assert difference == pytest.approx(expected, abs=0.015), claim.name
+            checked += 1
+    assert checked > 20
+
+
+def rows(a: Sequence[float], b: Sequence[float]) -> pd.DataFrame:
+    return load(cells.people({"ash": a, "ddc": b}))
+
+
+def verdict(claim: Claim, *tables: pd.DataFrame) -> str:
+    (row,) = judge([claim], {f"run {i}": table for i, table in enumerate(tables)}).itertuples()
+    return str(row.verdict)
+
+
+BETTER, SAME, UNCLEAR = (30.0, 31.0, 32.1), (28.0, 29.01, 30.0), (30.0, 28.0, 31.5)
+OTHER = (28.0, 29.0, 30.0)
+
+
+@pytest.mark.parametrize(
+    ("expect", "a", "found"),
+    [
+        ("better", BETTER, "confirmed"),
+        ("better", SAME, "contradicted"),
+        ("better", UNCLEAR, "not shown"),
+        ("worse", BETTER, "contradicted"),
+        ("equivalent", SAME, "confirmed"),
+        ("equivalent", BETTER, "contradicted"),
+        ("equivalent", UNCLEAR, "not shown"),
+        ("not better", SAME, "confirmed"),
+        ("not better", BETTER, "contradicted"),
+        ("not worse", BETTER, "confirmed"),
+        ("not worse", SAME, "confirmed"),
+    ],
+)
+def test_a_contrast_decides(expect: str, a: Sequence[float], found: str) -> None:
+    claim = Claim(name="n", says="s", where="w", a="ash", b="ddc", scenes=("loose",), expect=expect)  # type: ignore[arg-type]
+    assert verdict(claim, rows(a, OTHER)) == found
+    mirrored = {"better": "worse", "worse": "better", "not better": "not worse", "not worse": "not better"}
+    turned = Claim(
+        name="n", says="s", where="w", a="ddc", b="ash", scenes=("loose",), expect=mirrored.get(expect, expect)
+    )  # type: ignore[arg-type]
+    assert verdict(turned, rows(a, OTHER)) == found
+
+
+def test_a_published_difference_above_the_interval_makes_it_smaller() -> None:
+    claim = Claim(name="n", says="s", where="w", a="ash", b="ddc", scenes=("loose",), paper={"loose": 7.4})
+    assert verdict(claim, rows(BETTER, OTHER)) == "confirmed but smaller"
+    other_way = Claim(
+        name="n", says="s", where="w", a="ddc", b="ash", scenes=("loose",), expect="worse", paper={"loose": -2.0}
+    )
+    assert verdict(other_way, rows(BETTER, OTHER)) == "confirmed"
+
+
+def test_what_cannot_be_judged_says_why() -> None:
+    claim = Claim(name="n", says="s", where="w", a="ash", b="ddc", scenes=("loose",))
+    told = [
+        judge([claim], {"run": table}).because.item()
+        for table in (
+            rows((30.0,), (20.0,)),
+            load(cells.people({"ash": BETTER})),
+            load(cells.people({"ash": BETTER, "ddc": OTHER}, scene="tight")),
+            rows(BETTER, OTHER).assign(status="crashed"),
+            rows(BETTER, OTHER).assign(subject=100),
+        )
+    ]
+    assert told == [
+        "one person",
+        "no row ddc",
+        "no run of this scene",
+        "3 cells of ash failed",
+        "no run of this scene",
+    ]
+
+
+def test_it_is_judged_in_the_run_that_has_the_most_people() -> None:
+    claim = Claim(name="n", says="s", where="w", a="ash", b="ddc", scenes=("loose",))
+    few, many = rows(OTHER[:2], BETTER[:2]), rows(BETTER, OTHER)
+    table = judge([claim], {"alone": load(cells.people({"ash": BETTER})), "few": few, "many": many})
+    assert table[["run", "people", "verdict"]].to_numpy().tolist() == [["many", 3, "confirmed"]]
+
+
+def test_p_is_corrected_over_all_claims() -> None:
+    one = Claim(name="0", says="s", where="w", a="ash", b="ddc", scenes=("loose",))
+    many = [Claim(name=str(k), says="s", where="w", a="ash", b="ddc", scenes=("loose",)) for k in range(400)]
+    table = rows((28.9, 30.3, 30.9), OTHER)
+    assert judge([one], {"run": table}).verdict.item() == "confirmed"
+    assert set(judge(many, {"run": table}).verdict) == {"not shown"}
+
+
+def test_a_claim_that_held_and_does_not_any_more_is_named() -> None:
+    claim = Claim(name="n", says="s", where="w", a="ash", b="ddc", scenes=("loose",))
+    held, lost = (judge([claim], {"run": rows(a, OTHER)}) for a in (BETTER, SAME))
+    assert broken(held, held) == [] and broken(lost, held) == []
+    assert broken(held, lost) == ["n, loose: confirmed before, contradicted now"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "expected entries"),
+        ('[[claim]]\nname = "n"\nsays = "s"\n', "'where' is missing"),
+        ('[[claim]]\nname = "n"\nsays = "s"\nwhere = "w"\n', "expected a, b and scenes, or cannot"),
+        ('[[claim]]\nname = "n"\nsays = "s"\nwhere = "w"\na = "x"\nb = "y"\nscenes = ["z"]\nmetric = "m"\n', "metric"),
+        ('[[claim]]\nname = "n"\nsays = "s"\nwhere = "w"\nexpect = "good"\n', "expect"),
+        (2 * '[[claim]]\nname = "n"\nsays = "s"\nwhere = "w"\ncannot = "c"\n', "two claims are called n"),
+    ],
+)
+def test_a_wrong_file_is_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "claims.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message) as error:
+        read_claims(path)
+    assert "\n" not in str(error.value)
+
+
+@pytest.fixture
+def two_people(finished: Path, tmp_path: Path) -> Run:
+    """The finished run of the suite boxes, with its cells once more as those of another person."""
+    run = read_run(finished)
+    other = Path(shutil.copytree(run.cells[0].capture_folder, tmp_path / "other"))
+    more = []
+    for cell in run.cells:
+        config = replace(cell.config, subject=1)
+        folder = Path(shutil.copytree(cell.folder, tmp_path / "more" / config.key))
+        result = result_of(cell)
+        assert result is not None
+        write_result(folder, replace(result, config=config))
+        more.append(Cell(config=config, folder=folder, capture_folder=other))
+    return replace(run, cells=(*run.cells, *more))
+
+
+BOXES = """[[claim]]
+name = "detail"
+says = "more detail is more accurate"
+where = "here"
+a = "fake_good"
+b = "fake_bad"
+scenes = ["boxes"]
+"""
+
+
+def test_a_page_shows_what_was_judged(two_people: Run, tmp_path: Path) -> None:
+    file = tmp_path / "claims.toml"
+    file.write_text(BOXES)
+    lines, lost = write_claims([two_people], read_claims(file), tmp_path / "judged")
+    assert "confirmed 1" in lines[-1] and lost == []
+    page = (tmp_path / "judged" / "claims.html").read_text()
+    assert "the view of the median difference" in page and "run/report.html" in page
+    assert "more detail is more accurate" in (tmp_path / "judged" / "claims.md").read_text()
+
+
+def test_the_command(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, out = tmp_path / "claims.toml", tmp_path / "judged"
+    file.write_text(BOXES)
+    asked = ["claims", str(finished), "--claims", str(file), "--out", str(out)]
+    assert cli.main(asked) == cli.DONE
+    assert "cannot be judged here 1" in capsys.readouterr().out
+    before = tmp_path / "before.csv"
+    before.write_text((out / "claims.csv").read_text().replace("cannot be judged here", "confirmed"))
+    assert cli.main([*asked, "--before", str(before)]) == FAILED
+    told = "no longer holds: detail, boxes: confirmed before, cannot be judged here now"
+    assert told in capsys.readouterr().err
+    assert cli.main([*asked, "--before", str(file)]) == cli.WRONG_INPUT
+    assert cli.main(["claims", str(finished), "--out", str(out)]) == cli.DONE
