@@ -294,7 +294,8 @@ def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
     Where one scene's name stands for different captures of a subject, each is called as its capture's folder is.
 
     Raises:
-        InputError: a folder is no run, or people for validation are among others.
+        InputError: a folder is no run, people for validation are among others, or two cells of one name were trained
+            differently: a report would take them for two seeds.
     """
     runs = [read_run(folder) for folder in folders]
     cells = list({cell.config.key: cell for run in runs for cell in run.cells}.values())
@@ -304,10 +305,23 @@ def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
             f"{out}: people from {VALIDATION} on are there to choose by, expected a report without the others"
         )
     named = [_told_apart(cell) if cell.config.place in mixed else cell for cell in cells]
+    _require_one_of_each(named)
     about = f"cells of {', '.join(map(str, folders))}"
     titles = {name: title for run in reversed(runs) for name, title in run.titles.items()}  # The first run's first.
     table = next((run.table for run in runs if run.table), ())
     return Run(folder=out, suite=out.name, about=about, command=command, cells=tuple(named), titles=titles, table=table)
+
+
+def _require_one_of_each(cells: Iterable[Cell]) -> None:
+    names: dict[tuple[Any, ...], Cell] = {}
+    for cell in cells:
+        config = cell.config
+        other = names.setdefault((config.place, config.subject, config.capture, config.method, config.seed), cell)
+        if other is not cell:
+            raise InputError(
+                f"{cell.folder}: expected one cell {config.title}, another with other settings or code is"
+                f" {other.folder}; `train --row NAME` names a row, `compare` compares runs"
+            )
 
 
 def mixed_places(configs: Iterable[CellConfig]) -> set[str]:

@@ -92,11 +92,16 @@ def test_compare_tells_rows_and_shows_the_worst_frames(
 
 
 def test_a_report_over_runs_and_cells(runs: tuple[Path, Path], tmp_path: Path) -> None:
-    cells = [next((run / "cells").iterdir()) for run in runs]
+    cells = [*(runs[0] / "cells").iterdir()]
     assert cli.main(["report", *map(str, cells), "--out", str(tmp_path / "both")]) == 0
     assert "boxes" in (tmp_path / "both" / "report.md").read_text()
-    run = gathered([*runs, cells[0]], tmp_path, command="")
-    assert len(run.cells) == 4 and len({each.config.key for each in run.cells}) == 4
+    run = gathered([runs[0], cells[0]], tmp_path, command="")
+    assert len(run.cells) == 2 and len({each.config.key for each in run.cells}) == 2
+
+
+def test_two_avatars_of_one_name_are_no_two_seeds(runs: tuple[Path, Path], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"expected one cell boxes · mine · seed 0, another with other settings"):
+        gathered(runs, tmp_path, command="")
 
 
 def test_captures_of_one_name_are_told_apart(runs: tuple[Path, Path], tmp_path: Path) -> None:
