@@ -174,16 +174,18 @@ ADDITIONS: dict[str, Mapping[str, Any]] = {
     "background": {"training.background": "random"},
     "loss": {"training.l1_weight": 0.8, "training.ssim_weight": 0.2},
     "dilation": {"model.dilation": 0.05},
-    # Less: colours that are the same from everywhere; one U-Net that decodes at half the resolution.
+    # Less: colours that are the same from everywhere; one U-Net that decodes at half the resolution; a narrow one, which
+    # sees a single frame.
     "matt": {"model.sh_degree": 0},
     "coarse": {"model.shared_trunk": True, "model.shuffle": 2},
+    "narrow": {"model.width": 8, "model.window": 1},
 }
 
 
-def plus(preset: str) -> AshConfig:
-    """A preset with all `ADDITIONS`, which the paper does not have."""
-    config = named(preset)
-    return apply_overrides(config, {k: v for changes in ADDITIONS.values() for k, v in changes.items()}, of=preset)
+def plus(preset: str, *, without: str = "") -> AshConfig:
+    """A preset with all `ADDITIONS`, which the paper does not have, or all but one."""
+    changes = {key: value for name, each in ADDITIONS.items() if name != without for key, value in each.items()}
+    return apply_overrides(named(preset), changes, of=preset)
 
 
 @dataclass(frozen=True, kw_only=True)

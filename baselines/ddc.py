@@ -285,7 +285,8 @@ def _of_preset(preset: str) -> DdcConfig:
 
 
 def _plus(preset: str) -> DdcConfig:
-    return ddc_config(plus(preset), seed=0, template=plus(preset).template)
+    ash = plus(preset, without="narrow")
+    return ddc_config(ash, seed=0, template=ash.template)
 
 
 def _on_exact(preset: str) -> DdcConfig:
@@ -293,7 +294,7 @@ def _on_exact(preset: str) -> DdcConfig:
 
 
 ddc = MethodFactory(config=_of_preset, build=DdcAvatar.from_capture)  # On the template that `ash` gets.
-# With what `ash_plus` adds, as far as a mesh can have it: static texture, light, blending, and how textures are seen.
+# With what `ash_plus` adds, as far as a mesh can have it: static texture, light, and how textures are seen.
 ddc_plus = MethodFactory(config=_plus, build=DdcAvatar.from_capture)
 # An oracle on the exact surface, to see when a mesh wins.
 ddc_truth = MethodFactory(config=_on_exact, build=DdcAvatar.from_capture)

@@ -118,6 +118,7 @@ CHANGED_BY_ADDITION = {
     "dilation": {"drawing"},
     "matt": DECODERS | {"spread"},
     "coarse": DECODERS | {"textures"},
+    "narrow": DECODERS | {"textures"},
 }
 
 
@@ -137,7 +138,7 @@ def test_the_rows_of_the_suite_are_the_additions() -> None:
             if row in suite:
                 assert configured("ash", "cpu", suite[row].changes) == apply_overrides(presets.cpu(), wanted, of=row)
         assert f"plus_{name}" in suite
-        assert f"to_{name}" in suite or name in ("base", "coarse")
+        assert f"to_{name}" in suite or name in ("base", "narrow")
     assert apply_overrides(presets.cpu(), merged, of="all") == presets.plus("cpu")
 
 
@@ -206,7 +207,7 @@ MOVING = {"refinement", "weights"}
 OF_BOTH = {
     "seed": Case(1, {"batches", "weights"}),
     "model.window": Case(3, DECODERS | {"textures"}),
-    "model.width": Case(8, DECODERS),
+    "model.width": Case(12, DECODERS),
     "model.levels": Case(1, DECODERS),
     "model.shuffle": Case(1, DECODERS | {"textures"}),
     "model.standardise": Case(False, {"textures"}),
