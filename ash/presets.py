@@ -174,7 +174,7 @@ ADDITIONS: dict[str, Mapping[str, Any]] = {
     "background": {"training.background": "random"},
     "loss": {"training.l1_weight": 0.8, "training.ssim_weight": 0.2},
     "dilation": {"model.dilation": 0.05},
-    # Less: colours that are the same from everywhere; one U-Net, at half the resolution; half as wide, seeing one frame.
+    # Less: colours that are the same from everywhere; one U-Net, at half the side; half as wide, seeing one frame.
     "matt": {"model.sh_degree": 0},
     "coarse": {"model.shared_trunk": True, "model.shuffle": 2},
     "narrow": {"model.width": 8, "model.window": 1},
