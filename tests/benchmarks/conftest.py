@@ -52,7 +52,7 @@ def tube_run(shared: Shared) -> Path:
     def make(folder: Path) -> None:
         write_tube_capture(folder / "capture")
         short = ["--training.steps", "60", "--training.warmup_steps", "10"]
-        for method, more in (("ash_plus", ["--model.sh_degree", "2"]), ("ddc_plus", [])):
+        for method, more in (("ash_plus", ["--model.sh_degree", "2", "--model.window", "2"]), ("ddc_plus", [])):
             command = ["train", method, str(folder / "capture"), "--preset", "ci", "--out", str(folder / "run")]
             assert cli.main([*command, *short, *more]) == cli.DONE
 
