@@ -1,4 +1,4 @@
-"""A gate in a repository of one's own: its suite, and a GitHub workflow that runs it on every pull request."""
+"""A gate in a repository of one's own: its suite, and a GitHub workflow that runs it on pull requests and merges."""
 
 import shlex
 from pathlib import Path
@@ -16,24 +16,14 @@ methods = [{{ of = "{method}", name = "{name}" }}]
 preset = "ci"
 """
 
-# `gh` comes with GitHub's machines; the token is the workflow's own. An installed method would come before that of
-# `--method-path`, which is another one for each revision.
-STEPS = """\
-# Is this change worse or slower than the committed baseline? One comment per pull request, updated in place.
-name: gate
-on:
-  pull_request:
-permissions:
-  contents: read
-  pull-requests: write
-jobs:
-  gate:
+# An installed method would come before that of `--method-path`, which is another one for each revision.
+SETUP = """\
     runs-on: ubuntu-24.04
     timeout-minutes: 60
     steps:
       - uses: actions/checkout@v4
         with:
-          fetch-depth: 0 # Times are compared with those of the base, drawn in turn on this machine.
+          fetch-depth: 0 # Of a pull request, times are compared with those of the base, drawn in turn on this machine.
       - uses: actions/setup-python@v5
         with:
           python-version: "3.11"
@@ -49,15 +39,33 @@ jobs:
         with:
           path: data
           key: captures-${{ hashFiles('gate/*.toml') }}
+"""
+
+# `gh` comes with GitHub's machines; the token is the workflow's own. Only what was merged may write to the repository.
+WORKFLOW_TEXT = f"""\
+# Is this change worse or slower than the committed baseline? One comment per pull request, updated in place.
+# After a merge the scores and times of the commit are appended to the branch gate-history, whose index.html has charts.
+name: gate
+on:
+  pull_request:
+  push:
+    branches: [main, master]
+jobs:
+  gate:
+    if: github.event_name == 'pull_request'
+    permissions:
+      contents: read
+      pull-requests: write
+{SETUP}\
       - run: >-
           ash-bench/ash-bench --method-path METHOD_ROOT gate --baseline gate/baseline --out runs/gate
-          --against ${{ github.event.pull_request.base.sha }} --markdown gate.md --junit gate.xml
+          --against ${{{{ github.event.pull_request.base.sha }}}} --markdown gate.md --junit gate.xml
       - if: always()
         run: cat gate.md >> "$GITHUB_STEP_SUMMARY"
       - if: always()
-        run: gh pr comment ${{ github.event.number }} --body-file gate.md --edit-last --create-if-none
+        run: gh pr comment ${{{{ github.event.number }}}} --body-file gate.md --edit-last --create-if-none
         env:
-          GH_TOKEN: ${{ github.token }}
+          GH_TOKEN: ${{{{ github.token }}}}
       - if: always()
         uses: actions/upload-artifact@v4
         with:
@@ -66,6 +74,23 @@ jobs:
             gate.md
             gate.xml
             runs/gate/rendering_*.png
+  history:
+    if: github.event_name == 'push'
+    permissions:
+      contents: write
+    concurrency: gate-history
+{SETUP}\
+      - run: |
+          if ! git worktree add history gate-history; then
+            git worktree add --detach history
+            git -C history switch --orphan gate-history
+          fi
+          # Exit code 1: a commit that is worse belongs to the history.
+          ash-bench/ash-bench --method-path METHOD_ROOT gate --baseline gate/baseline --out runs/gate \\
+            --history history || [ $? = 1 ]
+          git -C history add history.jsonl index.html
+          git -C history -c user.name=gate -c user.email=gate@localhost commit --message "$GITHUB_SHA"
+          git -C history push origin gate-history
 """
 
 
@@ -83,7 +108,7 @@ def start(method: str, folder: Path) -> Path:
         if path.exists():
             raise InputError(f"{path}: is there already; expected a repository without a gate")
     write_atomic(suite, SUITE.format(method=method, name=name).encode())
-    write_atomic(WORKFLOW, STEPS.replace("METHOD_ROOT", shlex.quote(root)).encode())
+    write_atomic(WORKFLOW, WORKFLOW_TEXT.replace("METHOD_ROOT", shlex.quote(root)).encode())
     return suite
 
 

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import textwrap
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -26,7 +27,7 @@ from benchmarks.gate.baseline import Accepted, Baseline, Entry, GateFile, read_b
 from benchmarks.gate.checks import FAILING, Check, of_exact_change, outcome
 from benchmarks.gate.exact import equal_seeds, first_steps_check
 from benchmarks.gate.gate import Judgement, _times_again
-from benchmarks.gate.starting import start
+from benchmarks.gate.starting import WORKFLOW_TEXT, start
 from benchmarks.gate.statistical import (
     count_checks,
     judge_quality,
@@ -315,6 +316,36 @@ def test_a_gate_is_started_in_a_repository(tmp_path: Path, monkeypatch: pytest.M
         start("started_here.avatar:mine", Path("gate"))
     with pytest.raises(InputError, match="expected a module of the repository"):
         start("helpers.fakes:good", Path("other"))
+
+
+def test_the_workflow_keeps_the_history_on_a_branch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its last step, in two clones after each other; the gate is a script that finds something worse."""
+    script = "set -e\n" + textwrap.dedent(WORKFLOW_TEXT.rpartition("- run: |\n")[2])
+    monkeypatch.setenv("GIT_CONFIG_GLOBAL", os.devnull)
+    monkeypatch.setenv("GITHUB_SHA", "abc")
+
+    def git(*words: str | Path) -> str:
+        command = ["git", "-c", "user.name=me", "-c", "user.email=me@example.org", *map(str, words)]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+    origin, first = tmp_path / "origin.git", tmp_path / "first"
+    git("init", "--quiet", "--bare", "--initial-branch=main", origin)
+    git("clone", "--quiet", origin, first)
+    (first / "method.py").write_text("")
+    git("-C", first, "add", "method.py")
+    git("-C", first, "commit", "--quiet", "--message", "a method")
+    git("-C", first, "push", "--quiet", "origin", "HEAD:main")
+    for name in ("first", "second"):
+        clone = tmp_path / name
+        if not clone.exists():
+            git("clone", "--quiet", origin, clone)
+        (clone / "ash-bench").mkdir()
+        gate = clone / "ash-bench" / "ash-bench"
+        gate.write_text("#!/bin/sh\necho line >> history/history.jsonl\necho page > history/index.html\nexit 1\n")
+        gate.chmod(0o755)
+        subprocess.run(["bash", "-c", script], cwd=clone, check=True, capture_output=True)
+    assert git("-C", origin, "ls-tree", "--name-only", "gate-history").split() == ["history.jsonl", "index.html"]
+    assert git("-C", origin, "show", "gate-history:history.jsonl") == "line\nline\n"
 
 
 def test_history_marks_a_step_with_its_commit_and_refuses_damage(tmp_path: Path) -> None:
