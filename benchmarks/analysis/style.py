@@ -40,6 +40,7 @@ ADDED = (  # by `ash_plus`: name, title, colour
     ("dilation", "less dilation", "#008fb3"),
     ("matt", "SH 0", "#7a869a"),
     ("coarse", "one coarse U-Net", "#dd6b20"),
+    ("narrow", "half the width, one frame", "#5b6b7a"),
 )
 STYLES = {
     "ash": MethodStyle(title="ASH", colour="#2f6fde"),
@@ -53,6 +54,7 @@ STYLES = {
     "wo_mot_plus": MethodStyle(title="ASH+ w/o mot.", colour="#c77dff", reference="ash_plus"),
     "wo_mot_truncated": MethodStyle(title="w/o mot., 40 s of footage", colour="#7a869a"),
     "res_128": MethodStyle(title="half texels", colour="#5b8c2a"),
+    "double_width": MethodStyle(title="ASH+, double width", colour="#9b59b6", reference="ash_plus"),
     "half_width": MethodStyle(title="ASH+, half width", colour="#c2415c", reference="ash_plus"),
     "half_texels": MethodStyle(title="ASH+, half texels", colour="#5b8c2a", reference="ash_plus"),
     "half_texels_and_width": MethodStyle(title="ASH+, half texels and width", colour="#008fb3", reference="ash_plus"),
@@ -65,6 +67,7 @@ STYLES = {
     "unlearned": MethodStyle(title="skinned template", colour="#b8860b"),
     "wo_phi": MethodStyle(title="w/o Phi", colour="#c2415c"),
     "plus_window_1": MethodStyle(title="ASH+, window 1", colour="#7a869a", reference="ash_plus"),
+    "plus_window_3": MethodStyle(title="ASH+, window 3", colour="#7a869a", reference="ash_plus"),
     "wo_phi_and_light": MethodStyle(title="ASH+ w/o Phi and light", colour="#5b8c2a", reference="ash_plus"),
     "sh_0": MethodStyle(title="SH 0", colour="#008fb3"),
     "sh_1": MethodStyle(title="SH 1", colour="#a0522d"),
