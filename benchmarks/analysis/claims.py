@@ -115,15 +115,15 @@ def judge(claims: Sequence[Claim], runs: Mapping[str, pd.DataFrame]) -> pd.DataF
 
 def _compared_in(claim: Claim, scene: str, runs: Mapping[str, pd.DataFrame]) -> tuple[Comparison | None, str, str]:
     """The comparison in the run that has the most people; or None, and why there is none; and the run's name."""
-    missing = "no run"
-    best: tuple[Comparison | None, str] = None, ""
-    for name, rows in runs.items():
-        test, why = _compared(claim, rows[(rows["scene"] == scene) & (rows["subject"] < VALIDATION)])
-        if test is None:
-            missing = why if missing in ("no run", NO_SCENE) else missing
-        elif best[0] is None or test.captures > best[0].captures:
-            best = test, name
-    return best[0], "" if best[0] else missing, best[1]
+    asked = [
+        (name, *_compared(claim, rows[(rows["scene"] == scene) & (rows["subject"] < VALIDATION)]))
+        for name, rows in runs.items()
+    ]
+    judged = [(test, name) for name, test, _ in asked if test is not None]
+    if not judged:
+        return None, next((why for _, _, why in asked if why != NO_SCENE), NO_SCENE), ""
+    test, name = max(judged, key=lambda each: each[0].captures)  # the first of equals
+    return test, "", name
 
 
 def _compared(claim: Claim, rows: pd.DataFrame) -> tuple[Comparison | None, str]:

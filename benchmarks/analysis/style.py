@@ -66,7 +66,6 @@ STYLES = {
     "window_1": MethodStyle(title="window 1", colour="#008fb3"),
     "unlearned": MethodStyle(title="skinned template", colour="#b8860b"),
     "wo_phi": MethodStyle(title="w/o Phi", colour="#c2415c"),
-    "plus_window_1": MethodStyle(title="ASH+, window 1", colour="#7a869a", reference="ash_plus"),
     "plus_window_3": MethodStyle(title="ASH+, window 3", colour="#7a869a", reference="ash_plus"),
     "wo_phi_and_light": MethodStyle(title="ASH+ w/o Phi and light", colour="#5b8c2a", reference="ash_plus"),
     "sh_0": MethodStyle(title="SH 0", colour="#008fb3"),

@@ -19,7 +19,7 @@ from benchmarks.report.compare import Rows, cells_by_row
 from benchmarks.report.content import Block, Bullets, Mark, Report, Section, Strip, Strips, Table, Text
 from benchmarks.report.page import render
 from benchmarks.report.pictures import Album, Shown
-from benchmarks.suites.runs import Run, results_of
+from benchmarks.suites.runs import Run
 
 ABOUT = (
     "A claim is judged by its contrast, the mean of the first row minus that of the second, in pairs over people; in "
@@ -45,7 +45,8 @@ def write_claims(
         InputError: a run has no finished cell, or `before` is no claims.csv.
     """
     earlier = None if before is None else _read(before)
-    table = judge(claims, {str(run.folder): load(results_of(run), _captures(run)) for run in runs})
+    rows = {str(run.folder): cells_by_row(run) for run in runs}
+    table = judge(claims, {name: _table(of_run) for name, of_run in rows.items()})
     lost = [] if earlier is None else broken(earlier, table)
     write_atomic(out / "claims.csv", table.to_csv(index=False, float_format="%.6g").encode())
     counts = table["verdict"].value_counts()
@@ -59,10 +60,10 @@ def write_claims(
     blocks: list[Block] = [Text(text=ABOUT), Table(frame=shown, corner="claim", marks=marks)]
     if lost:
         blocks.insert(0, Bullets(items=tuple(lost)))
-    groups = tuple(_pictures(claims, table, {str(run.folder): cells_by_row(run) for run in runs}, album))
-    page = [*blocks, Strips(file="", title="", groups=groups)] if groups else blocks
     if links := [os.path.relpath(path, out) for run in runs if (path := run.folder / "report.html").exists()]:
-        page.append(Text(text=f"Reports of the runs: {', '.join(links)}."))
+        blocks.append(Text(text=f"Reports of the runs: {', '.join(links)}."))
+    groups = tuple(_pictures(claims, table, rows, album))
+    page = [*blocks, *([Strips(file="", title="", groups=groups)] if groups else [])]
     for form, content in (("html", page), ("md", blocks)):
         section = Section(title="Claims", headline=f"{headline}.", blocks=tuple(content))
         text = render(Report(title="ash-bench: claims", sections=(section,)), form, album)  # type: ignore[arg-type]
@@ -98,8 +99,9 @@ def printed(table: pd.DataFrame) -> pd.DataFrame:
     return texts
 
 
-def _captures(run: Run) -> dict[str, str]:
-    return {cell.config.key: cell.capture_folder.name for cell in run.cells}
+def _table(rows: Rows) -> pd.DataFrame:
+    cells = [pair for of_row in rows.values() for pair in of_row]
+    return load([result for _, result in cells], {cell.config.key: cell.capture_folder.name for cell, _ in cells})
 
 
 def _read(path: Path) -> pd.DataFrame:
