@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
+from functools import cache
 from typing import Any, TypeVar, get_type_hints
 
 from typeguard import TypeCheckError, check_type
@@ -117,7 +118,12 @@ def _has_parts(value: Any) -> bool:
 
 
 def _hint(config: Any, name: str) -> Any:
-    return type(config[int(name)]) if isinstance(config, tuple) else get_type_hints(type(config))[name]
+    return type(config[int(name)]) if isinstance(config, tuple) else _hints(type(config))[name]
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
 
 
 def _of_type(hint: Any, value: Any, where: str) -> Any:

@@ -2,15 +2,13 @@
 
 import os
 import signal
-import sys
 from collections.abc import Iterator
-from functools import cache
 
 import pytest
 from helpers.browser import chromium, visit  # noqa: F401  (fixtures for all)
 from helpers.sharing import ci_data, shared, small_capture  # noqa: F401
 
-from benchmarks.cell import metrics, registry
+from benchmarks.cell import metrics
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -22,11 +20,7 @@ def can_be_interrupted() -> Iterator[None]:
 
 
 def pytest_sessionstart() -> None:
-    """What is installed follows `sys.path` here; to read it anew takes a tenth of a second at each look."""
     os.environ.setdefault(metrics.LPIPS_WEIGHTS, "none")  # They take a second in each of hundreds of cells.
-    look = registry.methods
-    seen = cache(lambda path: look())
-    registry.methods = lambda: seen(tuple(sys.path))
 
 
 LONG = (

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import re
+import sys
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -91,6 +92,12 @@ def brought_folder(of: str) -> Path | None:
 
 def methods() -> dict[str, Method]:
     """All installed methods, ours and anyone's."""
+    return _installed(tuple(sys.path))
+
+
+@cache
+def _installed(path: tuple[str, ...]) -> dict[str, Method]:
+    """The entry points of the distributions on `path`, which is `sys.path`: each takes reading a file."""
     entries = sorted(entry_points(group=METHOD_GROUP), key=lambda entry: entry.name)
     distributions = {id(entry.dist): entry.dist for entry in entries if entry.dist is not None}
     named = {key: f"{dist.name} {dist.version}" for key, dist in distributions.items()}  # Each reads a file.

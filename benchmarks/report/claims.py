@@ -88,10 +88,7 @@ def printed(table: pd.DataFrame) -> pd.DataFrame:
             else f"{number(row.effect, row.unit)} [{number(row.low, '')}, {number(row.high, '')}]",
             "paper": number(row.paper, row.unit),
             "people": "" if pd.isna(row.people) else str(int(row.people)),
-            "says": row.says,
-            "place": row.where,
-            "because": row.because,
-            "run": row.run,
+            "says": f"{row.says} ({row.where})" + (f" Note: {row.because}." if row.because else ""),
         }
         for row in table.itertuples()
     )
