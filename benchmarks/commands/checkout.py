@@ -137,6 +137,6 @@ def _test_without_namespaces(root: Path, run: Callable[..., "subprocess.Complete
         print(f"--- {name}: not run, {why_not}", flush=True)
         return []
     print(f"--- {name}", flush=True)
-    spread = ["-n", str(cores()), "--max-worker-restart", "0"]
+    spread = ["-n", str(cores()), "--max-worker-restart", "0", "-m", "not slow and not both_ways"]
     pytest = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *spread]
     return [name] if run([*place, *pytest, "tests/benchmarks/cell/test_isolation.py"]).returncode else []

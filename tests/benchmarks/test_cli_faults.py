@@ -95,11 +95,10 @@ def test_a_file_beyond_the_systems_limit(capture: Path, tmp_path: Path) -> None:
     assert "Traceback" not in told.stderr
 
 
-@pytest.mark.parametrize("closed", ["2>&-", "<&- >&- 2>&-"])
-def test_closed_streams_change_nothing(closed: str, finished: Path, boxes: str) -> None:
+def test_closed_streams_change_nothing(finished: Path, boxes: str) -> None:
     before = (finished / "results.csv").read_bytes()
     (finished / "results.csv").unlink()
-    command = f'exec "{sys.executable}" -m benchmarks.cli run "{boxes}" --out "{finished}" {closed}'
+    command = f'exec "{sys.executable}" -m benchmarks.cli run "{boxes}" --out "{finished}" <&- >&- 2>&-'
     assert subprocess.run(command, shell=True, check=False).returncode == arguments.DONE
     assert (finished / "results.csv").read_bytes() == before
 

@@ -25,6 +25,7 @@ from benchmarks.suites.runs import cell_for
 from benchmarks.suites.suites import CaptureSpec, CellSpec
 
 LIMITS = Limits(seconds=300.0, memory_mb=4096)
+BOTH_WAYS = pytest.mark.both_ways  # Sets isolation itself, so that a kernel without namespaces changes nothing.
 METHODS = ("thief", "clock", "warps", "memoises", "prepares_elsewhere", *thieves.HOW, *thieves.SHOWN)
 
 
@@ -151,6 +152,7 @@ def test_all_work_before_the_first_picture_is_training(capture: Path, tmp_path: 
     assert result.value("speed", "", "train_s") > 1.5 and result.value("speed", "", "train_cpu_s") > 1.4
 
 
+@BOTH_WAYS
 @pytest.mark.parametrize("way", ["on", "off"])
 def test_a_result_that_another_cell_changed_is_made_again(
     way: str, own_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -167,6 +169,7 @@ def test_a_result_that_another_cell_changed_is_made_again(
     assert ("its result was changed while another cell ran" in lines) == (sandbox.problem() is not None)
 
 
+@BOTH_WAYS
 def test_methods_that_change_each_other_s_results_end_the_run(
     own_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -186,6 +189,7 @@ def test_a_damaged_result_is_made_again_and_kept_beside(capture: Path, tmp_path:
     assert (path.parent.with_name(f"{path.parent.name}.damaged") / "result.json").stat().st_size == 100
 
 
+@BOTH_WAYS
 @pytest.mark.parametrize("way", ["on", "off"])
 def test_a_method_s_folder_has_a_limit(
     way: str, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -197,6 +201,7 @@ def test_a_method_s_folder_has_a_limit(
     assert result.status == "crashed" and "MB, the limit is 100 MB" in result.reason
 
 
+@BOTH_WAYS
 @pytest.mark.parametrize("way", ["on", "off"])
 def test_what_a_method_started_ends_with_it_when_it_is_ended_for_memory(
     way: str, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -245,6 +250,7 @@ def test_however_a_method_ends_its_cell_has_a_result(
     assert result is not None and result.status == status and reason in result.reason, result.reason
 
 
+@BOTH_WAYS
 @pytest.mark.parametrize("way", ["on", "off"])
 def test_a_method_that_is_killed_from_outside_is_tried_again_and_then_crashed(
     way: str, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -288,6 +294,7 @@ def test_printing_is_bounded_and_processes_end_with_their_cell(capture: Path, tm
         assert result is not None and result.status == "done", result.reason
 
 
+@BOTH_WAYS
 def test_without_namespaces_the_row_says_so(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(sandbox.ISOLATION, "off")
     plain = cell("fake_good", capture, tmp_path)
@@ -317,8 +324,8 @@ def test_isolation_costs_a_cell_at_most_half_a_second(
     assert isolated - exposed < 0.5
 
 
-@pytest.mark.parametrize("way", ["on", "off"])
-@pytest.mark.parametrize("seeded", [True, False])
+@BOTH_WAYS
+@pytest.mark.parametrize(("seeded", "way"), [(True, "on"), (True, "off"), (False, "on")])
 def test_kernels_are_compiled_once_and_every_cell_has_its_own_copy(
     seeded: bool, way: str, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -349,6 +356,7 @@ def test_without_a_gpu_there_is_nothing_to_compile(tmp_path: Path, capfd: pytest
     assert "device cuda:99: no kernels are compiled, Warp" in capfd.readouterr().err
 
 
+@BOTH_WAYS
 def test_a_capture_that_a_method_changed_is_seen_and_used_no_more(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

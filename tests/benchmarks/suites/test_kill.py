@@ -33,7 +33,7 @@ OUR_TRACEBACK = re.compile(r'^  File ".*/(ash|synth|baselines|benchmarks)/.*", l
 @pytest.mark.parametrize(
     ("kills", "longest", "methods"),
     [  # With time for a machine that others use as well.
-        pytest.param(4, 1 / 4, ("ash_plus", "ddc_plus"), marks=pytest.mark.timeout(900)),
+        pytest.param(4, 1 / 6, ("ash_plus", "ddc_plus"), marks=pytest.mark.timeout(900)),
         pytest.param(
             *(MANY, 1 / 4, ("ash", "ash_plus", "ddc_plus", "ash_truth", "ddc_truth")),
             marks=[pytest.mark.slow, pytest.mark.timeout(60 * MANY)],
