@@ -31,6 +31,7 @@ from ash.fields import suggest
 from ash.files import InputError, disk_problem
 from benchmarks.aliases import OLD_COMMANDS
 from benchmarks.cell.sandbox import METHOD_PATH, add_method_paths
+from benchmarks.cell.schema import HarnessFailed, Killed
 from benchmarks.commands.arguments import DONE, INTERRUPTED, WRONG_INPUT, Command, own_name, read_command
 
 METHOD_PATH_FLAG = "--method-path"
@@ -70,6 +71,8 @@ def main(argv: list[str] | None = None) -> int:
             return DONE if command is None else command()
     except InputError as error:
         return _refuse(str(error))
+    except (HarnessFailed, Killed) as error:  # Of `train` and `eval`, which run a cell in this process.
+        return _refuse(str(error) or "the method's process was killed from outside")
     except BrokenPipeError:  # Whoever read our output has seen enough (`| head`).
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE

@@ -24,9 +24,9 @@ PACKAGES = (
 )
 
 
-def commit() -> str:
-    """The checkout's commit, with `+` where files differ from it; `unknown` outside a checkout."""
-    root = Path(__file__).parent.parent
+def commit(root: Path | None = None) -> str:
+    """The commit of a checkout (ours), with `+` where files differ from it; `unknown` outside a checkout."""
+    root = root or Path(__file__).parent.parent
     if not (root / ".git").exists() or shutil.which("git") is None:
         return "unknown"
     revision = _git(root, "rev-parse", "--short=12", "HEAD")

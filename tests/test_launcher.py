@@ -1,4 +1,4 @@
-"""The one door, tried on a tiny stand-in project: same launcher, no downloads."""
+"""The launcher, tried on a tiny stand-in project: same launcher, no downloads."""
 
 import os
 import shutil
@@ -157,6 +157,16 @@ def test_failed_step_points_at_the_log_and_is_tried_again(project: Path, environ
     last = done.stderr.splitlines()[-1]
     assert "no such kernel" in last and str(project / ".venv" / "setup.log") in last
     (project / "broken").unlink()
+    assert launch(project, "x", "0", env=environment).returncode == 0
+
+
+def test_packages_that_cannot_be_installed_end_the_set_up(project: Path, environment: dict[str, str]) -> None:
+    before = (project / "pyproject.toml").read_text()
+    (project / "pyproject.toml").write_text(before.replace('"tiny"', '"tiny", "not_there"'))
+    done = launch(project, "x", "0", env=environment)
+    assert done.returncode == 1
+    assert "packages (" in done.stderr.splitlines()[-1] and "not_there" in done.stderr.splitlines()[-1]
+    (project / "pyproject.toml").write_text(before)
     assert launch(project, "x", "0", env=environment).returncode == 0
 
 

@@ -7,14 +7,18 @@ from dataclasses import dataclass
 
 import pandas as pd
 
+from benchmarks.analysis import style
 from benchmarks.analysis.results import RunTables
 from benchmarks.analysis.style import style_of
 from synth.presets import FACTORS
 
 REFERENCE = "ash"
-NOT_ABLATIONS = ("static", "nearest", "ddc")  # other methods than ASH without one component
-# Rows that have a component which ASH lacks, and what ASH is without.
-ADDED = {"plus_light": "w/o light", "plus_heading": "w/o heading normalised"}
+# Rows that have a component which ASH lacks, and what ASH is without; other additions change what ASH has.
+ADDED = {
+    f"plus_{name}": f"w/o {title}"
+    for name, title, _ in style.ADDED
+    if name in ("base", "light", "standardise", "heading", "background")
+}
 FLIPPED = {"better": "worse", "worse": "better"}
 # Rows without the component that the one phenomenon of a scene needs.
 EXPECTED: dict[str, tuple[str, ...]] = {
@@ -29,6 +33,7 @@ EXPECTED: dict[str, tuple[str, ...]] = {
     "loose": ("unlearned",),
 }
 COMPONENTS = tuple(dict.fromkeys(row for rows in EXPECTED.values() for row in rows))
+SHOWN = frozenset((*COMPONENTS, *ADDED, "ddc"))  # Other rows are not ASH without one component.
 # Scenes that test the reason of a surprise, and in what they differ.
 OVERCAST = ("overcast", "under an even sky, where no lamp casts shadows")
 CONTROL_SCENES = {
@@ -80,7 +85,7 @@ def effects(table: pd.DataFrame, split: str) -> list[AblationEffect]:
         mean, low, high, verdict = row.mean, row.low, row.high, row.verdict
         if row.method in ADDED:
             mean, low, high, verdict = -mean, -high, -low, FLIPPED.get(verdict, verdict)
-        if row.method not in NOT_ABLATIONS[:2]:
+        if row.method in SHOWN:
             cells.append(
                 AblationEffect(scene=row.scene, row=row.method, mean=mean, low=low, high=high, verdict=verdict)
             )
@@ -92,7 +97,7 @@ def matrix(tables: RunTables, table: pd.DataFrame, split: str) -> list[AblationE
     """The cells of the matrix; none of fewer than two scenes or without an ablation."""
     cells = [effect for effect in effects(table, split) if not is_strength(effect.scene)]
     scenes = [scene for scene in tables.scenes if REFERENCE in tables.methods(scene) and not is_strength(scene)]
-    return cells if len(scenes) > 1 and any(effect.row not in NOT_ABLATIONS for effect in cells) else []
+    return cells if len(scenes) > 1 and any(effect.row != "ddc" for effect in cells) else []
 
 
 def surprises(cells: list[AblationEffect]) -> list[str]:

@@ -12,6 +12,7 @@ from ash.capture.typed import from_json
 from ash.files import InputError
 from benchmarks.analysis.results import Quantity, samples_of
 from benchmarks.analysis.statistics import Comparison, compare_samples, corrected
+from benchmarks.analysis.style import style_of
 from benchmarks.cell.metrics import METRICS
 from synth.person.cast import VALIDATION
 
@@ -94,7 +95,10 @@ def judge(claims: Sequence[Claim], runs: Mapping[str, pd.DataFrame]) -> pd.DataF
     records = []
     for claim, scene, test, missing, run in asked:
         test = None if test is None else next(tests)
-        verdict, because = ("cannot be judged here", missing) if test is None else _verdict(claim, scene, test)
+        verdict: Verdict
+        verdict, because = "cannot be judged here", missing
+        if test is not None:
+            verdict, because = _verdict(claim, scene, test, _short_of_plateau(claim, scene, runs[run]))
         records.append(
             {
                 "name": claim.name,
@@ -150,21 +154,35 @@ def _compared(claim: Claim, rows: pd.DataFrame) -> tuple[Comparison | None, str]
     return (test, "") if test.captures else (None, "one person")
 
 
+def _short_of_plateau(claim: Claim, scene: str, rows: pd.DataFrame) -> str:
+    """Which of the two rows ended a training before its plateau; empty where none did."""
+    ended = rows[(rows["scene"] == scene) & (rows["metric"] == "plateau") & (rows["value"] < 1)]
+    short = [style_of(row).title for row in (claim.a, claim.b) if (ended["method"] == row).any()]
+    return f"not at their plateau when training ended: {', '.join(short)}" if short else ""
+
+
 def _numbers(test: Comparison | None) -> dict[str, Any]:
     if test is None:
         return dict.fromkeys(("effect", "low", "high", "p", "people"))
     return {"effect": test.mean, "low": test.low, "high": test.high, "p": test.p, "people": test.captures}
 
 
-def _verdict(claim: Claim, scene: str, test: Comparison) -> tuple[Verdict, str]:
-    """The verdict, and what stands behind it."""
+def _verdict(claim: Claim, scene: str, test: Comparison, short: str) -> tuple[Verdict, str]:
+    """The verdict, and what stands behind it; `short`: which rows had not reached a plateau."""
     verdict = DECIDES[claim.expect].get(test.verdict, "not shown")
+    low, high = sorted((test.low, test.high) if test.higher_is_better else (-test.low, -test.high))
+    if (claim.expect == "not worse" and low >= -test.margin) or (claim.expect == "not better" and high <= test.margin):
+        verdict = "confirmed"
+    least = 0.0 if claim.least is None else claim.least
+    beyond = {"better": low > least, "worse": high < -least}.get(claim.expect, True)
+    if verdict == "confirmed" and claim.least is not None and not beyond:
+        verdict = "not shown"
     published = claim.paper.get(scene)
     if verdict == "confirmed" and claim.expect in ("better", "worse") and published is not None:
         far = test.high if published > 0 else test.low  # The end of the interval that lies nearest to the publication.
         if abs(far) < abs(published):
             verdict = "confirmed but smaller"
-    told = (claim.condition, "" if verdict in HOLDS else claim.experiment)
+    told = (short, claim.condition, "" if verdict in HOLDS else claim.experiment)
     return verdict, "; ".join(filter(None, told))
 
 

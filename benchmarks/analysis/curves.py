@@ -87,10 +87,11 @@ def data_scaling(rows: pd.DataFrame) -> pd.DataFrame:
     scenes = rows.loc[rows["axis"] == FOOTAGE_AXIS, "scene"].unique()
     records = []
     for (scene, severity), here in rows[rows["scene"].isin(scenes)].groupby(["scene", "severity"], sort=False):
+        counts = here[here["metric"] == "train_frames"].groupby("method")["value"].max()
         for split in HELD_OUT_SPLITS:
             for method, samples in samples_of(here, foreground(split)).items():
                 interval = mean_interval(independent(samples))
-                frames = FOOTAGE_FRAMES - int(severity)
+                frames = int(counts.get(method, FOOTAGE_FRAMES - severity))
                 records.append((scene, split, method, frames, interval.mean, interval.low, interval.high))
     table = _table(records, "scene", "split", "method", "frames")
     order = table["split"].map(HELD_OUT_SPLITS.index)
@@ -127,7 +128,10 @@ def novelty(images: pd.DataFrame) -> pd.DataFrame:
     Novel views of training poses stand at zero degrees; the frames of all novel poses are sorted by novelty into bins
     of equal number. Scenes whose frames fill fewer than two bins, or lie within a degree, have no curve.
     """
-    with_novelty = images[images["split"].isin(HELD_OUT_SPLITS) & images["novelty_deg"].notna()]
+    if "psnr" not in images:  # All pictures were brought without alpha.
+        return _table([], "scene", "method", "novelty_deg")
+    known = images["novelty_deg"].notna() & images["psnr"].notna()
+    with_novelty = images[images["split"].isin(HELD_OUT_SPLITS) & known]
     rows = [row for scene, here in with_novelty.groupby("scene", sort=False) for row in _novelty_of(str(scene), here)]
     return _table(rows, "scene", "method", "novelty_deg")
 

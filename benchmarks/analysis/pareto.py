@@ -67,8 +67,9 @@ def smallest_sufficient(candidates: Sequence[Candidate], *, margin: float = SUFF
         loss = compare_samples(best.samples, candidate.samples, level=ONE_SIDED)
         if loss is None or math.isnan(loss.high):
             return None
-        if candidate is best or loss.high < margin:
-            return Sufficient(name=candidate.name, best=best.name, loss_bound_db=loss.high)
+        bound = 0.0 if candidate is best else loss.high
+        if bound < margin:
+            return Sufficient(name=candidate.name, best=best.name, loss_bound_db=bound)
     return None
 
 

@@ -231,7 +231,6 @@ class RunTables:
         self.curves, self.snapshots = load_curves(results), load_snapshots(results)
         self.summary = summarise(self.rows)
         self.scenes = tuple(self.rows["scene"].unique())
-        self.seeds = int(self.rows["seed"].nunique())
 
     @cached_property
     def _by_scene(self) -> dict[str, pd.DataFrame]:
@@ -275,9 +274,13 @@ class RunTables:
         """How many captures a scene has."""
         return int(self.of(scene)["capture"].nunique())
 
+    def seeds(self, scene: str) -> int:
+        """With how many seeds methods were trained on a scene."""
+        return int(self.of(scene)["seed"].nunique())
+
     def unit(self, scene: str) -> str:
         """What intervals of a scene are taken over; empty where it has a single value."""
-        return "captures" if self.captures(scene) > 1 else "seeds" if self.seeds > 1 else ""
+        return "captures" if self.captures(scene) > 1 else "seeds" if self.seeds(scene) > 1 else ""
 
     def for_validation(self, scene: str) -> bool:
         """Whether the subjects of a scene are those for validation and tuning."""

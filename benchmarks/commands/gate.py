@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from ash.files import InputError
-from benchmarks.commands.arguments import DONE, FAILED, Count, File, Folder
+from benchmarks.commands.arguments import DONE, FAILED, File, Folder, whole
 
 if TYPE_CHECKING:
     from benchmarks.gate.baseline import Baseline
@@ -22,7 +22,7 @@ class GateCommand:
 
     baseline: Folder = Path("reports/baseline")  # what today's code is compared with
     suite: str | None = None  # of a new baseline: a name or FILE.toml, default ci; else the baseline has its own
-    seeds: Count = 6  # of a new baseline: as many are the most that a comparison can use
+    seeds: Annotated[int, whole(2)] = 6  # of a new baseline: as many are the most that a comparison can use
     minutes: float = 10.0  # that trainings beyond two seeds of each row may take
     strict: bool = False  # exit with 1 where anything changed
     data: Folder = Path("data")  # where captures are kept
@@ -121,8 +121,10 @@ class GateCommand:
         return DONE
 
     def _accept(self, row: str) -> int:
+        from benchmarks.gate.against import commit_of
         from benchmarks.gate.baseline import GateFile, read_baseline, with_row, write_baseline
         from benchmarks.gate.gate import cells_of, times_of, trained
+        from benchmarks.provenance import processor_name
         from benchmarks.suites.files import read_suite
 
         if not self.because:
@@ -135,8 +137,11 @@ class GateCommand:
         if row not in by_row:
             raise InputError(f"--accept: expected one of {'; '.join(by_row)}, got {row!r}")
         rows = trained({row: by_row[row]}, suite, options)
-        times = {**baseline.file.times, **times_of(rows, self.out)}
-        run, accepted = with_row(baseline, row, rows[row], self.because)
+        same = processor_name() == baseline.file.machine  # Others' times would be compared as if they were its own.
+        times = {**baseline.file.times, **(times_of(rows, self.out) if same else {row: {}})}
+        run, accepted = with_row(
+            baseline, row, rows[row], because=self.because, commit=commit_of({rows[row][0].cell.config.source})
+        )
         file: GateFile = replace(baseline.file, times=times, accepted=accepted)
         write_baseline(self.baseline, baseline.suite, run, file)
         print(f"{self.baseline}: {row} is now as it is today")
@@ -146,4 +151,4 @@ class GateCommand:
         from benchmarks.provenance import cores
         from benchmarks.suites.runs import RunOptions
 
-        return RunOptions(out=self.out, data=self.data, workers=cores())
+        return RunOptions(out=self.out, data=self.data, workers=cores(), retry_failed=True)

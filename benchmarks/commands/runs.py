@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from ash.fields import Changes
-from ash.files import InputError
+from ash.files import InputError, require_plain
 from benchmarks.commands.arguments import (
     DONE,
     FAILED,
@@ -183,12 +183,14 @@ class ReportCommand:
     def __call__(self) -> int:
         """Write it, and copy it where that is asked for."""
         from benchmarks.suites.merge import are_shards, merge_runs
-        from benchmarks.suites.runs import gathered, read_run, require_for_choosing
+        from benchmarks.suites.runs import TRAINED_BY_HAND, gathered, read_run, require_for_choosing
 
         if not self.runs:
             raise InputError("expected the folder of a run or of a cell")
         if len(self.runs) == 1 and self.out is None:
             run = read_run(self.runs[0])
+            if run.suite == TRAINED_BY_HAND:  # Nothing keeps such a folder from holding two versions of a row.
+                run = gathered(self.runs, self.runs[0], command=run.command)
         elif are_shards(self.runs):
             merge_runs(self.runs, out := self.out or Path("runs/report"))
             run = read_run(out)
@@ -304,7 +306,7 @@ class TrainCommand:
         from benchmarks.suites.captures import require_intact
         from benchmarks.suites.engine import plan_cells
         from benchmarks.suites.runs import cell_for
-        from benchmarks.suites.suites import AS_GIVEN, CaptureSpec, CellSpec, varied_name
+        from benchmarks.suites.suites import AS_GIVEN, CaptureSpec, CellSpec, MethodSpec, varied_name
 
         changes, device = self.changes, chosen_device(self.device)
         if device != CPU:
@@ -313,7 +315,11 @@ class TrainCommand:
             configured(self.method, self.preset, changes)
         capture = load_capture(self.capture)
         require_intact(self.capture)
-        row = self.row or varied_name(self.method, changes)
+        try:
+            named = require_plain(self.row or varied_name(self.method, changes), what="row")
+            row = MethodSpec(name=named, of=self.method).name
+        except ValueError as error:
+            raise InputError(f"--row: {error}") from error
         spec = CellSpec(
             capture=CaptureSpec(scene=capture.scene, size=AS_GIVEN, seed=capture.manifest.seed),
             method=row,
@@ -351,7 +357,6 @@ class ScoreCommand:
     def __call__(self) -> int:
         """One cell of brought pictures."""
         from ash.capture.formats import load_capture
-        from ash.files import require_plain
         from benchmarks.cell.registry import BROUGHT
         from benchmarks.cell.run import run_cell
         from benchmarks.cell.schema import write_config
@@ -455,14 +460,17 @@ def _report(run: "RunOnDisk", chosen_on: "RunOnDisk | None" = None) -> int:
 
 
 def _again(folder: Path, function: Callable[[Any], Any]) -> int:
+    from ash.files import run_lock
     from benchmarks.suites.runs import read_run, results_of
 
     run = read_run(folder)
     results_of(run)
     worst = DONE
-    for cell in run.cells:
-        if (cell.folder / "result.json").exists():
-            worst = max(worst, _tell(cell.folder, function(cell)))
+    whole = folder.parent.parent if folder.parent.name == "cells" else folder
+    with run_lock(whole):  # A run that is at work there must not see its results change.
+        for cell in run.cells:
+            if (cell.folder / "result.json").exists():
+                worst = max(worst, _tell(cell.folder, function(cell)))
     return worst
 
 

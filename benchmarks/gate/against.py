@@ -19,6 +19,7 @@ from benchmarks.cell.schema import Cell, CellResult, Timing, result_of
 from benchmarks.gate.baseline import Entry, drawn_again
 from benchmarks.gate.checks import Check
 from benchmarks.gate.statistical import SLOWER, SLOWER_STORED, least_times, rises, time_checks
+from benchmarks.provenance import commit
 
 ROUNDS = 5  # and up to as many more while a time fails by less than would be told of stored times
 ROOT = Path(__file__).resolve().parents[2]  # of ash-bench's checkout
@@ -61,7 +62,7 @@ def revision_of(name: str, methods: Iterable[str], out: Path) -> Revision:
     tree = _work_tree(root, name, out)
     folders = [tree / path.relative_to(root) if path.is_relative_to(root) else path for path in _method_paths()]
     command = (str(tree / "ash-bench"),) if root == ROOT else (sys.executable, "-P", "-m", "benchmarks.cli")
-    if root == ROOT and subprocess.run([*command, "--version"], stdout=subprocess.DEVNULL, check=False).returncode:
+    if root == ROOT and subprocess.run([*command, "run", "--help"], stdout=subprocess.DEVNULL, check=False).returncode:
         raise InputError(f"{tree}: the set-up of {name} failed; its own message stands above")
     revision = Revision(
         name=name,
@@ -72,6 +73,15 @@ def revision_of(name: str, methods: Iterable[str], out: Path) -> Revision:
     if root != ROOT:
         _require_from(tree, revision)
     return revision
+
+
+def commit_of(methods: Iterable[str]) -> str:
+    """The commit of the git repository that holds methods of others, where it is one; else that of ash-bench."""
+    try:
+        homes = {_repository_of(method) for method in methods} - {ROOT}
+    except InputError:
+        homes = set()
+    return commit(homes.pop() if len(homes) == 1 else None)
 
 
 def _method_paths() -> list[Path]:

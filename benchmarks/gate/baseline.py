@@ -33,7 +33,6 @@ from benchmarks.cell.schema import (
     write_config,
     write_result,
 )
-from benchmarks.provenance import commit
 from benchmarks.suites.archive import numbers_of
 from benchmarks.suites.runs import Run, read_run
 
@@ -196,8 +195,7 @@ def _write_first(first: Entry, folder: Path) -> None:
     if keeps_avatar(first.cell):
         names = [Path(CHECKPOINT), *(prediction_path(Path(), view) for view in stored_views(first.result))]
         for name in names:
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(first.cell.folder / name, folder / name)
+            write_atomic(folder / name, (first.cell.folder / name).read_bytes())
 
 
 def keeps_avatar(cell: Cell) -> bool:
@@ -207,11 +205,13 @@ def keeps_avatar(cell: Cell) -> bool:
     return kept and not is_oracle(cell.config.method)
 
 
-def with_row(baseline: Baseline, row: str, entries: Sequence[Entry], because: str) -> tuple[Run, tuple[Accepted, ...]]:
+def with_row(
+    baseline: Baseline, row: str, entries: Sequence[Entry], *, because: str, commit: str
+) -> tuple[Run, tuple[Accepted, ...]]:
     """The baseline's cells as a run with those of one row replaced, and the changes accepted so far with this one."""
     rows = {**baseline.rows, row: list(entries)}
     cells = tuple(entry.cell for each in rows.values() for entry in each)
-    told = Accepted(row=row, because=printable(because), commit=commit())
+    told = Accepted(row=row, because=printable(because), commit=commit)
     return replace(read_run(baseline.folder), cells=cells), (*baseline.file.accepted, told)
 
 

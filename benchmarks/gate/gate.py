@@ -32,7 +32,6 @@ from benchmarks.gate.exact import (
 )
 from benchmarks.gate.statistical import (
     Pairs,
-    Quality,
     count_checks,
     judge_quality,
     least_times,
@@ -72,6 +71,8 @@ def judge(
         InputError: the suite has no row in common with the baseline.
     """
     seeds = max(len(entries) for entries in baseline.rows.values())
+    if few := [row for row, entries in baseline.rows.items() if len(entries) < TRAINED]:
+        raise InputError(f"{few[0]}: expected a baseline of {TRAINED} seeds or more; --update-baseline makes one")
     run, by_row = cells_of(suite.narrowed(seeds=seeds), options)
     shared = [row for row in baseline.rows if row in by_row]
     if not shared:
@@ -84,12 +85,11 @@ def judge(
         detail = "the ground truth changed, so qualities cannot be compared; update the baseline"
         checks.append(Check(row=row, layer="rows", name="capture", verdict="worse", detail=detail))
     drawn, worst = _draw_frozen(baseline, by_row, same, options, checks)
-    started = time.monotonic()
     after = _train(by_row, same, TRAINED, suite, options)
+    started = time.monotonic()
     pairs: Pairs = {row: (baseline.rows[row], entries) for row, entries in after.items() if entries}
     _judge_training(pairs, checks)
-    quality = _judge_quality(pairs, by_row, suite, options, until=started + 60 * minutes, seeds=seeds)
-    checks += quality.checks
+    checks += _judge_quality(pairs, by_row, suite, options, until=started + 60 * minutes, seeds=seeds)
     for row, (before, entries) in pairs.items():
         checks += count_checks(row, before[0].result, entries[0].result)
     times: dict[str, dict[str, float]] = {}
@@ -210,14 +210,21 @@ def _train(
     return found
 
 
-def _judge_training(pairs: Pairs, checks: list[Check]) -> None:
-    """Failed cells, first steps and seeds; a row of which a cell failed is not compared any further."""
-    for row, (before, entries) in list(pairs.items()):
+def _drop_failed(pairs: Pairs) -> list[Check]:
+    """Take away rows of which a training failed, which are not compared any further."""
+    checks = []
+    for row, (_, entries) in list(pairs.items()):
         if failed := [entry.result for entry in entries if entry.result.status != "done"]:
             told = f"{len(failed)} of {len(entries)} trainings failed: {failed[0].status}: {failed[0].reason}"
             checks.append(Check(row=row, layer="rows", verdict="worse", detail=told))
             del pairs[row]
-            continue
+    return checks
+
+
+def _judge_training(pairs: Pairs, checks: list[Check]) -> None:
+    """Failed cells, first steps and seeds."""
+    checks += _drop_failed(pairs)
+    for row, (before, entries) in pairs.items():
         logs = (each.cell.folder / "log.jsonl" for each in (before[0], entries[0]))
         checks += [check for check in (first_steps_check(row, *logs),) if check is not None]
         if equal_seeds(row, before) is None:
@@ -232,17 +239,19 @@ def _judge_quality(
     *,
     until: float,
     seeds: int,
-) -> Quality:
+) -> list[Check]:
     """Judge the scores, with a further seed of what is undecided as long as there are seeds and time."""
     count = TRAINED
+    failed: list[Check] = []
     while True:
         quality = judge_quality(pairs, looks=max(1, seeds - 1))
         undecided = [row for row in quality.undecided if count < min(len(by_row[row]), len(pairs[row][0]))]
         if not undecided or time.monotonic() >= until:
-            return quality
+            return [*failed, *quality.checks]
         count += 1
         for row, entries in _train(by_row, undecided, count, suite, options).items():
-            pairs[row] = pairs[row][0], [entry for entry in entries if entry.result.status == "done"]
+            pairs[row] = pairs[row][0], entries
+        failed += _drop_failed(pairs)
 
 
 def _cost_checks(

@@ -10,9 +10,9 @@ import altair as alt
 import pandas as pd
 
 from ash.files import InputError, open_regular, write_atomic
-from benchmarks import provenance
 from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.schema import printable, result_of
+from benchmarks.gate.against import commit_of
 from benchmarks.gate.baseline import row_of
 from benchmarks.gate.checks import outcome
 from benchmarks.gate.gate import Judgement
@@ -42,7 +42,8 @@ def append(judged: Judgement, times: dict[str, dict[str, float]], folder: Path) 
         frame = times.get(row_of(cell.config), {}).get("frame")
         rows[row_of(cell.config)] = values | ({} if frame is None else {FRAME: frame})
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    lines.append({"commit": provenance.commit(), "when": now, "outcome": outcome(judged.checks), "rows": rows})
+    commit = commit_of({cell.config.source for cell in judged.run.cells})
+    lines.append({"commit": commit, "when": now, "outcome": outcome(judged.checks), "rows": rows})
     write_atomic(folder / FILE, "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines).encode())
     write_atomic(folder / PAGE, page(lines).encode())
     return folder / PAGE

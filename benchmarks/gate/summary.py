@@ -129,7 +129,8 @@ def likely_sources(bad: Sequence[Check], changed: Sequence[str] | None) -> list[
     near = [name for name in deciding if name.startswith(places)]
     other = [name for name in deciding if name not in near]
     if not deciding:
-        return [*lines, "No source that decides a result changed since the baseline: look at the machine and versions."]
+        told = "No source of ash-bench that decides a result changed since the baseline"
+        return [*lines, f"{told}: look at methods of your own, the machine and versions."]
     lines.append(f"{len(deciding)} sources changed since the baseline, {len(near)} of them there:")
     shown = [f"  * {name}" for name in near] + [f"    {name}" for name in other]
     more = [f"    and {len(shown) - SHOWN_FILES} more"] if len(shown) > SHOWN_FILES else []

@@ -50,7 +50,10 @@ def read_any_cameras(path: Path) -> dict[str, Camera]:
     rows = content.get("cameras") if isinstance(content, dict) else content
     if isinstance(rows, list) and any(isinstance(row, dict) and "viewmat" in row for row in rows):
         return read_cameras(path)
-    return _checked(path, json.loads(rig_from_file(path).given)["cameras"])
+    try:
+        return _checked(path, json.loads(rig_from_file(path).given)["cameras"])
+    except OverflowError as error:
+        raise InputError(f"{path}: a number is out of range ({error})") from error
 
 
 def read_colmap(cameras: Path, images: Path) -> dict[str, Camera]:

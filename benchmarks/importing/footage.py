@@ -133,10 +133,11 @@ def import_footage(
         Problems: a picture is damaged or of another size, a mask is empty or full, or a camera's masks are elsewhere
             than the template.
     """
+    out = out.resolve()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out}: expected an empty folder")
     try:
-        scene = require_plain(name or out.resolve().name, what="scene")
+        scene = require_plain(name or out.name, what="scene")
     except ValueError as error:
         raise InputError(f"--name: {error}") from error
     out.parent.mkdir(parents=True, exist_ok=True)

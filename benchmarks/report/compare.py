@@ -19,7 +19,7 @@ from benchmarks.report import pictures
 from benchmarks.report.content import Block, Mark, Report, Section, Strip, Strips, Table, Text
 from benchmarks.report.page import render
 from benchmarks.report.pictures import Album, Shown
-from benchmarks.suites.runs import Run, results_of
+from benchmarks.suites.runs import Run, require_one_of_each, results_of
 
 NAMES = ("Before", "After")
 ABOUT = (
@@ -56,16 +56,16 @@ def write_comparison(before: Run, after: Run, out: Path) -> str:
     old, new = cells_by_row(before), cells_by_row(after)
     if not set(old) & set(new):
         raise InputError(f"{before.folder} and {after.folder}: no scene and method in common, expected at least one")
-    table = changes(old, new)
+    table, failed = changes(old, new), failures_in_words(old, new)
     write_atomic(out / "compare.csv", table.to_csv(index=False, float_format="%.6g").encode())
-    shown, verdict, album = printed(table), verdict_of(table), Album()
+    shown, verdict, album = printed(table), f"{failed}{verdict_of(table)}", Album()
     kinds: dict[str, Mark] = {"better": "best", "worse": "second"}
     last = len(shown.columns) - 2
     marks = {(i, last): kinds[kind] for i, kind in enumerate(table["verdict"]) if kind in kinds}
     groups = [
-        (f"{key[1]} on {key[0]}: the worst frames", tuple(_worst_frames(old[key][0], new[key][0], album)))
+        (f"{key[1]} on {key[0]}: the worst frames", tuple(_worst_frames(*pair, album)))
         for key in old
-        if key in new
+        if key in new and (pair := _same_person(old[key], new[key])) is not None
     ]
     groups = [(name, strips) for name, strips in groups if strips]
     about = f"Before: {before.folder} ({before.suite}). After: {after.folder} ({after.suite}). {ABOUT}"
@@ -91,6 +91,8 @@ def changes(before: Rows, after: Rows) -> pd.DataFrame:
             old, new = (samples_of(table, quantity).get(method, {}) for table in tables)
             if not old and not new:
                 continue
+            if shared := set(old) & set(new):  # Means of the same people.
+                old, new = ({key: samples[key] for key in samples if key in shared} for samples in (old, new))
             means = [
                 float(np.mean([np.mean(seeds) for seeds in samples.values()])) if samples else None
                 for samples in (old, new)
@@ -108,6 +110,16 @@ def changes(before: Rows, after: Rows) -> pd.DataFrame:
         numbers = [None] * 4 if each is None else [each.mean, each.low, each.high, each.p]
         records.append([*row, *numbers, verdict])
     return pd.DataFrame(records, columns=COLUMNS)
+
+
+def failures_in_words(before: Rows, after: Rows) -> str:
+    """The rows of which cells failed, whose worst scores widen every interval; empty where none did."""
+    parts = []
+    for key in dict.fromkeys([*before, *after]):
+        was, now = (sum(result.status != "done" for _, result in run.get(key, [])) for run in (before, after))
+        if was or now:
+            parts.append(f"{now} cells of {key[1]} on {key[0]} failed (before: {was}).")
+    return f"{' '.join(parts)} " if parts else ""
 
 
 def verdict_of(table: pd.DataFrame) -> str:
@@ -145,15 +157,25 @@ def cells_by_row(run: Run) -> Rows:
     """The finished cells of every row, by scene and method.
 
     Raises:
-        InputError: there is none.
+        InputError: there is none, or two of one name were trained differently.
     """
     results_of(run)  # Refuses a run without any.
+    require_one_of_each(run.cells)
     rows: Rows = {}
     for cell in run.cells:
         result = read_result(cell.folder)
         if result is not None:
             rows.setdefault((cell.config.place, cell.config.method), []).append((cell, result))
     return rows
+
+
+def _same_person(
+    before: list[tuple[Cell, CellResult]], after: list[tuple[Cell, CellResult]]
+) -> tuple[tuple[Cell, CellResult], tuple[Cell, CellResult]] | None:
+    """The first cells of both runs that are of one subject and seed."""
+    theirs = {(cell.config.subject, cell.config.seed): (cell, result) for cell, result in after}
+    pairs = ((mine, theirs.get((mine[0].config.subject, mine[0].config.seed))) for mine in before)
+    return next(((mine, other) for mine, other in pairs if other is not None), None)
 
 
 def _by_subject(results: Sequence[CellResult]) -> pd.DataFrame:

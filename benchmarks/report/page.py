@@ -77,7 +77,7 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
             *others,
             *novelty,
             *sections.beside_the_paper(run_tables, run.suite),
-            *sections.failed_cells(results, len(run.cells) - len(results)),
+            *sections.failed_cells(results, len(run.cells) + len(run.absent) - len(results)),
             sections.provenance(results, run.command),
             sections.glossary(),
         ),

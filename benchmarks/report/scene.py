@@ -160,6 +160,7 @@ def _facts(data: SceneData, capture: Capture | None, *, smoke: bool) -> list[tup
         known.pop("Smallest sufficient", None)
     missing = [known.pop("Missing", "")]
     missing += [f"{unfinished} of {len(of_scene)} trainings are not finished."] if unfinished > 0 else []
+    missing += [f"{_count(n, 'cell')} of the run: other shards have them."] if (n := len(data.run.absent)) else []
     facts = {
         "Compared": " ".join(compared),
         "Data": f"{footage}.",
@@ -173,7 +174,8 @@ def _facts(data: SceneData, capture: Capture | None, *, smoke: bool) -> list[tup
 
 def difference_tables(run_tables: RunTables, scene: str, rows: pd.DataFrame, *, title: str) -> list[Block]:
     """The differences with intervals and verdicts."""
-    if not rows["p"].notna().any():
+    rows = rows[rows["p"].notna()]  # Of single values there is no verdict.
+    if rows.empty:
         return []
     test = "people, paired t" if run_tables.captures(scene) > 1 else "seeds, Welch"
     blocks: list[Block] = []

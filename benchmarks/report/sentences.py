@@ -78,7 +78,7 @@ def _finding(tables: RunTables, scene: str) -> str:
     compared = {other: compare(tables.of(scene), first, other, foreground()) for other in others}
     tests = {other: each for other, each in compared.items() if each is not None}
     rows = [
-        {"method": other, "split": "novel_view", **asdict(each), "verdict": each.verdict}
+        {"method": other, "reference": first, "split": "novel_view", **asdict(each), "verdict": each.verdict}
         for other, each in zip(tests, corrected([*tests.values()]), strict=True)
     ]
     return f"On {scene}, {_pair(tables, scene, pd.DataFrame(rows), first, others[0])}"
@@ -90,7 +90,8 @@ def _pair(tables: RunTables, scene: str, ranked: pd.DataFrame, first: str, secon
     if lost := [method for method in (first, second) if tables.failed(scene, method)]:
         return f"{titles(lost)} failed: {names[0]} and {names[1]} cannot be compared."
     parts: dict[str, list[str]] = {}  # by what is said of the splits
-    for row in ranked[ranked["method"] == second].itertuples() if len(ranked) else ():
+    own = ranked[(ranked["method"] == second) & (ranked["reference"] == first)] if len(ranked) else ranked
+    for row in own.itertuples():
         words = f"on {SPLIT_NAMES[row.split].words}"
         if math.isnan(row.p):
             means = tables.values(scene, foreground(row.split), (first, second))
@@ -144,7 +145,7 @@ def _scores(tables: RunTables, scene: str) -> str:
 
 
 def _certainty(tables: RunTables, scene: str) -> str:
-    people, seeds = tables.captures(scene), tables.seeds
+    people, seeds = tables.captures(scene), tables.seeds(scene)
     note = f" {FOR_VALIDATION}" if tables.for_validation(scene) else ""
     if people == seeds == 1:
         return f"One training of each method on one person: no verdicts. --seeds 3 or --subjects 8 gives them.{note}"

@@ -7,6 +7,7 @@ either is a run again, of which `report` and `compare` read all that is there.
 
 import contextlib
 import json
+import os
 import re
 import shutil
 import struct
@@ -118,6 +119,8 @@ def _write(path: Path, entries: Iterable[tuple[str, bytes]]) -> None:
                     archive.writestr(info, content)
         except zipfile.LargeZipFile as error:
             raise InputError(f"{path}: would be larger than 4 GiB or 65,535 files; pack fewer cells") from error
+        with part.open("rb") as whole:
+            os.fsync(whole.fileno())
         part.replace(path)
 
 
@@ -203,7 +206,7 @@ def read_pack(folder: Path) -> PackFile:
     except ValueError as error:
         raise InputError(str(error) if isinstance(error, InputError) else f"{path}: {error}") from error
     if (pack.schema, pack.protocol) != (PACK_SCHEMA, PROTOCOL):
-        got = f"{pack.schema:.0f} and {pack.protocol:.20}"
+        got = f"{pack.schema!s:.20} and {pack.protocol:.20}"
         raise InputError(f"{path}: expected schema {PACK_SCHEMA} and protocol {PROTOCOL}, got {got}")
     files = {each.relative_to(folder).as_posix(): each for each in folder.rglob("*") if each.is_file()}
     del files[PACK_FILE]

@@ -1,6 +1,7 @@
 """The captures that a suite needs, made or taken up where they lie."""
 
 import shutil
+import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -62,8 +63,15 @@ def _spoilt_capture(spec: CaptureSpec, stress: Stress, clean: Path, data: Path) 
     capture = load_capture(clean)
     folder = data / f"{spec.name}-{capture.identity[:8]}"
     if not is_capture(folder):
-        shutil.rmtree(folder, ignore_errors=True)
-        perturb(clean, folder, stress.perturbation(capture), seed=spec.seed)
+        made = Path(tempfile.mkdtemp(dir=data, prefix=f".{folder.name[:40]}."))
+        try:
+            perturb(clean, made, stress.perturbation(capture), seed=spec.seed)
+            made.chmod(0o755)
+            if not is_capture(folder):  # Another shard may have made it meanwhile.
+                shutil.rmtree(folder, ignore_errors=True)
+                made.rename(folder)
+        finally:
+            shutil.rmtree(made, ignore_errors=True)
     return folder
 
 

@@ -1,6 +1,7 @@
 """Puts the shards of a run together, from one machine or many."""
 
 import shutil
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -45,5 +46,9 @@ def merge_runs(shards: Sequence[Path], out: Path) -> None:
     for key, folder in finished.items():
         target = out / "cells" / key
         if not (target / "result.json").exists():
-            shutil.copytree(folder, target, dirs_exist_ok=True)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=target.parent, prefix=".merge-") as made:
+                whole = Path(shutil.copytree(folder, Path(made) / key))
+                shutil.rmtree(target, ignore_errors=True)
+                whole.rename(target)
     write_json(out / RUN_FILE, description)

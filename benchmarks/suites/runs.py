@@ -34,6 +34,7 @@ from benchmarks.suites.tables import TableSpec
 from synth.person.cast import VALIDATION
 
 RUN_FILE = "run.json"
+TRAINED_BY_HAND = "train"  # suite of a folder of cells that `train` made
 IMPORT_S = 120.0  # of a method, before a run
 
 
@@ -270,7 +271,7 @@ def read_run(folder: Path) -> Run:
     path = folder / RUN_FILE
     if not path.exists() and (trained := sorted(folder.glob("cells/*/config.json"))):  # As `train` leaves them.
         cells = tuple(read_cell(each.parent) for each in trained)
-        return Run(folder=folder, suite="train", about="cells trained by hand", command="", cells=cells)
+        return Run(folder=folder, suite=TRAINED_BY_HAND, about="cells trained by hand", command="", cells=cells)
     content = read_json(path)
     try:
         file: RunFile = from_json(RunFile, content)
@@ -305,23 +306,47 @@ def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
             f"{out}: people from {VALIDATION} on are there to choose by, expected a report without the others"
         )
     named = [_told_apart(cell) if cell.config.place in mixed else cell for cell in cells]
-    _require_one_of_each(named)
+    require_one_of_each(named)
     about = f"cells of {', '.join(map(str, folders))}"
     titles = {name: title for run in reversed(runs) for name, title in run.titles.items()}  # The first run's first.
     table = next((run.table for run in runs if run.table), ())
-    return Run(folder=out, suite=out.name, about=about, command=command, cells=tuple(named), titles=titles, table=table)
+    there = {cell.config.key for cell in cells}
+    absent = tuple(dict.fromkeys(key for run in runs for key in run.absent if key not in there))
+    return Run(
+        folder=out,
+        suite=out.name,
+        about=about,
+        command=command,
+        cells=tuple(named),
+        absent=absent,
+        titles=titles,
+        table=table,
+    )
 
 
-def _require_one_of_each(cells: Iterable[Cell]) -> None:
+def require_one_of_each(cells: Iterable[Cell]) -> None:
+    """Refuse two cells of one name that were trained differently: they would be taken for two seeds.
+
+    Raises:
+        InputError: names both folders.
+    """
     names: dict[tuple[Any, ...], Cell] = {}
+    settings: dict[tuple[Any, ...], Cell] = {}
     for cell in cells:
         config = cell.config
         other = names.setdefault((config.place, config.subject, config.capture, config.method, config.seed), cell)
+        alike = settings.setdefault((config.place, config.method), cell)
+        if other is cell and _settings(alike) != _settings(cell):
+            other = alike
         if other is not cell:
             raise InputError(
                 f"{cell.folder}: expected one cell {config.title}, another with other settings or code is"
                 f" {other.folder}; `train --row NAME` names a row, `compare` compares runs"
             )
+
+
+def _settings(cell: Cell) -> tuple[Any, ...]:
+    return cell.config.preset, cell.config.source, cell.config.changes
 
 
 def mixed_places(configs: Iterable[CellConfig]) -> set[str]:

@@ -104,6 +104,9 @@ def test_a_methods_configuration_is_flags_recorded_hashed_and_used(capture: Path
     assert cli.main([*train, "--detail", "0.8"]) == arguments.DONE
     assert "trained before, from the same inputs" in capsys.readouterr().err
     assert "detail: expected 0 to 1, got 2.0" in refused(capsys, *train, "--detail", "2")
+    assert "--row: " in refused(capsys, *train, "--row", "a/b")
+    oracle = refused(capsys, "train", "ash_truth", str(capture), "--row", "mine")
+    assert "expected a name that begins with 'ash_truth', an oracle" in oracle
     assert "unknown option '--detial', did you mean --detail" in refused(capsys, *train, "--detial", "2")
     assert "preset: expected one of ci, cpu, got 'huge'" in refused(capsys, *train[:3], "--preset", "huge")
 

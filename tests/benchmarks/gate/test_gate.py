@@ -1,6 +1,7 @@
 """The gate: what it compares, what it says, and what it refuses."""
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from benchmarks import cli, provenance
 from benchmarks.cell.sandbox import METHOD_PATH
 from benchmarks.cell.schema import CHECKPOINT, Cell, CellResult, Summary, Timing, ViewScore
 from benchmarks.commands import arguments
-from benchmarks.gate import against, history, summary
+from benchmarks.gate import against, gate, history, summary
 from benchmarks.gate.baseline import Accepted, Baseline, Entry, GateFile, read_baseline, row_of, write_baseline
 from benchmarks.gate.checks import FAILING, Check, of_exact_change, outcome
 from benchmarks.gate.exact import equal_seeds, first_steps_check
@@ -88,6 +89,18 @@ def test_what_is_not_decided_asks_for_another_seed() -> None:
     noisy = judge_quality({ROW: (entries([25.0, 25.1]), entries([24.9, 25.6]))}, looks=1)
     assert noisy.undecided == (ROW,) and {check.verdict for check in noisy.checks} == {"not worse"}
     assert "would have been seen" in noisy.checks[0].detail
+
+
+def test_a_further_seed_that_fails_is_worse(monkeypatch: pytest.MonkeyPatch) -> None:
+    def trained(by_row: object, rows: Sequence[str], count: int, *_: object) -> dict[str, list[Entry]]:
+        *good, last = entries([24.9, 25.6, 25.2])
+        return {ROW: [*good, replace(last, result=replace(last.result, status="diverged", reason="NaN"))]}
+
+    monkeypatch.setattr(gate, "_train", trained)
+    pairs = {ROW: (entries([25.0, 25.1, 24.9]), entries([24.9, 25.6]))}
+    cells = {ROW: [each.cell for each in entries([1.0, 2.0, 3.0])]}
+    checks = gate._judge_quality(pairs, cells, None, None, until=math.inf, seeds=3)  # type: ignore[arg-type]
+    assert [(check.verdict, check.detail) for check in checks] == [("worse", "1 of 3 trainings failed: diverged: NaN")]
 
 
 def test_false_alarms_of_a_run_that_is_judged_after_every_seed() -> None:

@@ -80,6 +80,7 @@ OTHER = (28.0, 29.0, 30.0)
         ("not better", BETTER, "contradicted"),
         ("not worse", BETTER, "confirmed"),
         ("not worse", SAME, "confirmed"),
+        ("not worse", (28.2, 29.5, 30.4), "confirmed"),  # Unclear which is better, but no loss that counts.
     ],
 )
 def test_a_contrast_decides(expect: str, a: Sequence[float], found: str) -> None:
@@ -99,6 +100,23 @@ def test_a_published_difference_above_the_interval_makes_it_smaller() -> None:
         name="n", says="s", where="w", a="ddc", b="ash", scenes=("loose",), expect="worse", paper={"loose": -2.0}
     )
     assert verdict(other_way, rows(BETTER, OTHER)) == "confirmed"
+
+
+def test_by_more_than_so_much_asks_for_the_whole_interval() -> None:
+    claim = Claim(name="n", says="s", where="w", a="ash", b="ddc", scenes=("loose",), least=1.5)
+    assert verdict(claim, rows(BETTER, OTHER)) == "confirmed"
+    wide = rows((29.0, 31.1, 32.2), OTHER)
+    assert verdict(claim, wide) == "not shown" and verdict(replace(claim, least=None), wide) == "confirmed"
+
+
+def test_trainings_that_ended_before_their_plateau_are_told() -> None:
+    claim = Claim(name="n", says="s", where="w", a="ash", b="ddc", scenes=("loose",))
+    table = rows(BETTER, OTHER)
+    ended = table.drop_duplicates(["method", "capture"]).assign(split="speed", region="", metric="plateau", value=1.0)
+    assert judge([claim], {"run": pd.concat([table, ended])}).because.item() == ""
+    short = ended.assign(value=(ended["method"] != "ash").astype(float))
+    because = judge([claim], {"run": pd.concat([table, short])}).because.item()
+    assert because == "not at their plateau when training ended: ASH"
 
 
 def test_what_cannot_be_judged_says_why() -> None:

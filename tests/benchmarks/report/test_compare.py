@@ -10,13 +10,13 @@ import pandas as pd
 import pytest
 from helpers import fakes
 from helpers.browser import DESKTOP, PHONE, Visitor
-from helpers.cells import cell
+from helpers.cells import cell, people
 from helpers.waiting import wait_for
 
 from ash.files import InputError
 from benchmarks import cli
 from benchmarks.cell.schema import Cell, CellResult
-from benchmarks.report.compare import changes, printed, verdict_of
+from benchmarks.report.compare import changes, failures_in_words, printed, verdict_of
 from benchmarks.suites import runs as runs_module
 from benchmarks.suites.files import read_suite
 from benchmarks.suites.runs import RunOptions, gathered, read_run, run_suite
@@ -44,6 +44,23 @@ def test_one_seed_and_a_missing_row_have_no_verdict() -> None:
     assert views(row(30.0), row(35.0)).verdict == ""
     alone = changes(row(30.0), row(30.0, method="ddc"))
     assert set(alone["verdict"]) == {""} and "n/a" in printed(alone)["after"].tolist()
+
+
+def test_means_are_of_the_people_that_both_runs_have() -> None:
+    def of(*psnr: float) -> Rows:
+        results = people({"ash": psnr})
+        return {("loose", "ash"): [(Cell(config=r.config, folder=Path()), r) for r in results]}
+
+    found = views(of(25.0, 26.0, 31.0, 32.0), of(25.3, 26.4))
+    assert (found.before, found.after) == (25.5, 25.85) and found.change == pytest.approx(0.35)
+
+
+def test_cells_that_failed_are_told_first() -> None:
+    before, after = row(30.0, 30.1), row(30.0, 0.0)
+    place, result = after["loose", "ash"][1]
+    after["loose", "ash"][1] = place, replace(result, status="crashed")
+    assert failures_in_words(before, before) == ""
+    assert failures_in_words(before, after) == "1 cells of ash on loose failed (before: 0). "
 
 
 def test_less_error_is_better() -> None:

@@ -111,6 +111,10 @@ def _add(result: dict) -> None:
     result["summary"].append(result["summary"][0] | {"value": 1000.0})
 
 
+def _leave_out(result: dict) -> None:
+    result["summary"] = [row for row in result["summary"] if row["split"] != "novel_pose"]
+
+
 def _fail(result: dict) -> None:
     result.update(status="crashed", reason="once")
 
@@ -122,6 +126,8 @@ def _fail(result: dict) -> None:
         (change_json("result.json", _improve), "scores differ, the first: train_view foreground psnr is told as"),
         (change_json("result.json", lambda result: result["views"][0]["scores"].update({"full/psnr": 99})), "differ"),
         (change_json("result.json", _add), "is told as 1000"),
+        (change_json("result.json", _leave_out), "scores are left out, the first: "),
+        (change_json("result.json", lambda result: result["views"][0].update(scores={})), "scores are left out"),
         (change_json("result.json", lambda result: result["views"].reverse()), "are not the 26 views"),
         (change_json("result.json", _fail), "says that it failed, and has scores"),
     ],
@@ -146,6 +152,7 @@ def _drop(files: Files) -> None:
         (change_json("run.json", lambda run: run.update(cells=[])), "run.json and the cells that are there differ"),
         (change_json("run.json", lambda run: run.update(protocol="2")), "results do not mix"),
         (change_json("pack.json", lambda pack: pack.update(protocol="2")), "expected schema 1 and protocol"),
+        (change_json("pack.json", lambda pack: pack.update(schema=10**400)), "expected schema 1 and protocol"),
         (lambda files: files.pop("pack.json"), "pack.json is missing"),
         (lambda files: files.update({"../up.json": b"{}"}), "has no place in a pack"),
         (lambda files: files.update({"/abs.json": b"{}"}), "has no place in a pack"),
