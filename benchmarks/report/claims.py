@@ -53,12 +53,15 @@ def write_claims(
     counts = table["verdict"].value_counts()
     found = ", ".join(f"{verdict} {counts[verdict]}" for verdict in ORDER if verdict in counts)
     headline = f"Of {len(table)} claims, each on its scene: {found}"
-    shown, album = printed(table), Album()
+    judged, album = table[table["effect"].notna()], Album()
+    shown = printed(judged)
     marks: dict[tuple[int, int], Mark] = {}
-    for row, verdict in enumerate(table["verdict"]):
+    for row, verdict in enumerate(judged["verdict"]):
         if verdict in HOLDS or verdict == "contradicted":
             marks[row, list(shown.columns).index("verdict")] = "best" if verdict in HOLDS else "second"
-    blocks: list[Block] = [Text(text=ABOUT), Table(frame=shown, corner="claim", marks=marks)]
+    blocks: list[Block] = [Text(text=ABOUT)]
+    blocks += [Table(frame=shown, corner="claim", marks=marks)] if len(shown) else []
+    blocks.append(Bullets(items=tuple(_told(claim, table[table["name"] == claim.name]) for claim in claims)))
     if lost:
         blocks.insert(0, Bullets(items=tuple(lost)))
     if links := [os.path.relpath(path, out) for run in runs if (path := run.folder / "report.html").exists()]:
@@ -69,32 +72,37 @@ def write_claims(
         section = Section(title="Claims", headline=f"{headline}.", blocks=tuple(content))
         text = render(Report(title="ash-bench: claims", sections=(section,)), form, album)  # type: ignore[arg-type]
         write_atomic(out / f"claims.{form}", text.encode())
-    judged = shown.loc[table["effect"].notna().to_numpy(), ["scene", "difference", "people", "verdict"]]
-    return [*([judged.to_string(), ""] if len(judged) else []), headline], lost
+    return [*([shown.to_string(), ""] if len(shown) else []), headline], lost
 
 
-def printed(table: pd.DataFrame) -> pd.DataFrame:
-    """The table as texts, by the name of the claim."""
+def printed(judged: pd.DataFrame) -> pd.DataFrame:
+    """The claims that were judged as texts, by their names."""
 
-    def number(value: float | None, unit: str, sign: str = "+") -> str:
-        return "" if pd.isna(value) else f"{value:{sign}.3g}{unit and ' ' + unit}"
+    def number(value: float | None, unit: str = "") -> str:
+        return "" if pd.isna(value) else f"{value:+.3g}{unit and ' ' + unit}"
 
     texts = pd.DataFrame(
         {
             "scene": row.scene,
             "verdict": row.verdict,
             "contrast": row.contrast,
-            "difference": ""
-            if pd.isna(row.effect)
-            else f"{number(row.effect, row.unit)} [{number(row.low, '')}, {number(row.high, '')}]",
+            "difference": f"{number(row.effect, row.unit)} [{number(row.low)}, {number(row.high)}]",
             "paper": number(row.paper, row.unit),
-            "people": "" if pd.isna(row.people) else str(int(row.people)),
-            "says": f"{row.says} ({row.where})" + (f" Note: {row.because}." if row.because else ""),
+            "people": str(int(row.people)),
         }
-        for row in table.itertuples()
+        for row in judged.itertuples()
     )
-    texts.index = pd.Index(table["name"])
+    texts.index = pd.Index(judged["name"])
     return texts
+
+
+def _told(claim: Claim, rows: pd.DataFrame) -> str:
+    """What is claimed, where, and what was found on each of its scenes."""
+    found = (
+        f"{f'{row.scene}: ' if row.scene else ''}{row.verdict}{f' ({row.because})' if row.because else ''}"
+        for row in rows.itertuples()
+    )
+    return f"{claim.name} ({claim.where}): {claim.says}. {'; '.join(found)}."
 
 
 def _table(rows: Rows) -> pd.DataFrame:
