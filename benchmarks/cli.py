@@ -31,7 +31,6 @@ from ash.fields import suggest
 from ash.files import InputError, disk_problem
 from benchmarks.aliases import OLD_COMMANDS
 from benchmarks.cell.sandbox import METHOD_PATH, add_method_paths
-from benchmarks.cell.schema import HarnessFailed, Killed
 from benchmarks.commands.arguments import DONE, INTERRUPTED, WRONG_INPUT, Command, own_name, read_command
 
 METHOD_PATH_FLAG = "--method-path"
@@ -71,13 +70,16 @@ def main(argv: list[str] | None = None) -> int:
             return DONE if command is None else command()
     except InputError as error:
         return _refuse(str(error))
-    except (HarnessFailed, Killed) as error:  # Of `train` and `eval`, which run a cell in this process.
-        return _refuse(str(error) or "the method's process was killed from outside")
     except BrokenPipeError:  # Whoever read our output has seen enough (`| head`).
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except OSError as error:
         line = _semaphore_problem(error) or disk_problem(error)
+        if line is None:
+            raise
+        return _refuse(line)
+    except Exception as error:
+        line = _cell_problem(error)
         if line is None:
             raise
         return _refuse(line)
@@ -126,6 +128,14 @@ def _semaphore_problem(error: OSError) -> str | None:
     except OSError as refused:
         return f"/dev/shm: cannot be used for what processes share ({refused.strerror}); it wants to be writable"
     return None
+
+
+def _cell_problem(error: Exception) -> str | None:
+    """What ended a cell that a command runs in its own process, and is not the method's fault."""
+    from benchmarks.cell.schema import HarnessFailed, Killed
+
+    told = str(error) or "the method's process was killed from outside"
+    return told if isinstance(error, (HarnessFailed, Killed)) else None
 
 
 def _parse(tokens: Sequence[str]) -> Command | None:

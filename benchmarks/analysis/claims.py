@@ -1,5 +1,6 @@
 """Claims, and what the rows of runs say of each: `claims.toml` holds those of the paper and of our README."""
 
+import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -95,10 +96,11 @@ def judge(claims: Sequence[Claim], runs: Mapping[str, pd.DataFrame]) -> pd.DataF
     records = []
     for claim, scene, test, missing, run in asked:
         test = None if test is None else next(tests)
-        verdict: Verdict
-        verdict, because = "cannot be judged here", missing
-        if test is not None:
-            verdict, because = _verdict(claim, scene, test, _short_of_plateau(claim, scene, runs[run]))
+        verdict, because = (
+            ("cannot be judged here", missing)
+            if test is None
+            else _verdict(claim, scene, test, _short_of_plateau(claim, scene, runs[run]))
+        )
         records.append(
             {
                 "name": claim.name,
@@ -173,9 +175,8 @@ def _verdict(claim: Claim, scene: str, test: Comparison, short: str) -> tuple[Ve
     low, high = sorted((test.low, test.high) if test.higher_is_better else (-test.low, -test.high))
     if (claim.expect == "not worse" and low >= -test.margin) or (claim.expect == "not better" and high <= test.margin):
         verdict = "confirmed"
-    least = 0.0 if claim.least is None else claim.least
-    beyond = {"better": low > least, "worse": high < -least}.get(claim.expect, True)
-    if verdict == "confirmed" and claim.least is not None and not beyond:
+    least = -math.inf if claim.least is None else claim.least
+    if verdict == "confirmed" and not {"better": low > least, "worse": -high > least}.get(claim.expect, True):
         verdict = "not shown"
     published = claim.paper.get(scene)
     if verdict == "confirmed" and claim.expect in ("better", "worse") and published is not None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from ash.fields import Changes
-from ash.files import InputError, require_plain
+from ash.files import InputError, require_plain, run_lock
 from benchmarks.commands.arguments import (
     DONE,
     FAILED,
@@ -32,7 +32,7 @@ from benchmarks.problems import Problems
 if TYPE_CHECKING:
     from benchmarks.suites.runs import Run as RunOnDisk
     from benchmarks.suites.runs import RunOptions
-    from benchmarks.suites.suites import SceneSpec, Suite
+    from benchmarks.suites.suites import MethodSpec, SceneSpec, Suite
 
 LOCAL = "local"
 LpipsWeights = Annotated[Path | None, Argument(metavar="FILE")]
@@ -306,7 +306,7 @@ class TrainCommand:
         from benchmarks.suites.captures import require_intact
         from benchmarks.suites.engine import plan_cells
         from benchmarks.suites.runs import cell_for
-        from benchmarks.suites.suites import AS_GIVEN, CaptureSpec, CellSpec, MethodSpec, varied_name
+        from benchmarks.suites.suites import AS_GIVEN, CaptureSpec, CellSpec, varied_name
 
         changes, device = self.changes, chosen_device(self.device)
         if device != CPU:
@@ -315,11 +315,7 @@ class TrainCommand:
             configured(self.method, self.preset, changes)
         capture = load_capture(self.capture)
         require_intact(self.capture)
-        try:
-            named = require_plain(self.row or varied_name(self.method, changes), what="row")
-            row = MethodSpec(name=named, of=self.method).name
-        except ValueError as error:
-            raise InputError(f"--row: {error}") from error
+        row = _row_named(self.row or varied_name(self.method, changes), of=self.method, flag="--row").name
         spec = CellSpec(
             capture=CaptureSpec(scene=capture.scene, size=AS_GIVEN, seed=capture.manifest.seed),
             method=row,
@@ -362,12 +358,9 @@ class ScoreCommand:
         from benchmarks.cell.schema import write_config
         from benchmarks.suites.captures import require_intact
         from benchmarks.suites.runs import cell_for
-        from benchmarks.suites.suites import AS_GIVEN, CaptureSpec, CellSpec, MethodSpec
+        from benchmarks.suites.suites import AS_GIVEN, CaptureSpec, CellSpec
 
-        try:
-            row = MethodSpec(name=require_plain(self.name, what="row"), of=f"{BROUGHT}:{self.pictures}")
-        except ValueError as error:
-            raise InputError(f"--name: {error}") from error
+        row = _row_named(self.name, of=f"{BROUGHT}:{self.pictures}", flag="--name")
         capture = load_capture(self.capture)
         require_intact(self.capture)
         spec = CellSpec(
@@ -436,6 +429,16 @@ class EvalCommand:
         return DONE
 
 
+def _row_named(name: str, *, of: str, flag: str) -> "MethodSpec":
+    """The row that a flag names; refused as in a suite."""
+    from benchmarks.suites.suites import MethodSpec
+
+    try:
+        return MethodSpec(name=require_plain(name, what="row"), of=of)
+    except ValueError as error:
+        raise InputError(f"{flag}: {error}") from error
+
+
 def _use_lpips(weights: Path | None) -> None:
     """Hand the user's weights on to the cells' processes, once they are known to load."""
     if weights is None:
@@ -460,7 +463,6 @@ def _report(run: "RunOnDisk", chosen_on: "RunOnDisk | None" = None) -> int:
 
 
 def _again(folder: Path, function: Callable[[Any], Any]) -> int:
-    from ash.files import run_lock
     from benchmarks.suites.runs import read_run, results_of
 
     run = read_run(folder)

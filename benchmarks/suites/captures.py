@@ -1,14 +1,13 @@
 """The captures that a suite needs, made or taken up where they lie."""
 
 import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from ash.capture.formats import load_capture
 from ash.capture.manifest import Manifest, is_capture, read_manifest, verify_capture
-from ash.files import InputError, hash_of
+from ash.files import InputError, file_lock, hash_of
 from benchmarks.suites.scenes import SPLATS, draw_scene, identity_of, scene_of
 from benchmarks.suites.stress import Stress
 from benchmarks.suites.suites import CaptureSpec, Suite
@@ -62,16 +61,10 @@ def _spoilt_capture(spec: CaptureSpec, stress: Stress, clean: Path, data: Path) 
     """The clean capture, perturbed; made anew where an earlier attempt did not come to its manifest, the last file."""
     capture = load_capture(clean)
     folder = data / f"{spec.name}-{capture.identity[:8]}"
-    if not is_capture(folder):
-        made = Path(tempfile.mkdtemp(dir=data, prefix=f".{folder.name[:40]}."))
-        try:
-            perturb(clean, made, stress.perturbation(capture), seed=spec.seed)
-            made.chmod(0o755)
-            if not is_capture(folder):  # Another shard may have made it meanwhile.
-                shutil.rmtree(folder, ignore_errors=True)
-                made.rename(folder)
-        finally:
-            shutil.rmtree(made, ignore_errors=True)
+    with file_lock(folder):  # Shards may want it at once.
+        if not is_capture(folder):
+            shutil.rmtree(folder, ignore_errors=True)
+            perturb(clean, folder, stress.perturbation(capture), seed=spec.seed)
     return folder
 
 

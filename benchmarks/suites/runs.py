@@ -331,14 +331,13 @@ def require_one_of_each(cells: Iterable[Cell]) -> None:
         InputError: names both folders.
     """
     names: dict[tuple[Any, ...], Cell] = {}
-    settings: dict[tuple[Any, ...], Cell] = {}
+    rows: dict[tuple[str, str], Cell] = {}
     for cell in cells:
         config = cell.config
-        other = names.setdefault((config.place, config.subject, config.capture, config.method, config.seed), cell)
-        alike = settings.setdefault((config.place, config.method), cell)
-        if other is cell and _settings(alike) != _settings(cell):
-            other = alike
-        if other is not cell:
+        twin = names.setdefault((config.place, config.subject, config.capture, config.method, config.seed), cell)
+        first = rows.setdefault((config.place, config.method), cell)
+        if twin is not cell or _settings(first) != _settings(cell):
+            other = first if twin is cell else twin
             raise InputError(
                 f"{cell.folder}: expected one cell {config.title}, another with other settings or code is"
                 f" {other.folder}; `train --row NAME` names a row, `compare` compares runs"

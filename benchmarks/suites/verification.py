@@ -109,8 +109,8 @@ def _check(cell: Cell, result: CellResult, folder: Path | None, intact: set[Path
             return ended("differs", f"the picture {view.split}/{view.camera}/{view.frame} is not the one that it names")
     same = capture.identity == cell.config.capture
     told, measured = _scores(result.summary, result.views), _scores(quality_summary(on_cpu, capture, scored), scored)
-    values = dict(measured)
-    if left_out := [place for place in values if place not in dict(told) and place[-1] != "lpips"]:
+    values, given = dict(measured), dict(told)
+    if left_out := [place for place in values if place not in given and place[-1] != "lpips"]:
         return ended("differs", f"{len(left_out)} scores are left out, the first: {' '.join(left_out[0])}")
     wrong = [(place, value) for place, value in told if not _close(place[-1], value, values.get(place), same=same)]
     if wrong:
