@@ -118,7 +118,7 @@ def _has_parts(value: Any) -> bool:
 
 
 def _hint(config: Any, name: str) -> Any:
-    return type(config[int(name)]) if isinstance(config, tuple) else _hints(config.__class__)[name]
+    return type(config[int(name)]) if isinstance(config, tuple) else _hints(type(config))[name]
 
 
 @cache
