@@ -101,9 +101,8 @@ def read_csv(path: Path) -> pd.DataFrame:
     table = table.assign(**{name: value for name, value in defaults.items() if name not in table})
     place = table["scene"].str.extract(PLACE)
     table["axis"], table["severity"] = place["axis"].fillna(""), pd.to_numeric(place["severity"]).fillna(0.0)
-    failed = table.groupby(["scene", "method", "seed", "capture"])["metric"].transform(
-        lambda names: "failed" in set(names)
-    )
+    says_so = table["metric"].eq("failed") & table["value"].gt(0)
+    failed = says_so.groupby([table[name] for name in ("scene", "method", "seed", "capture")]).transform("any")
     return table.assign(status=failed.map({True: "crashed", False: "done"}))
 
 

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy import stats
-from scipy.special import nctdtrinc
+from scipy.special import nctdtrinc, stdtr, stdtrit
 
 Verdict = Literal["better", "worse", "equivalent", "unclear"]
 Samples = Mapping[str, Sequence[float]]  # values by capture, one for each seed
@@ -88,12 +87,12 @@ def compare_samples(
         freedom = error**4 / squares if squares else 1.0
     if spread <= ROUNDING * max(map(abs, [*first, *second])):
         return replace(comparison, low=mean, high=mean, p=float(mean == 0), spread=0.0, detectable=0.0)
-    quantile = float(stats.t.ppf((1 + level) / 2, freedom))
+    quantile = _quantile(level, freedom)
     return replace(
         comparison,
         low=mean - quantile * error,
         high=mean + quantile * error,
-        p=float(2 * stats.t.sf(abs(mean) / error, freedom)),
+        p=float(2 * stdtr(freedom, -abs(mean) / error)),
         spread=spread,
         detectable=_noncentrality(freedom, quantile) * error,
     )
@@ -122,7 +121,7 @@ def detectable(spread: float, pairs: int, *, level: float = LEVEL) -> float:
     """
     if pairs < 2:
         return math.inf
-    quantile = float(stats.t.ppf((1 + level) / 2, pairs - 1))
+    quantile = _quantile(level, pairs - 1)
     return _noncentrality(float(pairs - 1), quantile) * spread / math.sqrt(pairs)
 
 
@@ -131,7 +130,7 @@ def mean_interval(values: Sequence[float], *, level: float = LEVEL) -> Interval:
     mean = float(np.mean(values))
     if len(values) < 2:
         return Interval(mean=mean, low=None, high=None)
-    half = float(stats.t.ppf((1 + level) / 2, len(values) - 1) * stats.sem(values))
+    half = _quantile(level, len(values) - 1) * float(np.std(values, ddof=1)) / math.sqrt(len(values))
     return Interval(mean=mean, low=mean - half, high=mean + half)
 
 
@@ -155,7 +154,7 @@ def intervals(samples: Mapping[str, Samples]) -> dict[str, Interval]:
         return by_method
     values = np.array([[np.mean(seeds[capture]) for capture in shared] for seeds in samples.values()])
     variances = (values - values.mean(0)).var(1, ddof=1) * len(samples) / len(others)
-    halves = stats.t.ppf((1 + LEVEL) / 2, len(shared) - 1) * np.sqrt(variances / len(shared))
+    halves = _quantile(LEVEL, len(shared) - 1) * np.sqrt(variances / len(shared))
     return {
         method: Interval(mean=each.mean, low=each.mean - float(half), high=each.mean + float(half))
         for (method, each), half in zip(by_method.items(), halves, strict=True)
@@ -183,8 +182,15 @@ def wilson(failures: int, trials: int) -> tuple[float, float]:
     """95 % interval of a rate (Wilson 1927); also right for 0 of 5."""
     if not 0 <= failures <= trials or trials == 0:
         raise ValueError(f"expected 0 <= failures <= trials and a trial, got {failures} of {trials}")
-    interval = stats.binomtest(failures, trials).proportion_ci(LEVEL, method="wilson")
+    from scipy.stats import binomtest  # A second of imports that no report needs.
+
+    interval = binomtest(failures, trials).proportion_ci(LEVEL, method="wilson")
     return float(interval.low), float(interval.high)
+
+
+def _quantile(level: float, freedom: float) -> float:
+    """Half the width of Student's interval, in standard errors."""
+    return float(stdtrit(freedom, (1 + level) / 2))
 
 
 def _noncentrality(freedom: float, quantile: float) -> float:

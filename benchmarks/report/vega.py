@@ -6,15 +6,19 @@ paper, ink and grid are replaced on dark pages by those of `DARK`, in the file a
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
+from importlib.metadata import version
 from typing import Any, ClassVar
 
 import altair as alt
 import vl_convert
 
+from ash.files import write_atomic
 from benchmarks.analysis.style import style_of
 from benchmarks.cell.registry import is_oracle
+from synth.person.anny_body import cache_folder
 
 VERSION = "6.4"  # of Vega-Lite, among those that vl-convert brings
 PAPER, INK, DIM, GRID, LINE = "#fffffe", "#1f2733", "#5d6878", "#dfe4eb", "#8a94a3"
@@ -115,7 +119,12 @@ def dark_rules(scope: str = "") -> str:
 @cache
 def library() -> str:
     """The JavaScript that draws specifications in a page: Vega, Vega-Lite, and their interpreter of expressions."""
+    kept = cache_folder() / f"vega-{VERSION}-{version('vl-convert-python')}.js"  # Bundling takes seconds.
+    with suppress(OSError, UnicodeDecodeError):
+        return kept.read_text(encoding="utf-8")
     bundle: str = vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;", vl_version=VERSION)
+    with suppress(OSError):
+        write_atomic(kept, bundle.encode())
     return bundle
 
 

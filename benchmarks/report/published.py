@@ -1,0 +1,169 @@
+"""`reports/README.md` from its template `README.md.j2`: every number in it comes from a published csv or `cells.zip`.
+
+`.venv/bin/python -m benchmarks.report.published` writes it anew after a report was published; a test compares the two.
+"""
+
+import math
+import re
+import sys
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+import pandas as pd
+from jinja2 import Environment, StrictUndefined
+
+from ash.files import InputError, write_atomic
+from benchmarks.analysis.results import Quantity, compare, foreground, read_csv, samples_of, summarise
+from benchmarks.analysis.statistics import Comparison, corrected
+from benchmarks.analysis.style import style_of
+from benchmarks.cell.metrics import METRICS, PROTOCOL
+from benchmarks.cell.registry import code_version
+from benchmarks.report.claims import printed
+from benchmarks.report.page import CELLS
+from benchmarks.report.tables import ON_WHOLE_FRAMES, cost_columns, head_of, quality_columns
+from benchmarks.suites.archive import unpacked
+from benchmarks.suites.runs import read_run, results_of
+
+FOLDER = Path(__file__).parents[2] / "reports"
+NAME = "README.md"
+NEWLINE = "\n"
+FACT = re.compile(r"^\| (code|commit) \| (.*?) \|$", re.MULTILINE)  # of a report's provenance
+
+
+def read_me(folder: Path = FOLDER) -> str:
+    """The text of the template with its numbers.
+
+    Raises:
+        InputError: a report that the template names is not there, or is of another protocol.
+    """
+    environment = Environment(undefined=StrictUndefined, keep_trailing_newline=True)
+    numbers = Numbers(folder)
+    names = ("score", "difference", "scores", "differences", "claims", "origin", "state", "title")
+    return environment.from_string((folder / f"{NAME}.j2").read_text()).render(
+        {name: getattr(numbers, name) for name in names}
+    )
+
+
+class Numbers:
+    """What a template may ask for; a quantity is named by split and metric (`benchmarks.cell.metrics`)."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._rows = cache(self._read)
+
+    def title(self, method: str) -> str:
+        """As tables write it."""
+        return style_of(method).title
+
+    def score(self, report: str, scene: str, method: str, split: str = "novel_view", metric: str = "psnr") -> str:
+        """The mean over people."""
+        return self._score(report, scene, method, _quantity(split, metric))
+
+    def difference(
+        self, report: str, scene: str, a: str, b: str, split: str = "novel_view", metric: str = "psnr"
+    ) -> str:
+        """Row `a` minus row `b` in pairs over people, with its 95 % interval."""
+        return _told(self._compared(report, scene, a, b, _quantity(split, metric)), metric)
+
+    def scores(self, report: str, scene: str) -> str:
+        """A table in Markdown: PSNR and LPIPS on all held-out splits, milliseconds and training seconds."""
+        wanted = [*quality_columns(("psnr", "lpips")), *cost_columns(("frame_ms", "train_cpu_s"))]
+        rows = self._rows(report)
+        methods = list(dict.fromkeys(rows[rows["scene"] == scene]["method"]))
+        cells = [
+            [style_of(method).title, *(self._score(report, scene, method, quantity) for quantity in wanted)]
+            for method in methods
+        ]
+        return _markdown(["", *(": ".join(head_of(quantity)) for quantity in wanted)], cells)
+
+    def differences(self, report: str, scenes: Sequence[str], pairs: Sequence[tuple[str, str]]) -> str:
+        """A table in Markdown: differences on novel views and new poses, p after Holm's correction."""
+        measured = set(self._rows(report)["metric"])
+        asked = [
+            (scene, a, b, _quantity(split, metric))
+            for scene in scenes
+            for a, b in pairs
+            for split in ("novel_view", "novel_pose")
+            for metric in ("psnr", "lpips")
+            if metric in measured
+        ]
+        tests = corrected([self._compared(report, *each) for each in asked])
+        cells = [
+            [
+                *(scene, f"{self.title(a)} - {self.title(b)}", head_of(quantity)[0], METRICS[quantity.metric].title),
+                *(_told(test, quantity.metric), "" if math.isnan(test.p) else f"{test.p:.2g}"),
+            ]
+            for (scene, a, b, quantity), test in zip(asked, tests, strict=True)
+        ]
+        return _markdown(["scene", "rows", "images", "metric", "difference [95 %]", "p (Holm)"], cells)
+
+    def claims(self) -> str:
+        """The claims that were judged, as a table in Markdown."""
+        table = pd.read_csv(self.folder / "claims" / "claims.csv", keep_default_na=False, na_values=[""])
+        shown = printed(table[table["effect"].notna()])
+        return _markdown(["claim", *shown.columns], [[str(name), *map(str, row)] for name, *row in shown.itertuples()])
+
+    def origin(self, report: str) -> str:
+        """Command, commit, machine and core-hours of training of a published report."""
+        with unpacked(self.folder / report / CELLS) as folder:
+            run = read_run(folder)
+            results = results_of(run)
+        made = [result.provenance for result in results if result.provenance is not None]
+        commits = ", ".join(sorted({each.commit for each in made}))
+        machines = ", ".join(sorted({f"{e.machine['cores']} cores of {e.machine['processor']}" for e in made}))
+        rows = self._rows(report)
+        hours = rows[(rows["metric"] == "train_cpu_s") & (rows["split"] == "speed")]["value"].sum() / 3600
+        return f"`{run.command}`, code of {commits}, {machines}, {hours:.1f} core-hours of training"
+
+    def state(self, report: str) -> str:
+        """Whether today's code made a published report."""
+        facts = dict(FACT.findall((self.folder / report / "report.md").read_text()))
+        return "current" if facts.get("code") == code_version("ash") else f"stale, {facts.get('commit', 'unknown')}"
+
+    def _score(self, report: str, scene: str, method: str, quantity: Quantity) -> str:
+        table = summarise(self._rows(report))
+        key = (scene, method, *quantity)
+        if key not in table.index:
+            return "n/a"
+        measure = METRICS[quantity.metric]
+        return f"{table.loc[key, 'value']:.{measure.decimals}f}"
+
+    def _compared(self, report: str, scene: str, a: str, b: str, quantity: Quantity) -> Comparison:
+        rows = self._rows(report)
+        of_scene = rows[rows["scene"] == scene]
+        test = compare(of_scene, a, b, quantity)
+        if test is None or not samples_of(of_scene, quantity).keys() >= {a, b}:
+            raise InputError(f"{self.folder / report}: expected rows {a} and {b} on {scene}")
+        return test
+
+    def _read(self, report: str) -> pd.DataFrame:
+        rows = read_csv(self.folder / report / "results.csv")
+        if set(rows["protocol"]) != {PROTOCOL}:
+            raise InputError(f"{self.folder / report}: expected results of protocol {PROTOCOL}")
+        return rows
+
+
+def _quantity(split: str, metric: str) -> Quantity:
+    return Quantity(split, "full", metric) if metric in ON_WHOLE_FRAMES else foreground(split, metric)
+
+
+def _told(test: Comparison, metric: str) -> str:
+    """A difference with its interval; without one where there is one person."""
+    measure = METRICS[metric]
+
+    def number(value: float) -> str:
+        return f"{value:+.{measure.decimals}f}"
+
+    interval = "" if math.isnan(test.low) else f" [{number(test.low)}, {number(test.high)}]"
+    return f"{number(test.mean)} {measure.unit}{interval}"
+
+
+def _markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [heads, ["---", *["---:"] * (len(heads) - 1)], *rows]
+    return NEWLINE.join(f"| {' | '.join(line)} |" for line in lines)
+
+
+if __name__ == "__main__":
+    place = Path(*sys.argv[1:2]) if len(sys.argv) > 1 else FOLDER
+    write_atomic(place / NAME, read_me(place).encode())
