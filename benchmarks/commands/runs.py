@@ -167,7 +167,7 @@ class ReportCommand:
     Shards of one run are merged: their cells are copied to --out, which is then the whole run.
 
     What --publish leaves holds cells.zip, every number of every cell. Unpacked, that is a run for `report` and
-    `compare`: `unzip reports/people/cells.zip -d runs/earlier`.
+    `compare`: `unzip reports/table/cells.zip -d runs/earlier`.
     """
 
     runs: Positional[tuple[Path, ...]]  # folders of runs or of single cells
