@@ -2,6 +2,7 @@
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pandas as pd
@@ -31,10 +32,14 @@ from benchmarks.suites.suites import CaptureSpec
 MASKS = Path(__file__).parents[2] / "data" / "masks.toml"
 
 
+@cache  # Reading our suites takes seconds.
+def our_stresses() -> tuple[Stress, ...]:
+    return (*find_suite("stability").stresses, *find_suite("motions").stresses)
+
+
 def severities_of(axis: str) -> list[float]:
     """The steps that our suites take along an axis."""
-    stresses = (*find_suite("stability").stresses, *find_suite("motions").stresses)
-    return [stress.severity for stress in stresses if stress.axis == axis]
+    return [stress.severity for stress in our_stresses() if stress.axis == axis]
 
 
 def course(levels: tuple[float, ...]) -> list[CellResult]:
