@@ -377,6 +377,23 @@ def test_the_main_table_is_followed_by_what_training_saw_of_the_views() -> None:
     assert sentences.training_views(unknown, "loose") == []
 
 
+def test_the_browser_sees_errors_overflow_faint_text_and_requests(visit: Visitor, tmp_path: Path) -> None:
+    """Without which the checks below would say nothing."""
+    (
+        tmp_path / "page.html"
+    ).write_text("""<!doctype html><meta name=viewport content='width=device-width'><title>t</title>
+    <p>text</p><p style="color:#aaa">faint</p><div class="long" style="width:600px">wide</div><img src="gone.png">
+    <meta http-equiv="Content-Security-Policy" content="script-src 'unsafe-inline'">
+    <script>setTimeout(() => { try { eval("1") } catch {} throw new Error("thrown") })</script>""")
+    seen = visit(tmp_path / "page.html", size=PHONE)
+    seen.page.wait_for_timeout(100)
+    assert any("thrown" in error for error in seen.errors) and any("gone.png" in error for error in seen.errors)
+    assert any("unsafe-eval" in error or "Security" in error for error in seen.errors)
+    assert len(seen.requests) == 1 and seen.requests[0].endswith("gone.png")
+    assert any("long" in found for found in seen.too_wide())
+    assert ['"faint"' in found for found in seen.poor_contrast()] == [True]
+
+
 def walked(run: Run, visit: Visitor, size: tuple[int, int], scheme: Literal["light", "dark"]) -> Visit:
     """The page in a window, everything unfolded and walked through, so that whatever is lazy has come."""
     found = visit(run.folder / "report.html", size=size, scheme=scheme)
