@@ -117,8 +117,8 @@ def test_an_oracle_sees_everything(capture: Path, tmp_path: Path) -> None:
 
 def test_a_short_peak_of_memory_fails_a_real_run_too(capture: Path, tmp_path: Path) -> None:
     config = CellConfig(
-        scene="boxes", size="ci", capture_seed=0, capture=load_capture(capture).identity, method="hoarding", preset="ci",
-        seed=0, code="test",
+        scene="boxes", size="ci", capture_seed=0, capture=load_capture(capture).identity, method="hoarding",
+        preset="ci", seed=0, code="test",
     )  # fmt: skip
     cell = Cell(config=config, folder=tmp_path / "cell", capture_folder=capture)
     write_config(cell)
