@@ -1,4 +1,4 @@
-"""Browsers of the player that are none: they speak viser's protocol, count pictures and measure how late they come."""
+"""Browsers of the player that are none: they speak viser's protocol and count pictures."""
 
 import threading
 import time
@@ -91,16 +91,13 @@ class FakeBrowser:
     width: int = 512
     height: int = 512
     arrivals: list[float] = field(default_factory=list)  # of pictures, perf_counter
-    latencies: list[float] = field(default_factory=list)  # seconds from a camera to the next picture begun after it
     controls: dict[str, str] = field(default_factory=dict)  # label -> uuid
     texts: dict[str, str] = field(default_factory=dict)  # uuid -> Markdown
-    kinds: set[str] = field(default_factory=set)
     commands: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.socket = enter(self.url)
         self.angle = 0.3
-        self._asked: list[float] = []
         self._thread = threading.Thread(target=self._listen, daemon=True)
         self._thread.start()
         self.look(self.angle)
@@ -118,12 +115,8 @@ class FakeBrowser:
             pass
 
     def _note(self, each: dict, now: float) -> None:
-        self.kinds.add(each["type"])
         if each["type"] == "BackgroundImageMessage" and each["rgb_data"] is not None:
             self.arrivals.append(now)
-            if self._asked:
-                self.latencies.append(now - self._asked.pop(0))
-                self._asked.clear()
         elif each["type"] == "RegisterCommandMessage":
             self.commands[each["props"]["label"]] = each["uuid"]
         elif "props" in each and isinstance(each["props"], dict):
@@ -149,7 +142,6 @@ class FakeBrowser:
         from scipy.spatial.transform import Rotation
 
         x, y, z, w = Rotation.from_matrix(np.stack([right, np.cross(forward, right), forward], axis=1)).as_quat()
-        self._asked.append(time.perf_counter())
         self.send(
             "ViewerCameraMessage",
             wxyz=[float(w), float(x), float(y), float(z)],

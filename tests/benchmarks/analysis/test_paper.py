@@ -1,6 +1,7 @@
 """Our rows beside the paper's, and the agreement of the two orders."""
 
 import math
+from functools import cache
 
 import pytest
 from helpers.cells import cell, config
@@ -19,6 +20,7 @@ def run(levels: dict[str, float], seeds: int = 3) -> RunTables:
     return RunTables([cell(m, level + 0.1 * seed, seed=seed) for m, level in levels.items() for seed in range(seeds)])
 
 
+@cache  # Reading our suites takes seconds.
 def specs() -> list[TableSpec]:
     return [spec for name in ("paper", "cameras") for spec in read_tables(suite_file(name))[0]]
 

@@ -2,6 +2,7 @@
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pandas as pd
@@ -31,10 +32,14 @@ from benchmarks.suites.suites import CaptureSpec
 MASKS = Path(__file__).parents[2] / "data" / "masks.toml"
 
 
+@cache  # Reading our suites takes seconds.
+def our_stresses() -> tuple[Stress, ...]:
+    return (*find_suite("stability").stresses, *find_suite("motions").stresses)
+
+
 def severities_of(axis: str) -> list[float]:
     """The steps that our suites take along an axis."""
-    stresses = (*find_suite("stability").stresses, *find_suite("motions").stresses)
-    return [stress.severity for stress in stresses if stress.axis == axis]
+    return [stress.severity for stress in our_stresses() if stress.axis == axis]
 
 
 def course(levels: tuple[float, ...]) -> list[CellResult]:
@@ -164,12 +169,12 @@ def test_a_stress_without_meaning_is_refused(stress: tuple[str, float]) -> None:
         Stress(axis=stress[0], severity=stress[1])
 
 
-def test_every_axis_changes_what_a_method_learns_from_more_and_more(tmp_path: Path) -> None:
-    capture = load_capture(write_capture(tmp_path))
+def test_every_axis_changes_what_a_method_learns_from_more_and_more(capture: Path) -> None:
+    whole = load_capture(capture)
     train = Split(cameras=tuple(f"cam{i}" for i in range(4)), frames=tuple(range(FOOTAGE_FRAMES)))
-    capture = replace(capture, splits={**capture.splits, "train": train})
+    longer = replace(whole, splits={**whole.splits, "train": train})
     for name, axis in AXES.items():
-        found = [axis.perturbation(capture, severity) for severity in severities_of(name)]
+        found = [axis.perturbation(longer, severity) for severity in severities_of(name)]
         assert len({repr(p) for p in found}) == len(found) >= 3, name
         assert severities_of(name) == sorted(severities_of(name))
 

@@ -1,6 +1,7 @@
 """Every format is read back by another program's reader and drawn by our splatter, beside our own picture."""
 
 import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -87,28 +88,19 @@ def test_spz_keeps_every_number_to_the_step_that_the_format_has() -> None:
     torch.testing.assert_close(read.sh[:, 1:], written.sh[:, 1:].clamp(-1, 127 / 128), atol=0.51 / 128, rtol=0)
     unit = torch.nn.functional.normalize(written.quats, dim=-1)
     assert (read.quats * unit).sum(-1).abs().min() > 1 - 1e-5
-    far = Gaussians(
-        means=100 * written.means, quats=unit, scales=written.scales, opacities=written.opacities, sh=written.sh
-    )
+    far = replace(written, means=100 * written.means)
     torch.testing.assert_close(read_spz(spz_bytes(far)).means, far.means, atol=2**-15, rtol=0)
     with pytest.raises(InputError, match="4096 m"):
-        spz_bytes(Gaussians(means=1e5 * far.means, quats=unit, scales=far.scales, opacities=far.opacities, sh=far.sh))
+        spz_bytes(replace(far, means=1e5 * far.means))
 
 
-@pytest.mark.parametrize("form", WRITERS)
-def test_a_wrong_turn_would_be_seen(form: str) -> None:
+def test_a_wrong_turn_would_be_seen() -> None:
     """What the tests above hold: turned by one degree, or with rotations conjugated, the pictures part."""
     written = cloud(1)
-    read = there_and_back(form, written)
+    read = there_and_back("ply", written)  # which loses nothing by itself
     angle = math.radians(0.5)
     assert agreement_db(turned(read, (math.cos(angle), math.sin(angle), 0.0, 0.0)), written) < 40
-    mirrored = Gaussians(
-        means=read.means,
-        quats=read.quats * torch.tensor([1.0, -1, -1, -1]),
-        scales=read.scales,
-        opacities=read.opacities,
-        sh=read.sh,
-    )
+    mirrored = replace(read, quats=read.quats * torch.tensor([1.0, -1, -1, -1]))
     assert agreement_db(mirrored, written) < 40
 
 

@@ -19,10 +19,9 @@ SCRIPT = Path(__file__).parents[3] / "docs" / "draw_a_frame.py"
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A trained cell of a fake method."""
     made = tmp_path_factory.mktemp("made")
-    capture = fakes.write_capture(made / "capture")
     with pytest.MonkeyPatch.context() as patch:
         fakes.use(made / "plugins", patch)
         assert cli.main(["train", "helpers.fakes:good", str(capture), "--preset", "ci", "--out", str(made)]) == 0

@@ -1,4 +1,4 @@
-"""`export --format html`: the page in a real browser, from a file, beside our own picture."""
+"""`export --format html`: the page in a real browser, beside our own picture; other exports in its viewer."""
 
 import base64
 import io
@@ -14,7 +14,7 @@ from helpers.browser import Visitor
 from helpers.scoring import psnr
 from PIL import Image
 
-from ash.capture.dataset import Pose
+from ash.capture.dataset import Camera, Pose
 from ash.protocol import StageClock
 from benchmarks import cli
 from benchmarks.play.avatars import open_avatars
@@ -22,6 +22,29 @@ from benchmarks.play.share import COLUMNS
 
 PAPER = (236, 236, 236)
 PATIENCE = 120_000  # milliseconds: software graphics on a busy machine
+
+# Opens a file in a scene of its own and looks at it; half a turn about x is how three.js shows a world whose y is down.
+OPEN = """async ([bytes, type, turned, matrix, fov, width, height, dilation]) => {
+  const fileBytes = Uint8Array.from(atob(bytes), (c) => c.charCodeAt(0));
+  const renderer = new Splats.WebGLRenderer({ antialias: false, preserveDrawingBuffer: true });
+  renderer.setPixelRatio(1); renderer.setSize(width, height, false);
+  const scene = new Splats.Scene();
+  scene.background = new Splats.Color("#ececec");
+  scene.add(new Splats.SparkRenderer({
+    renderer, preBlurAmount: dilation, blurAmount: 0, maxStdDev: Math.sqrt(11), minAlpha: 1 / 255, sortRadial: false,
+  }));
+  const mesh = new Splats.SplatMesh({ fileBytes, fileType: type });
+  await mesh.initialized;
+  if (turned) mesh.quaternion.set(1, 0, 0, 0);
+  scene.add(mesh);
+  const camera = new Splats.PerspectiveCamera(fov, width / height, 0.05, 100);
+  new Splats.Matrix4().fromArray(matrix).decompose(camera.position, camera.quaternion, camera.scale);
+  for (let k = 0; k < 8; k++) { // A worker sorts between two of them.
+    renderer.render(scene, camera);
+    await new Promise((done) => setTimeout(done, 150));
+  }
+  return renderer.domElement.toDataURL("image/png");
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -44,13 +67,9 @@ def test_the_page_draws_in_a_browser_what_we_draw(page: Path, tube_cells: dict[s
         loaded, capture = avatars[avatars.titles[0]], avatars.capture
         for frame, name in ((0, "cam1"), (3, "cam3")):
             camera = capture.cameras[name]
-            matrix = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1, -1, 1])
-            fov = float(np.rad2deg(2 * np.arctan2(camera.height / 2, camera.K[1, 1])))
-            look = [frame, matrix.T.ravel().tolist(), fov, camera.width, camera.height]
-            tab.evaluate("([f, m, v, w, h]) => window.avatar.look(f, m, v, w, h)", look)
+            tab.evaluate("([f, m, v, w, h]) => window.avatar.look(f, m, v, w, h)", [frame, *seen_by(camera)])
             tab.wait_for_function("window.avatar.resting", timeout=PATIENCE)
-            encoded = tab.evaluate("window.avatar.picture()").partition(",")[2]
-            theirs = np.asarray(Image.open(io.BytesIO(base64.b64decode(encoded))).convert("RGB")) / 255
+            theirs = decoded(tab.evaluate("window.avatar.picture()"))
             ours = loaded.on_colour(Pose(capture.motion, frame), camera, StageClock(), PAPER) / 255
             alpha = loaded.premultiplied(Pose(capture.motion, frame), camera, StageClock())[..., 3]
             assert theirs.shape == ours.shape and (alpha > 0.5).mean() > 0.05
@@ -58,6 +77,42 @@ def test_the_page_draws_in_a_browser_what_we_draw(page: Path, tube_cells: dict[s
         tab.keyboard.press("ArrowRight")
         assert tab.evaluate("window.avatar.shown") == 0, "after the last frame comes the first"
     assert visited.errors == [] and visited.requests == [], "it needs no network"
+
+
+def seen_by(camera: Camera) -> list[object]:
+    """How three.js describes a camera: its matrix, the field of view, width and height."""
+    matrix = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1, -1, 1])
+    fov = float(np.rad2deg(2 * np.arctan2(camera.height / 2, camera.K[1, 1])))
+    return [matrix.T.ravel().tolist(), fov, camera.width, camera.height]
+
+
+def decoded(url: str) -> np.ndarray:
+    """The colours of a picture in a data URL."""
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB")) / 255
+
+
+def test_a_viewer_that_is_not_ours_shows_exported_files_as_the_avatar_renders(
+    page: Path, tube_cells: dict[str, Path], tmp_path: Path, visit: Visitor
+) -> None:
+    """Spark, which the page brings along."""
+    visited = visit(page, size=(200, 200))
+    visited.page.wait_for_function("window.avatar", timeout=PATIENCE)
+    visited.page.keyboard.press(" ")  # The page's own clip stands still meanwhile.
+    with open_avatars(tube_cells["ash"]) as avatars:
+        loaded, camera = avatars[avatars.titles[0]], avatars.capture.cameras["cam2"]
+        pose = Pose(avatars.capture.motion, 2)
+        ours = loaded.on_colour(pose, camera, StageClock(), PAPER) / 255
+        alpha = loaded.premultiplied(pose, camera, StageClock())[..., 3]
+        dilation = loaded.avatar.dilation
+    assert (alpha > 0.5).mean() > 0.05
+    for form, turned in (("ply", True), ("spz", False)):
+        out = tmp_path / f"frame.{form}"
+        command = ["export", str(tube_cells["ash"]), "--format", form, "--motion", "train", "--frames", "2"]
+        assert cli.main([*command, "--out", str(out)]) == cli.DONE
+        content = base64.b64encode(out.read_bytes()).decode()
+        theirs = decoded(visited.page.evaluate(OPEN, [content, form, turned, *seen_by(camera), dilation]))
+        assert psnr(theirs, ours, alpha) > 30, form
+    assert visited.errors == []
 
 
 def test_the_page_holds_every_frame_to_its_bytes(page: Path, tube_cells: dict[str, Path]) -> None:

@@ -57,6 +57,9 @@ def rows(a: Sequence[float], b: Sequence[float]) -> pd.DataFrame:
     return load(cells.people({"ash": a, "ddc": b}))
 
 
+CLAIM = Claim(name="n", says="s", where="w", a="ash", b="ddc", scenes=("loose",))
+
+
 def verdict(claim: Claim, *tables: pd.DataFrame) -> str:
     (row,) = judge([claim], {f"run {i}": table for i, table in enumerate(tables)}).itertuples()
     return str(row.verdict)
@@ -84,45 +87,38 @@ OTHER = (28.0, 29.0, 30.0)
     ],
 )
 def test_a_contrast_decides(expect: str, a: Sequence[float], found: str) -> None:
-    claim = Claim(name="n", says="s", where="w", a="ash", b="ddc", scenes=("loose",), expect=expect)  # type: ignore[arg-type]
+    claim = replace(CLAIM, expect=expect)
     assert verdict(claim, rows(a, OTHER)) == found
     mirrored = {"better": "worse", "worse": "better", "not better": "not worse", "not worse": "not better"}
-    turned = Claim(
-        name="n", says="s", where="w", a="ddc", b="ash", scenes=("loose",), expect=mirrored.get(expect, expect)
-    )  # type: ignore[arg-type]
+    turned = replace(CLAIM, a="ddc", b="ash", expect=mirrored.get(expect, expect))
     assert verdict(turned, rows(a, OTHER)) == found
 
 
 def test_a_published_difference_above_the_interval_makes_it_smaller() -> None:
-    claim = Claim(name="n", says="s", where="w", a="ash", b="ddc", scenes=("loose",), paper={"loose": 7.4})
-    assert verdict(claim, rows(BETTER, OTHER)) == "confirmed but smaller"
-    other_way = Claim(
-        name="n", says="s", where="w", a="ddc", b="ash", scenes=("loose",), expect="worse", paper={"loose": -2.0}
-    )
+    assert verdict(replace(CLAIM, paper={"loose": 7.4}), rows(BETTER, OTHER)) == "confirmed but smaller"
+    other_way = replace(CLAIM, a="ddc", b="ash", expect="worse", paper={"loose": -2.0})
     assert verdict(other_way, rows(BETTER, OTHER)) == "confirmed"
 
 
 def test_by_more_than_so_much_asks_for_the_whole_interval() -> None:
-    claim = Claim(name="n", says="s", where="w", a="ash", b="ddc", scenes=("loose",), least=1.5)
+    claim = replace(CLAIM, least=1.5)
     assert verdict(claim, rows(BETTER, OTHER)) == "confirmed"
     wide = rows((29.0, 31.1, 32.2), OTHER)
     assert verdict(claim, wide) == "not shown" and verdict(replace(claim, least=None), wide) == "confirmed"
 
 
 def test_trainings_that_ended_before_their_plateau_are_told() -> None:
-    claim = Claim(name="n", says="s", where="w", a="ash", b="ddc", scenes=("loose",))
     table = rows(BETTER, OTHER)
     ended = table.drop_duplicates(["method", "capture"]).assign(split="speed", region="", metric="plateau", value=1.0)
-    assert judge([claim], {"run": pd.concat([table, ended])}).because.item() == ""
+    assert judge([CLAIM], {"run": pd.concat([table, ended])}).because.item() == ""
     short = ended.assign(value=(ended["method"] != "ash").astype(float))
-    because = judge([claim], {"run": pd.concat([table, short])}).because.item()
+    because = judge([CLAIM], {"run": pd.concat([table, short])}).because.item()
     assert because == "not at their plateau when training ended: ASH"
 
 
 def test_what_cannot_be_judged_says_why() -> None:
-    claim = Claim(name="n", says="s", where="w", a="ash", b="ddc", scenes=("loose",))
     told = [
-        judge([claim], {"run": table}).because.item()
+        judge([CLAIM], {"run": table}).because.item()
         for table in (
             rows((30.0,), (20.0,)),
             load(cells.people({"ash": BETTER})),
@@ -141,23 +137,20 @@ def test_what_cannot_be_judged_says_why() -> None:
 
 
 def test_it_is_judged_in_the_run_that_has_the_most_people() -> None:
-    claim = Claim(name="n", says="s", where="w", a="ash", b="ddc", scenes=("loose",))
     few, many = rows(OTHER[:2], BETTER[:2]), rows(BETTER, OTHER)
-    table = judge([claim], {"alone": load(cells.people({"ash": BETTER})), "few": few, "many": many})
+    table = judge([CLAIM], {"alone": load(cells.people({"ash": BETTER})), "few": few, "many": many})
     assert table[["run", "people", "verdict"]].to_numpy().tolist() == [["many", 3, "confirmed"]]
 
 
 def test_p_is_corrected_over_all_claims() -> None:
-    one = Claim(name="0", says="s", where="w", a="ash", b="ddc", scenes=("loose",))
-    many = [Claim(name=str(k), says="s", where="w", a="ash", b="ddc", scenes=("loose",)) for k in range(400)]
-    table = rows((28.9, 30.3, 30.9), OTHER)
-    assert judge([one], {"run": table}).verdict.item() == "confirmed"
+    many = [replace(CLAIM, name=str(k)) for k in range(20)]
+    table = rows((28.9, 30.3, 30.9), OTHER)  # p is 0.016
+    assert judge([CLAIM], {"run": table}).verdict.item() == "confirmed"
     assert set(judge(many, {"run": table}).verdict) == {"not shown"}
 
 
 def test_a_claim_that_held_and_does_not_any_more_is_named() -> None:
-    claim = Claim(name="n", says="s", where="w", a="ash", b="ddc", scenes=("loose",))
-    held, lost = (judge([claim], {"run": rows(a, OTHER)}) for a in (BETTER, SAME))
+    held, lost = (judge([CLAIM], {"run": rows(a, OTHER)}) for a in (BETTER, SAME))
     assert broken(held, held) == [] and broken(lost, held) == []
     assert broken(held, lost) == ["n, loose: confirmed before, contradicted now"]
 

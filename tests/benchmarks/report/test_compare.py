@@ -2,24 +2,25 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import pandas as pd
 import pytest
-from helpers import fakes
 from helpers.browser import DESKTOP, PHONE, Visitor
 from helpers.cells import cell, people
 from helpers.waiting import wait_for
 
+from ash.capture.formats import load_capture
 from ash.files import InputError
 from benchmarks import cli
-from benchmarks.cell.schema import Cell, CellResult
-from benchmarks.report.compare import changes, failures_in_words, printed, verdict_of
+from benchmarks.cell.schema import Cell, CellResult, result_of, write_config, write_result
+from benchmarks.report.compare import changes, failures_in_words, printed, verdict_of, write_comparison
 from benchmarks.suites import runs as runs_module
-from benchmarks.suites.files import read_suite
-from benchmarks.suites.runs import RunOptions, gathered, read_run, run_suite
+from benchmarks.suites.captures import truth_of
+from benchmarks.suites.runs import Run, gathered, read_run, write_run
 
 Rows = dict[tuple[str, str], list[tuple[Cell, CellResult]]]
 
@@ -74,36 +75,46 @@ def test_less_error_is_better() -> None:
     assert verdict_of(changes(before, after)) == "Of 1 quantities 1 is better (ash on loose)."
 
 
+def copied(cell: Cell, out: Path, **changes: object) -> Cell:
+    """The cell with its result and pictures, under another config."""
+    config, result = replace(cell.config, **changes), result_of(cell)
+    assert result is not None
+    made = replace(cell, config=config, folder=out / "cells" / config.key)
+    shutil.copytree(cell.folder, made.folder)
+    write_config(made)
+    write_result(made.folder, replace(result, config=config))
+    return made
+
+
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Two runs: the second has a worse method under the same name."""
-    folder = tmp_path_factory.mktemp("runs")
-    capture = fakes.write_capture(folder / "capture")
-    made = []
-    with pytest.MonkeyPatch.context() as patch:
-        fakes.use(folder / "plugins", patch)
-        for name, method in (("before", "good"), ("after", "bad")):
-            suite = fakes.write_suite(folder / name, capture, f"fake_{method}")
-            text = suite.read_text().replace(f"'fake_{method}'", f"{{ of = 'fake_{method}', name = 'mine' }}")
-            suite.write_text(text)
-            options = RunOptions(out=folder / name / "run", data=folder, workers=2)
-            made.append(run_suite(read_suite(suite).narrowed(seeds=2), options).folder)
-    return made[0], made[1]
+def runs(made_once: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two runs of two seeds: the second has a worse method under the same name."""
+    folders = (tmp_path_factory.mktemp("runs") / "before", tmp_path_factory.mktemp("runs") / "after")
+    for folder, made in zip(folders, read_run(made_once).cells, strict=True):
+        row = {"method": "mine", "factory": made.config.method}
+        cells = tuple(copied(made, folder, **row, seed=seed) for seed in range(2))
+        write_run(Run(folder=folder, suite=folder.name, about="", command="", cells=cells))
+    return folders
+
+
+@pytest.fixture(scope="module")
+def compared(runs: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """What the terminal shows of the two runs, and the folder of their page."""
+    folder = tmp_path_factory.mktemp("compared")
+    return write_comparison(*map(read_run, runs), folder), folder
 
 
 def test_compare_tells_rows_and_shows_the_worst_frames(
-    runs: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture
+    runs: tuple[Path, Path], compared: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    before, after = runs
-    assert cli.main(["compare", str(before), str(after), "--out", str(tmp_path)]) == 0
-    output = capsys.readouterr().out
+    output, folder = compared
     assert output.startswith("Of ") and "worse (mine on boxes)" in output.splitlines()[0]
-    page = (tmp_path / "compare.html").read_text()
+    page = (folder / "compare.html").read_text()
     album = re.search(r'id="album">(.*?)</script>', page)
     assert "among the worst before" in page and album is not None and len(json.loads(album[1])) >= 3 * 3
     assert re.search(r'<td class="second"[^>]*>worse</td>', page)
-    assert 'boxes,mine,"PSNR, novel views",dB,' in (tmp_path / "compare.csv").read_text()
-    assert cli.main(["compare", str(before), str(before), "--out", str(tmp_path)]) == 0
+    assert 'boxes,mine,"PSNR, novel views",dB,' in (folder / "compare.csv").read_text()
+    assert cli.main(["compare", str(runs[0]), str(runs[0]), "--out", str(tmp_path)]) == 0
     same = capsys.readouterr().out
     assert same.startswith("No quantity is better or worse.") and "equivalent" in same
 
@@ -122,14 +133,14 @@ def test_two_avatars_of_one_name_are_no_two_seeds(runs: tuple[Path, Path], tmp_p
 
 
 def test_captures_of_one_name_are_told_apart(runs: tuple[Path, Path], tmp_path: Path) -> None:
-    other = fakes.write_capture(tmp_path / "other")
+    (mine, _) = read_run(runs[0]).cells
+    other = Path(shutil.copytree(mine.capture_folder, tmp_path / "other"))
     manifest = other / "manifest.json"
     manifest.write_text(manifest.read_text().replace("{", '{"identity": "another",', 1))
-    out = tmp_path / "train"
-    with pytest.MonkeyPatch.context() as patch:
-        fakes.use(tmp_path / "plugins", patch)
-        assert cli.main(["train", "fake_good", str(other), "--preset", "ci", "--out", str(out)]) == 0
-    run = gathered([runs[0], next((out / "cells").iterdir())], tmp_path, command="")
+    shown = load_capture(other)
+    same = replace(mine, capture_folder=other)
+    third = copied(same, tmp_path, capture=shown.identity, truth=truth_of(shown.manifest))
+    run = gathered([runs[0], third.folder], tmp_path, command="")
     assert {each.config.scene for each in run.cells} == {"capture", "other"}
 
 
@@ -143,26 +154,21 @@ def test_subjects_of_a_scene_stay_one_scene(runs: tuple[Path, Path], tmp_path: P
 
 
 def test_runs_without_a_common_row_are_refused(runs: tuple[Path, Path], tmp_path: Path) -> None:
-    from benchmarks.report.compare import write_comparison
-
     run = read_run(runs[0])
     renamed = replace(run, cells=tuple(replace(c, config=replace(c.config, scene="other")) for c in run.cells))
     with pytest.raises(InputError, match="no scene and method in common"):
         write_comparison(run, renamed, tmp_path)
 
 
-@pytest.mark.parametrize(("size", "scheme"), [(DESKTOP, "dark"), (PHONE, "light")], ids=str)
-def test_nothing_is_wrong_with_the_comparison_in_a_browser(
-    runs: tuple[Path, Path], tmp_path: Path, visit: Visitor, size: tuple[int, int], scheme: str
-) -> None:
-    assert cli.main(["compare", *map(str, runs), "--out", str(tmp_path)]) == 0
-    seen = visit(tmp_path / "compare.html", size=size, scheme=scheme)
-    assert (seen.errors, seen.requests, seen.too_wide(), seen.poor_contrast()) == ([], [], [], [])
-    for _ in range(10):  # Pictures are decoded when they are scrolled to.
-        seen.page.evaluate("scrollBy(0, 500)")
-        seen.page.wait_for_timeout(20)
-    wait_for(partial(seen.page.evaluate, "[...document.images].every((image) => image.naturalWidth > 0)"))
-    assert seen.page.evaluate("document.images.length") >= 9
+def test_nothing_is_wrong_with_the_comparison_in_a_browser(compared: tuple[str, Path], visit: Visitor) -> None:
+    for size, scheme in ((DESKTOP, "dark"), (PHONE, "light")):
+        seen = visit(compared[1] / "compare.html", size=size, scheme=scheme)
+        assert (seen.errors, seen.requests, seen.too_wide(), seen.poor_contrast()) == ([], [], [], [])
+        for _ in range(10):  # Pictures are decoded when they are scrolled to.
+            seen.page.evaluate("scrollBy(0, 500)")
+            seen.page.wait_for_timeout(20)
+        wait_for(partial(seen.page.evaluate, "[...document.images].every((image) => image.naturalWidth > 0)"))
+        assert seen.page.evaluate("document.images.length") >= 9
 
 
 def test_subjects_are_compared_in_pairs() -> None:

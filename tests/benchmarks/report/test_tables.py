@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from helpers.cells import config
 
 from ash.files import InputError
 from benchmarks.analysis.results import COLUMNS, RunTables, csv_of, foreground, load, read_csv, samples_of
@@ -12,7 +13,6 @@ from benchmarks.cell.evaluation import read_curve
 from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.schema import (
     Cell,
-    CellConfig,
     CellResult,
     CurvePoint,
     Provenance,
@@ -27,12 +27,6 @@ from benchmarks.cell.schema import (
 )
 from benchmarks.report.sentences import doubts
 from benchmarks.report.tables import build, quality_columns
-
-
-def config(method: str = "ash", seed: int = 0) -> CellConfig:
-    return CellConfig(
-        scene="boxes", size="ci", capture_seed=0, capture="c" * 64, method=method, preset="ci", seed=seed, code="0"
-    )
 
 
 def result(method: str = "ash", seed: int = 0, psnr: float = 25.0) -> CellResult:
@@ -110,20 +104,20 @@ def test_several_captures_of_a_scene_are_the_unit_and_their_seeds_are_averaged()
     ]
     tables = RunTables(results)
     assert list(tables.rows["subject"].unique()) == [0, 1]
-    assert list(tables.rows["capture"].unique()) == ["boxes-ci-0", "boxes-ci-0-subject1"]
-    samples = samples_of(tables.of("boxes"), foreground())["ash"]
-    assert independent(samples) == [25.0, 28.0] and tables.captures("boxes") == 2
-    assert tables.get("boxes", "ash", foreground()).n == 2
+    assert list(tables.rows["capture"].unique()) == ["loose-ci-0", "loose-ci-0-subject1"]
+    samples = samples_of(tables.of("loose"), foreground())["ash"]
+    assert independent(samples) == [25.0, 28.0] and tables.captures("loose") == 2
+    assert tables.get("loose", "ash", foreground()).n == 2
 
 
 def test_scores_are_means_with_students_interval() -> None:
     tables = RunTables([result(seed=seed, psnr=psnr) for seed, psnr in enumerate((24.0, 25.0, 27.0))])
-    score = tables.get("boxes", "ash", foreground())
+    score = tables.get("loose", "ash", foreground())
     assert score is not None and score.n == 3
     assert score.value == pytest.approx(76 / 3)
     assert score.half_width == pytest.approx(4.302653 * math.sqrt(7 / 3 / 3), rel=1e-5)  # t of 2 degrees of freedom
-    assert math.isnan(RunTables([result()]).get("boxes", "ash", foreground()).half_width)
-    assert tables.get("boxes", "ddc", foreground()) is None
+    assert math.isnan(RunTables([result()]).get("loose", "ash", foreground()).half_width)
+    assert tables.get("loose", "ddc", foreground()) is None
 
 
 def test_a_curve_passes_over_what_is_no_point(tmp_path: Path) -> None:
@@ -158,7 +152,7 @@ def test_what_was_not_enforced_and_clocks_that_contradict_are_told() -> None:
     assert doubts([oracle]) == (), "an oracle is given the truth"
     columns = quality_columns(("psnr",))
     plain, marked = (
-        build(RunTables([result()]), "boxes", columns, title="", exposed=exposed) for exposed in ((), ("ash",))
+        build(RunTables([result()]), "loose", columns, title="", exposed=exposed) for exposed in ((), ("ash",))
     )
     assert (plain.frame.index[0], marked.frame.index[0]) == ("ASH", "ASH (not isolated)")
 

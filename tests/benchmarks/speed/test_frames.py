@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.captures import SIZE, write_tube_capture
+from helpers.captures import SIZE
 from helpers.commands import refused
 
 from ash.avatar import AshAvatar
 from ash.capture.dataset import Capture
+from ash.capture.formats import load_capture
 from ash.files import InputError, read_json
 from ash.presets import plus
 from ash.training.images import load_training_images
@@ -27,8 +28,8 @@ Trained = tuple[AshAvatar, Capture]
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
+def capture(tube_run: Path) -> Capture:
+    return load_capture(tube_run.parent / "capture")
 
 
 @pytest.fixture(scope="module")
@@ -217,7 +218,7 @@ def test_a_part_that_takes_longer_is_seen(capture, tmp_path):
     decode, images = avatar._decode, load_training_images(capture)
 
     def slow(*arguments):
-        until = time.thread_time() + 0.5
+        until = time.thread_time() + 0.3
         while time.thread_time() < until:
             pass
         return decode(*arguments)
@@ -225,4 +226,5 @@ def test_a_part_that_takes_longer_is_seen(capture, tmp_path):
     avatar._decode = slow
     candidate = profile.profiled(avatar, images, "it", tmp_path)
     parts = {part: ms for number in range(3) for part, ms in candidate.call(number).items()}
-    assert parts["decode"] > 500 and max(ms for part, ms in parts.items() if part not in ("decode", "step")) < 500
+    others = [ms for part, ms in parts.items() if part not in ("decode", "step")]
+    assert parts["decode"] > 300 and parts["decode"] > max(others)

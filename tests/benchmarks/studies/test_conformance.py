@@ -1,4 +1,4 @@
-"""The conformance checker tells planted cheats from an honest method, and a real run is sealed in the same way."""
+"""The conformance checker tells planted cheats from an honest method, and what it seals its trials with."""
 
 import re
 from pathlib import Path
@@ -51,7 +51,7 @@ def test_a_cheat_is_caught_for_what_it_does_and_for_nothing_else(name: str, capt
 
 
 def test_a_method_that_takes_too_long_is_ended(capture: Path, tmp_path: Path) -> None:
-    short = Limits(seconds=4.0, memory_mb=700)
+    short = Limits(seconds=1.0, memory_mb=700)
     checks = check_method("sleeping", capture, tmp_path / "trials", preset="ci", limits=short, workers=3)
     assert {check.rule for check in checks if check.passed is False} == {"keeps to its time"}
     assert sum(check.passed is None for check in checks) > 5, "what was not seen is not called kept"
@@ -115,18 +115,15 @@ def test_an_oracle_sees_everything(capture: Path, tmp_path: Path) -> None:
         assert (capture / "truth" / "template.npz").read_bytes()
 
 
-@pytest.mark.parametrize("name", ["peeking", "hoarding"])
-def test_a_real_run_is_sealed_too(name: str, capture: Path, tmp_path: Path) -> None:
+def test_a_short_peak_of_memory_fails_a_real_run_too(capture: Path, tmp_path: Path) -> None:
     config = CellConfig(
-        scene="boxes", size="ci", capture_seed=0, capture=load_capture(capture).identity, method=name, preset="ci",
-        seed=0, code="test",
+        scene="boxes", size="ci", capture_seed=0, capture=load_capture(capture).identity, method="hoarding",
+        preset="ci", seed=0, code="test",
     )  # fmt: skip
     cell = Cell(config=config, folder=tmp_path / "cell", capture_folder=capture)
     write_config(cell)
     run_in_process(str(cell.folder), LIMITS)
     result = read_result(cell.folder)
-    assert result is not None
-    status, reason = {"peeking": ("done", ""), "hoarding": ("out of memory", "700 MB")}[name]
-    assert result.status == status and reason in result.reason
+    assert result is not None and result.status == "out of memory" and "700 MB" in result.reason
     assert not (cell.folder / "input").exists()
     assert not verify_capture(capture)
