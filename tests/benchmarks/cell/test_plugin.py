@@ -22,8 +22,8 @@ def environment(tmp_path_factory) -> dict[str, str]:
     source.mkdir()
     for path in PACKAGE.glob("p*.*"):
         (source / path.name).write_bytes(path.read_bytes())
-    options = ["--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check", "--target", str(target)]
-    command = [sys.executable, "-m", "pip", "install", *options, str(source)]
+    options = ["--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check"]
+    command = [sys.executable, "-m", "pip", "install", *options, "--target", str(target), str(source)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return {**os.environ, METHOD_PATH: str(target), "OMP_NUM_THREADS": "1"}
