@@ -206,13 +206,6 @@ def test_dry_run_starts_nothing(tmp_path: Path, capsys) -> None:
     assert not out.exists()
 
 
-def test_unknown_names(capture: Path, tmp_path: Path, capsys) -> None:
-    assert "unknown suite 'nosuch', expected one of budget, cameras, ci, factors, " in refused(capsys, "run", "nosuch")
-    assert "unknown suite 'qiuck', did you mean quick?" in refused(capsys, "run", "qiuck")
-    assert "unknown method 'nosuch', expected one of" in refused(capsys, "train", "nosuch", str(capture))
-    assert "expected a shard i/n" in refused(capsys, "run", "ci", "--shard", "3/2", "--dry-run")
-
-
 def test_reports_need_a_finished_cell(finished: Path, tmp_path: Path, capsys) -> None:
     assert "run.json: cannot be read" in refused(capsys, "report", str(tmp_path))
     out = finished

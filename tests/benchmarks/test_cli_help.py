@@ -72,6 +72,8 @@ for command in COMMANDS:
         ("verify", "expected SOURCE"),
         ("export", "expected SOURCE and --format"),
         ("run qiuck --list", "unknown suite 'qiuck', did you mean quick"),
+        ("run nosuch", "unknown suite 'nosuch', expected one of budget, cameras, ci, factors, "),
+        ("train nosuch x", "unknown method 'nosuch', expected one of"),
         ("synth tihgt", "unknown scene 'tihgt', did you mean tight"),
         ("synth mannequin --rig.camers 24", "unknown option '--rig.camers', did you mean --rig.cameras"),
         ("synth mannequin --rig.cameras many", "--rig.cameras: expected a whole number, got 'many'"),

@@ -87,13 +87,6 @@ def test_a_cell_beyond_its_time_or_memory_is_ended_and_recorded(capture: Path, t
     assert read_result(large.folder).status == "out of memory"
 
 
-def test_a_second_run_repeats_nothing(done: Cell) -> None:
-    stamp = (done.folder / "result.json").stat().st_mtime_ns
-    plan = run([done])
-    assert (len(plan.todo), len(plan.done)) == (0, 1)
-    assert (done.folder / "result.json").stat().st_mtime_ns == stamp
-
-
 def test_a_changed_input_runs_again_and_says_why(done: Cell) -> None:
     config = replace(done.config, code="other")
     fresh = replace(done, config=config, folder=done.folder.parent / config.key)
