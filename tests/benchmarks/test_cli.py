@@ -310,7 +310,8 @@ def test_commands_set_how_idle_threads_wait_unless_the_user_did() -> None:
         own = settings | given | {"OMP_DISPLAY_ENV": "verbose"}
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
         started.append((subprocess.Popen([sys.executable, "-c", code], env=own, **quiet), spins))
-    for told, spins in [(process.communicate()[1], spins) for process, spins in started]:
+    for process, told, spins in [(process, process.communicate()[1], spins) for process, spins in started]:
+        assert process.returncode == 0, told
         reported = {name: re.findall(rf"{name} ?= ?'(\w+)'", told) for name in OPENMP}
         if not reported["GOMP_SPINCOUNT"]:
             pytest.skip("torch's OpenMP runtime is not GNU's")

@@ -1,6 +1,5 @@
 import io
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -11,7 +10,6 @@ from pathlib import Path
 
 import psutil
 import pytest
-from helpers import fakes
 from helpers.waiting import wait_for
 
 from ash.files import InputError
@@ -20,7 +18,7 @@ from benchmarks.cell.schema import Cell, read_result
 from benchmarks.suites import engine
 from benchmarks.suites.engine import CellPlan, Limits, make_executor, plan_cells, run_cells, run_in_process, shard_of
 from benchmarks.suites.progress import Progress
-from benchmarks.suites.runs import cell_for
+from benchmarks.suites.runs import cell_for, read_run
 from benchmarks.suites.suites import CaptureSpec, CellSpec
 
 LIMITS = Limits(seconds=300.0, memory_mb=4096)
@@ -45,21 +43,10 @@ def run(cells: list[Cell], *, limits: Limits = LIMITS, workers: int = 2) -> Cell
     return plan
 
 
-@pytest.fixture(scope="module")
-def done_once(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a run of one cell leaves."""
-    folder = tmp_path_factory.mktemp("done")
-    with pytest.MonkeyPatch.context() as patch:
-        fakes.use(folder / "plugins", patch)
-        assert len(run([cell("good", capture, folder / "out")]).todo) == 1
-    return folder / "out"
-
-
 @pytest.fixture
-def done(done_once: Path, capture: Path, tmp_path: Path) -> Cell:
-    """A copy of that cell."""
-    shutil.copytree(done_once, tmp_path, dirs_exist_ok=True)
-    return cell("good", capture, tmp_path)
+def done(finished: Path) -> Cell:
+    """A cell that is finished."""
+    return read_run(finished).cells[0]
 
 
 def test_cells_run_side_by_side_and_failures_are_results(capture: Path, tmp_path: Path) -> None:
