@@ -35,8 +35,8 @@ def run_alone(script: Path, *arguments: Path) -> str:
 
 
 def test_our_packages_are_out_of_reach(tmp_path: Path) -> None:
-    (tmp_path / "import_ash.py").write_text("import torch, numpy\nimport ash.files\n")
-    with pytest.raises(AssertionError, match="ash"):
+    (tmp_path / "import_ash.py").write_text("import numpy\nimport ash.files\n")
+    with pytest.raises(AssertionError, match="'ash' is not a package"):
         run_alone(tmp_path / "import_ash.py", tmp_path)
 
 

@@ -7,6 +7,7 @@ import resource
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,26 +20,41 @@ from benchmarks.suites.progress import Progress
 pytestmark = pytest.mark.usefixtures("installed_fakes")
 
 
-def damaged(capture: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(capture, tmp_path / "damaged"))
+def _edited(old: str, new: str) -> Callable[[Path], object]:
+    def edit(folder: Path) -> None:
+        path = folder / "manifest.json"
+        path.write_text(path.read_text().replace(old, new))
+
+    return edit
 
 
-def test_a_missing_image(capture: Path, tmp_path: Path, capsys) -> None:
-    folder = damaged(capture, tmp_path)
-    (folder / "frames" / "cam0" / "000002.png").unlink()
-    assert "cam0/000002.png: missing" in refused(capsys, "train", "fake_good", str(folder))
+def _cut(folder: Path) -> None:
+    path = folder / "frames" / "cam0" / "000002.png"
+    path.write_bytes(path.read_bytes()[:-200])
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda folder: (folder / "frames" / "cam0" / "000002.png").unlink(), "cam0/000002.png: missing"),
+        (_cut, "cam0/000002.png: altered"),
+        (_edited('"schema": 1', '"schema": 99'), "expected capture schema 1, got 99"),
+        (_edited('"complete": true', '"complete": false'), "unfinished"),
+        (shutil.rmtree, "manifest.json"),
+    ],
+    ids=["missing", "truncated", "schema", "unfinished", "none"],
+)
+def test_a_capture_that_is_not_whole(
+    damage: Callable[[Path], object], message: str, capture: Path, tmp_path: Path, capsys
+) -> None:
+    folder = Path(shutil.copytree(capture, tmp_path / "damaged"))
+    damage(folder)
+    assert message in refused(capsys, "train", "fake_good", str(folder))
     assert cli.main(["verify", str(folder)]) == arguments.WRONG_INPUT
 
 
-def test_a_truncated_image(capture: Path, tmp_path: Path, capsys) -> None:
-    folder = damaged(capture, tmp_path)
-    image = folder / "frames" / "cam0" / "000002.png"
-    image.write_bytes(image.read_bytes()[:-200])
-    assert "cam0/000002.png: altered" in refused(capsys, "train", "fake_good", str(folder))
-
-
 def test_a_wrong_hash(capture: Path, tmp_path: Path, capsys) -> None:
-    folder = damaged(capture, tmp_path)
+    folder = Path(shutil.copytree(capture, tmp_path / "damaged"))
     path = folder / "motion.npz"
     content = bytearray(path.read_bytes())
     content[-1] ^= 1  # In the archive's comment length: still readable, and still not what was made.
@@ -46,21 +62,6 @@ def test_a_wrong_hash(capture: Path, tmp_path: Path, capsys) -> None:
     assert cli.main(["verify", str(folder)]) == arguments.WRONG_INPUT
     assert "motion.npz: altered (SHA-256 differs from the manifest)" in capsys.readouterr().err
     assert cli.main(["verify", str(capture)]) == arguments.DONE
-
-
-def test_another_schema_version(capture: Path, tmp_path: Path, capsys) -> None:
-    folder = damaged(capture, tmp_path)
-    manifest = folder / "manifest.json"
-    manifest.write_text(manifest.read_text().replace('"schema": 1', '"schema": 99'))
-    assert "expected capture schema 1, got 99" in refused(capsys, "train", "fake_good", str(folder))
-
-
-def test_an_unfinished_capture_and_no_capture(capture: Path, tmp_path: Path, capsys) -> None:
-    folder = damaged(capture, tmp_path)
-    manifest = folder / "manifest.json"
-    manifest.write_text(manifest.read_text().replace('"complete": true', '"complete": false'))
-    assert "unfinished" in refused(capsys, "train", "fake_good", str(folder))
-    assert "manifest.json" in refused(capsys, "train", "fake_good", str(tmp_path / "nowhere"))
 
 
 def test_a_folder_that_cannot_be_written(capture: Path, tmp_path: Path, capsys) -> None:

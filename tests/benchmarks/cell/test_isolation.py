@@ -4,6 +4,7 @@ import io
 import json
 import shutil
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 from helpers import fakes, thieves
+from helpers.sharing import Shared
 
 from ash.capture.formats import load_capture
 from ash.capture.manifest import verify_capture
@@ -27,28 +29,60 @@ from benchmarks.suites.suites import CaptureSpec, CellSpec
 LIMITS = Limits(seconds=300.0, memory_mb=4096)
 BOTH_WAYS = pytest.mark.both_ways  # Sets isolation itself, so that a kernel without namespaces changes nothing.
 METHODS = ("thief", "clock", "warps", "memoises", "prepares_elsewhere", *thieves.HOW, *thieves.SHOWN)
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """For methods that do not reach for it; the others get a copy."""
-    return fakes.write_capture(tmp_path_factory.mktemp("capture") / "boxes")
+ENDS = {  # how a method ends: status and reason of its cell
+    "exit_2": ("crashed", "exit code 2"), "exit_0": ("crashed", "exit code 0"),
+    "os_error": ("crashed", "No space left"), "input_error": ("crashed", "own refusal"),
+    "keyboard": ("crashed", "KeyboardInterrupt"), "exit_130": ("crashed", "SystemExit"),
+    "bytes": ("crashed", "expected an image float32"), "units": ("crashed", "expected 0 to 1"),
+    "negative": ("crashed", "expected a whole number"),
+}  # fmt: skip
+ALONE = ("sleeps", "works", "clock", "memoises", "prepares_elsewhere", "loud", "leaves", *thieves.SHOWN, *ENDS)
 
 
 @pytest.fixture
 def own_capture(capture: Path, tmp_path: Path) -> Path:
-    """A copy, for methods that damage it where nothing isolates them."""
+    """A copy, for methods that reach for it: they damage it where nothing isolates them."""
     return Path(shutil.copytree(capture, tmp_path / "own"))
 
 
 @pytest.fixture(autouse=True)
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fakes.use(tmp_path / "plugins", monkeypatch)
-    info = tmp_path / "plugins" / "ash_bench_thieves-1.0.dist-info"
+    install(tmp_path / "plugins", monkeypatch)
+
+
+def install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fakes and thieves, as two installed distributions."""
+    fakes.use(folder, monkeypatch)
+    info = folder / "ash_bench_thieves-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: ash-bench-thieves\nVersion: 1.0\n")
     lines = ["[ash_bench.methods]", *(f"{name} = helpers.thieves:{name}" for name in METHODS)]
     (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+
+
+@pytest.fixture(scope="session")
+def all_run(capture: Path, shared: Shared) -> Path:
+    """Where an honest method, and those that reach for nothing of others, were run once, side by side."""
+
+    def make(folder: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            install(folder / "plugins", patch)
+            run([cell(method, capture, folder) for method in ("fake_good", *ALONE)])
+
+    return shared("isolation", make)
+
+
+@pytest.fixture
+def ran(all_run: Path, capture: Path) -> Callable[[str], Cell]:
+    """The cell of one of them; nothing in its folder may be changed."""
+    return lambda method: cell(method, capture, all_run)
+
+
+@pytest.fixture
+def honest(ran: Callable[[str], Cell], own_capture: Path, tmp_path: Path) -> Cell:
+    """A finished cell of an honest method on a capture of its own."""
+    shutil.copytree(ran("fake_good").folder, (made := cell("fake_good", own_capture, tmp_path)).folder)
+    return made
 
 
 def cell(method: str, capture: Path, out: Path, *, seed: int = 0) -> Cell:
@@ -69,11 +103,9 @@ def _left_behind() -> list[psutil.Process]:
 
 
 def test_a_thief_finds_nothing_and_scores_what_it_draws(
-    own_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    honest: Cell, own_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     capture = own_capture
-    honest = cell("fake_good", capture, tmp_path)
-    run([honest])
     truth, other = capture / "frames" / "cam4" / "000000.png", honest.folder / "result.json"
     before = {path: sha256_of(path) for path in (truth, other)}
     monkeypatch.setenv("ASH_BENCH_TEST_TRUTH", str(truth))
@@ -95,15 +127,12 @@ def test_a_thief_finds_nothing_and_scores_what_it_draws(
     assert [view.scores for view in result.views] == [view.scores for view in expected.views]
 
 
-def test_the_processor_s_time_stands_beside_the_clock_s(capture: Path, tmp_path: Path) -> None:
+def test_the_processor_s_time_stands_beside_the_clock_s(ran: Callable[[str], Cell]) -> None:
     """A training that sleeps, as one that was stopped, takes time by the clock and none of the processor."""
-    sleeps, works = cell("sleeps", capture, tmp_path), cell("works", capture, tmp_path)
-    run([sleeps, works])
     wall, cpu = {}, {}
-    for each in (sleeps, works):
-        result = read_result(each.folder)
+    for name in ("sleeps", "works"):
+        result = result_of(ran(name))
         assert result is not None and result.status == "done", result and result.reason
-        name = each.config.method
         wall[name], cpu[name] = (result.value("speed", "", f"train_{clock}_s") for clock in ("wall", "cpu"))
     assert wall["sleeps"] > 1.2 and cpu["sleeps"] < 0.6
     assert wall["works"] > 0.9 and cpu["works"] > 0.9, "a process of the method's counts as well"
@@ -119,10 +148,8 @@ def test_what_an_earlier_attempt_left_damaged_is_not_the_method_s_fault(capture:
     assert "expected a safetensors checkpoint" in (target.folder / "output.log").read_text()
 
 
-def test_a_clock_that_contradicts_ours_is_told(capture: Path, tmp_path: Path) -> None:
-    cheat = cell("clock", capture, tmp_path)
-    run([cheat])
-    result = read_result(cheat.folder)
+def test_a_clock_that_contradicts_ours_is_told(ran: Callable[[str], Cell]) -> None:
+    result = result_of(ran("clock"))
     assert result is not None and result.status == "crashed" and "its clock says" in result.reason
 
 
@@ -137,17 +164,13 @@ def test_a_slow_clock_gains_nothing_and_a_busy_machine_ends_no_cell() -> None:
             worker.frame_times_ms(frames(way))
 
 
-def test_a_picture_that_was_drawn_before_is_not_timed(capture: Path, tmp_path: Path) -> None:
-    cheat = cell("memoises", capture, tmp_path)
-    run([cheat])
-    result = result_of(cheat)
+def test_a_picture_that_was_drawn_before_is_not_timed(ran: Callable[[str], Cell]) -> None:
+    result = result_of(ran("memoises"))
     assert result.status == "done" and min(result.timing.frame_ms) > 29, result
 
 
-def test_all_work_before_the_first_picture_is_training(capture: Path, tmp_path: Path) -> None:
-    cheat = cell("prepares_elsewhere", capture, tmp_path)
-    run([cheat])
-    result = result_of(cheat)
+def test_all_work_before_the_first_picture_is_training(ran: Callable[[str], Cell]) -> None:
+    result = result_of(ran("prepares_elsewhere"))
     assert result.status == "done", result.reason
     assert result.value("speed", "", "train_s") > 1.5 and result.value("speed", "", "train_cpu_s") > 1.4
 
@@ -155,11 +178,10 @@ def test_all_work_before_the_first_picture_is_training(capture: Path, tmp_path: 
 @BOTH_WAYS
 @pytest.mark.parametrize("way", ["on", "off"])
 def test_a_result_that_another_cell_changed_is_made_again(
-    way: str, own_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    way: str, honest: Cell, own_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(sandbox.ISOLATION, way)
-    honest, cheat = cell("fake_good", own_capture, tmp_path), cell("overwrites", own_capture, tmp_path)
-    run([honest])
+    cheat = cell("overwrites", own_capture, tmp_path)
     before = result_of(honest)
     lines = run([honest, cheat])
     again = result_of(honest)
@@ -177,16 +199,6 @@ def test_methods_that_change_each_other_s_results_end_the_run(
     one, other = cell("overwrites", own_capture, tmp_path), cell("overwrites", own_capture, tmp_path, seed=1)
     with pytest.raises(InputError, match="its result was changed by other cells 2 times"):
         run([one, other], workers=1)
-
-
-def test_a_damaged_result_is_made_again_and_kept_beside(capture: Path, tmp_path: Path) -> None:
-    honest = cell("fake_good", capture, tmp_path)
-    run([honest])
-    path = honest.folder / "result.json"
-    path.write_bytes(path.read_bytes()[:100])
-    assert "run again, its result is damaged" in run([honest])
-    assert result_of(honest).status == "done"
-    assert (path.parent.with_name(f"{path.parent.name}.damaged") / "result.json").stat().st_size == 100
 
 
 @BOTH_WAYS
@@ -215,38 +227,21 @@ def test_what_a_method_started_ends_with_it_when_it_is_ended_for_memory(
 
 @pytest.mark.parametrize(("how", "drawn_by"), [("shown", "display"), ("screenless", "trainer"), ("works", "method")])
 def test_frames_are_timed_as_they_are_shown_and_the_result_says_how(
-    how: str, drawn_by: str, capture: Path, tmp_path: Path
+    how: str, drawn_by: str, ran: Callable[[str], Cell]
 ) -> None:
-    made = cell(how, capture, tmp_path)
-    run([made])
-    result = result_of(made)
+    result = result_of(ran(how))
     assert result.status == "done" and result.timing is not None, result.reason
     assert (result.timing.drawn_by, result.timing.agreement_db) == (drawn_by, 100.0)
 
 
-def test_a_display_that_shows_something_else_fails_its_cell(capture: Path, tmp_path: Path) -> None:
-    cheat = cell("decoy", capture, tmp_path)
-    run([cheat])
-    result = result_of(cheat)
+def test_a_display_that_shows_something_else_fails_its_cell(ran: Callable[[str], Cell]) -> None:
+    result = result_of(ran("decoy"))
     assert result.status == "crashed" and "a timed picture differs from the one that was scored" in result.reason
 
 
-@pytest.mark.parametrize(
-    ("how", "status", "reason"),
-    [
-        ("exit_2", "crashed", "exit code 2"), ("exit_0", "crashed", "exit code 0"),
-        ("os_error", "crashed", "No space left"), ("input_error", "crashed", "own refusal"),
-        ("keyboard", "crashed", "KeyboardInterrupt"), ("exit_130", "crashed", "SystemExit"),
-        ("bytes", "crashed", "expected an image float32"),
-        ("units", "crashed", "expected 0 to 1"), ("negative", "crashed", "expected a whole number"),
-    ],
-)  # fmt: skip
-def test_however_a_method_ends_its_cell_has_a_result(
-    how: str, status: str, reason: str, capture: Path, tmp_path: Path
-) -> None:
-    bad = cell(how, capture, tmp_path)
-    run([bad])
-    result = result_of(bad)
+@pytest.mark.parametrize("how", ENDS)
+def test_however_a_method_ends_its_cell_has_a_result(how: str, ran: Callable[[str], Cell]) -> None:
+    (status, reason), result = ENDS[how], result_of(ran(how))
     assert result is not None and result.status == status and reason in result.reason, result.reason
 
 
@@ -280,9 +275,8 @@ def _kill_when_it_waits(sign: Path, *, times: int) -> int:
     return killed
 
 
-def test_printing_is_bounded_and_processes_end_with_their_cell(capture: Path, tmp_path: Path) -> None:
-    loud, leaves = cell("loud", capture, tmp_path), cell("leaves", capture, tmp_path)
-    run([loud, leaves])
+def test_printing_is_bounded_and_processes_end_with_their_cell(ran: Callable[[str], Cell]) -> None:
+    loud, leaves = ran("loud"), ran("leaves")
     log = loud.folder / "output.log"
     assert log.stat().st_size < 2 << 20 and "last words" in log.read_text() and "bytes left out" in log.read_text()
     deadline = time.monotonic() + 10
@@ -292,15 +286,6 @@ def test_printing_is_bounded_and_processes_end_with_their_cell(capture: Path, tm
     for each in (loud, leaves):
         result = read_result(each.folder)
         assert result is not None and result.status == "done", result.reason
-
-
-@BOTH_WAYS
-def test_without_namespaces_the_row_says_so(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(sandbox.ISOLATION, "off")
-    plain = cell("fake_good", capture, tmp_path)
-    run([plain])
-    result = read_result(plain.folder)
-    assert result is not None and result.status == "done" and result.isolated is False
 
 
 def test_isolation_costs_a_cell_at_most_half_a_second(

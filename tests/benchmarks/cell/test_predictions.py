@@ -213,20 +213,19 @@ def test_other_pixels_or_information_make_another_cell(pictures: Path, capture: 
     assert third.brought == replace(first.brought, commit="abc")
 
 
-def test_a_suite_takes_brought_pictures_once(pictures: Path, capture: Path, tmp_path: Path, capsys) -> None:
+def test_a_suite_takes_brought_pictures_once(
+    pictures: Path, capture: Path, finished: Path, tmp_path: Path, capsys
+) -> None:
+    """Beside the first seed of a method, which is there already."""
     named = shutil.move(pictures, tmp_path / "all" / capture.resolve().name)
     suite = tmp_path / "mine.toml"
     row = f'{{ of = "predictions:{tmp_path / "all"}", name = "mine", title = "Ours" }}'
     text = f'scenes = [{{ capture = "{capture}" }}]\nmethods = ["fake_good", {row}]\npreset = "ci"\nseeds = 2\n'
     suite.write_text(text)
-    assert cli.main(["run", str(suite), "--out", str(tmp_path / "run")]) == cli.DONE
-    cells = read_run(tmp_path / "run").cells
-    assert sorted((cell.config.method, cell.config.seed) for cell in cells) == [
-        ("fake_good", 0),
-        ("fake_good", 1),
-        ("mine", 0),
-    ]
-    assert "Ours (brought pictures; what it saw is not known)" in (tmp_path / "run" / "report.md").read_text()
+    assert cli.main(["run", str(suite), "--out", str(finished)]) == cli.DONE
+    rows = sorted((cell.config.method, cell.config.seed) for cell in read_run(finished).cells)
+    assert rows == [("fake_good", 0), ("fake_good", 1), ("mine", 0)]
+    assert "Ours (brought pictures; what it saw is not known)" in (finished / "report.md").read_text()
     next(Path(named).rglob("*.png")).unlink()
     assert "missing" in refused_last(capsys, "run", str(suite), "--out", str(tmp_path / "other"))
     suite.write_text(text.replace(str(tmp_path / "all"), str(tmp_path / "none")))

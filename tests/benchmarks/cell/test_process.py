@@ -14,7 +14,7 @@ from benchmarks.cell import run, sandbox
 from benchmarks.cell.schema import Cell, read_result, write_config
 from benchmarks.suites import engine
 from benchmarks.suites.engine import Ending, Limits
-from benchmarks.suites.runs import cell_for, require_utf8
+from benchmarks.suites.runs import cell_for, read_run, require_utf8
 from benchmarks.suites.suites import CaptureSpec, CellSpec
 
 pytestmark = pytest.mark.usefixtures("installed_fakes")
@@ -59,9 +59,8 @@ def write_nothing() -> Cell:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "a file")
 
 
-def test_eval_names_the_code_that_scored(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = cell("fake_good", capture, tmp_path)
-    run.run_cell(made)
+def test_eval_names_the_code_that_scored(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = read_run(finished).cells[0]
     assert run.evaluate_cell(made).evaluated_code == ""
     monkeypatch.setattr(run, "code_version", lambda method: "0123456789abcdef")
     run.evaluate_cell(made)
@@ -75,11 +74,9 @@ def test_a_folder_whose_path_is_not_utf8_is_refused() -> None:
         require_utf8(Path(os.fsdecode(b"runs/\xff")))
 
 
-def test_a_result_says_whether_the_machine_isolates(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = cell("fake_good", capture, tmp_path)
-    assert run.run_cell(made).isolated is (sandbox.problem() is None)
+def test_a_result_says_whether_the_machine_isolates(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = read_run(finished).cells[0]
+    assert read_result(made.folder).isolated is (sandbox.problem() is None)
     monkeypatch.setenv(sandbox.ISOLATION, "off")
     assert sandbox.problem() == "ASH_BENCH_ISOLATION=off"
     (made.folder / "result.json").unlink()

@@ -1,6 +1,5 @@
 import io
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -11,7 +10,6 @@ from pathlib import Path
 
 import psutil
 import pytest
-from helpers import fakes
 from helpers.waiting import wait_for
 
 from ash.files import InputError
@@ -20,7 +18,7 @@ from benchmarks.cell.schema import Cell, read_result
 from benchmarks.suites import engine
 from benchmarks.suites.engine import CellPlan, Limits, make_executor, plan_cells, run_cells, run_in_process, shard_of
 from benchmarks.suites.progress import Progress
-from benchmarks.suites.runs import cell_for
+from benchmarks.suites.runs import cell_for, read_run
 from benchmarks.suites.suites import CaptureSpec, CellSpec
 
 LIMITS = Limits(seconds=300.0, memory_mb=4096)
@@ -45,21 +43,10 @@ def run(cells: list[Cell], *, limits: Limits = LIMITS, workers: int = 2) -> Cell
     return plan
 
 
-@pytest.fixture(scope="module")
-def done_once(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a run of one cell leaves."""
-    folder = tmp_path_factory.mktemp("done")
-    with pytest.MonkeyPatch.context() as patch:
-        fakes.use(folder / "plugins", patch)
-        assert len(run([cell("good", capture, folder / "out")]).todo) == 1
-    return folder / "out"
-
-
 @pytest.fixture
-def done(done_once: Path, capture: Path, tmp_path: Path) -> Cell:
-    """A copy of that cell."""
-    shutil.copytree(done_once, tmp_path, dirs_exist_ok=True)
-    return cell("good", capture, tmp_path)
+def done(finished: Path) -> Cell:
+    """A cell that is finished."""
+    return read_run(finished).cells[0]
 
 
 def test_cells_run_side_by_side_and_failures_are_results(capture: Path, tmp_path: Path) -> None:
@@ -87,13 +74,6 @@ def test_a_cell_beyond_its_time_or_memory_is_ended_and_recorded(capture: Path, t
     assert read_result(large.folder).status == "out of memory"
 
 
-def test_a_second_run_repeats_nothing(done: Cell) -> None:
-    stamp = (done.folder / "result.json").stat().st_mtime_ns
-    plan = run([done])
-    assert (len(plan.todo), len(plan.done)) == (0, 1)
-    assert (done.folder / "result.json").stat().st_mtime_ns == stamp
-
-
 def test_a_changed_input_runs_again_and_says_why(done: Cell) -> None:
     config = replace(done.config, code="other")
     fresh = replace(done, config=config, folder=done.folder.parent / config.key)
@@ -113,14 +93,6 @@ def test_a_cell_with_a_damaged_result_is_run_again_and_the_damaged_one_kept_asid
         plan = plan_cells([done])
         assert plan.todo == (done,) and "run again, its result is damaged" in plan.reasons[0]
         assert (path.parent.with_name(f"{path.parent.name}.damaged") / "result.json").read_bytes() == content
-
-
-def test_wrong_input_ends_the_run_with_its_line(capture: Path, tmp_path: Path) -> None:
-    damaged = Path(shutil.copytree(capture, tmp_path / "damaged"))
-    image = damaged / "frames" / "cam3" / "000000.png"
-    image.write_bytes(image.read_bytes()[:100])
-    with pytest.raises(InputError, match=r"cam3/000000\.png.*(PNG|altered)"):
-        run([cell("good", damaged, tmp_path)])
 
 
 def test_shards_cover_all_cells_once() -> None:

@@ -1,7 +1,6 @@
 """A suite's file: ours and a user's, and errors that name file, line and key."""
 
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -168,30 +167,22 @@ def test_an_oracle_is_told_by_its_rows_name(row: str, refused: str, tmp_path: Pa
         assert is_oracle(method.name)
 
 
-def test_our_suites_are_such_files() -> None:
-    assert set(suite_files()) >= {
-        "quick",
-        "table",
-        "factors",
-        "stability",
-        "template",
-        "switches",
-        "speed",
-        "paper",
-        "offline",
-        "ci",
-    }
+def test_our_suites_are_such_files_and_their_rows_ours(tmp_path: Path) -> None:
+    """Every row has an identity, and none is taken for a user's own."""
+    ours = "quick table factors stability template switches speed paper offline ci"
+    assert set(suite_files()) >= set(ours.split())
+    capture = fakes.write_capture(tmp_path / "mine")
     for name in suite_files():
         suite = find_suite(name)
-        assert suite.name == name and suite.about and list(suite.cells)
+        cells = list(suite.cells)
+        assert suite.name == name and suite.about and cells
+        assert [row.name for row in suite.methods if not is_ours(row.name)] == [], name
+        rows = [cell_for(cell, capture, tmp_path).config for cell in cells[: len(suite.methods)]]
+        assert len({row.key for row in rows}) == len(suite.methods)
+        assert not user_rows(rows)
+    assert not is_ours("mine")
     template = {row.name for row in find_suite("template").methods}
     assert {method for row in WRONG_BY_MM.values() for method in row} <= template
-
-
-def test_no_row_of_our_suites_is_taken_for_a_users_own() -> None:
-    for name in suite_files():
-        assert [row.name for row in find_suite(name).methods if not is_ours(row.name)] == [], name
-    assert not is_ours("mine")
 
 
 def test_a_users_row_does_not_take_our_title(tmp_path: Path) -> None:
@@ -234,14 +225,6 @@ def test_a_row_has_the_title_that_its_suite_gives(tmp_path: Path) -> None:
 def test_a_title_is_printable_and_ours_keep_theirs(tmp_path: Path, row: str, message: str) -> None:
     with pytest.raises(InputError, match=rf"mine\.toml:3: {message}"):
         read_suite(written(tmp_path, f'preset = "ci"\nscenes = ["tight"]\nmethods = [{row}]\n'))
-
-
-def test_every_row_of_our_suites_has_an_identity(tmp_path: Path) -> None:
-    capture = fakes.write_capture(tmp_path / "mine")
-    for suite in map(find_suite, suite_files()):
-        rows = [cell_for(cell, capture, tmp_path).config for cell in islice(suite.cells, len(suite.methods))]
-        assert len({row.key for row in rows}) == len(suite.methods)
-        assert not user_rows(rows)
 
 
 def test_every_subject_has_its_captures_and_subject_0_keeps_its_names(tmp_path: Path) -> None:
