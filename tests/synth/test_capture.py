@@ -14,7 +14,7 @@ import pytest
 from helpers.scenes import small_scene
 
 import synth.source_hash
-from ash.capture.dataset import Capture, image_path, pixels_path, surface_path
+from ash.capture.dataset import Capture, image_path, pixels_path, scan_path, surface_path
 from ash.capture.formats import load_capture, read_template_truth
 from ash.capture.manifest import read_manifest, verify_capture
 from ash.files import InputError, read_arrays, sha256_of
@@ -183,16 +183,19 @@ def test_a_killed_capture_resumes_to_the_same_manifest(kills: int, tmp_path: Pat
     assert verify_capture(target) == []
 
 
-def test_a_finished_capture_returns_at_once_and_a_lost_image_comes_back(tmp_path: Path, folder: Path):
-    other = tmp_path / "other"
-    shutil.copytree(folder, other)
+def test_a_finished_capture_returns_at_once_and_shards_bring_back_what_is_lost(tmp_path: Path, folder: Path):
+    """An image of the second shard and a scan of the first one: each makes its own share, and the last one finishes."""
+    other, scene = shutil.copytree(folder, tmp_path / "other"), small_scene()
     told: list[tuple[int, int]] = []
-    make_capture(small_scene(), other, progress=lambda done, total: told.append((done, total)))
+    make_capture(scene, other, progress=lambda *now: told.append(now))
     assert told == []
-    lost = next(other.rglob("frames/*/*.png"))
-    lost.unlink()
-    make_capture(small_scene(), other, progress=lambda done, total: told.append((done, total)))
-    assert told[0] == (11, 12) and told[-1] == (12, 12)
+    image_path(other, wanted_views(scene)[3].camera, 1).unlink()
+    scan_path(other, 0).unlink()
+    for shard, first, share in (((2, 2), 4, 5), ((1, 2), 4, 7)):
+        told.clear()
+        make_capture(scene, other, shard=shard, progress=lambda *now: told.append(now))
+        assert told[0] == (first, share) and told[-1] == (share, share)
+        assert is_finished(scene, other) == (shard == (1, 2))
     assert sha256_of(other / "manifest.json") == sha256_of(folder / "manifest.json")
 
 
@@ -227,18 +230,6 @@ def test_the_code_that_counts_is_all_that_making_a_capture_imports():
                 waiting |= {part for part in named if part.is_file()} - found
     assert found <= set(synth.source_hash.maker_sources())
     assert not any(path.is_relative_to(root / "synth" / "readers") for path in found)
-
-
-def test_two_shards_make_what_one_run_makes(tmp_path: Path, folder: Path):
-    target = tmp_path / "shards"
-    counts = []
-    for shard in ((2, 2), (1, 2)):
-        told: list[tuple[int, int]] = []
-        make_capture(small_scene(), target, shard=shard, progress=lambda *now, told=told: told.append(now))
-        counts.append(told[-1])
-        assert is_finished(small_scene(), target) == (shard == (1, 2))
-    assert [done for done, _ in counts] == [total for _, total in counts] and sum(total for _, total in counts) == 12
-    assert sha256_of(target / "manifest.json") == sha256_of(folder / "manifest.json")
 
 
 def test_wrong_folders_are_refused(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch):
