@@ -58,7 +58,7 @@ def test_paper_and_release_differ_in_named_switches_alone():
     }
 
 
-@pytest.mark.parametrize("name", ["ci", "cpu", "paper", "official"])  # The others are `cpu` of another length.
+@pytest.mark.parametrize("name", ["ci", "official"])  # The others are these at other sizes, on other templates.
 def test_every_preset_trains(name, capture, tmp_path):
     avatar = AshAvatar.from_capture(small(named(name), fitted_steps=3), capture)
     before = {key: value.clone() for key, value in avatar.module.named_parameters() if value.requires_grad}

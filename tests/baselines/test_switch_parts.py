@@ -5,7 +5,7 @@ the avatar without the change. A field that has no case, no row and no test of i
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cache, partial
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -44,7 +44,10 @@ BULGE_M = 0.01  # of the true surface where the tube is straight, and as much mo
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    """The tube with a bulge that follows its bend: there is something to learn for a template that sees the truth."""
+    """The tube with a bulge that follows its bend: there is something to learn for a template that sees the truth.
+
+    What templates are learned from is tracked once for all avatars.
+    """
     made = write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
     rest, posed = tube_mesh().vertices, []
     for frame, dofs in enumerate(made.motion.dofs):
@@ -53,7 +56,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     write_arrays(made.folder / "truth" / "template.npz", vertices=np.stack(posed))
     for frame in made.splits["train"].frames:
         write_arrays(scan_path(made.folder, frame), vertices=posed[frame], faces=tube_mesh().faces)
-    return made
+    return replace(made, store=tmp_path_factory.mktemp("store"))
 
 
 @pytest.fixture(autouse=True, scope="module")
