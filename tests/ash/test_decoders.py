@@ -180,13 +180,12 @@ def test_frames_decoded_together_are_those_decoded_alone(shared_trunk, kind):
         assert relative_error(a, b) < (1e-5 if kind == torch.float32 else 1e-12)
 
 
-@pytest.mark.parametrize("factor", [0.0, 0.5])
-def test_a_halved_or_zeroed_gradient_of_one_layer_is_noticed(factor, monkeypatch):
+def test_a_halved_gradient_of_one_layer_is_noticed(monkeypatch):
     honest = _UNet.backward
 
     def halved(ctx, grad):
         grads = list(honest(ctx, grad))
-        grads[10] *= factor
+        grads[10] *= 0.5
         return tuple(grads)
 
     monkeypatch.setattr(_UNet, "backward", staticmethod(halved))

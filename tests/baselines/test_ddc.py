@@ -4,7 +4,6 @@ import pytest
 import torch
 from helpers.captures import write_tube_capture
 from helpers.figures import front_camera, tube_motion
-from helpers.learning import training_views
 
 from ash.capture.dataset import Pose
 from ash.config import TemplateConfig
@@ -59,19 +58,6 @@ def test_gradients_reach_exactly_the_texture_pixels_that_are_seen(capture):
     assert not texture.grad[[0, 2]].any()
     lit = texture.grad[1] != 0
     assert 0.3 < lit.float().mean() < 0.7  # The camera sees one half of the tube's unrolled surface.
-
-
-def test_noise_in_the_textures_is_for_learning_alone(capture):
-    config = plus("ci")
-    config = replace(config, training=replace(config.training, texture_noise=0.5, warmup_steps=2))
-    avatar = DdcAvatar.from_capture(ddc_config(config, seed=0, template=TemplateConfig(kind="exact")), capture)
-    for parameter in avatar.module.network.parameters():
-        parameter.data += 0.05 * torch.randn(parameter.shape, generator=torch.manual_seed(0))
-    cameras = [capture.cameras["cam1"]]
-    learned = [training_views(avatar, 0, cameras, torch.zeros(3), step).detach() for step in (2, 3)]
-    with torch.no_grad():
-        still = [training_views(avatar, 0, cameras, torch.zeros(3), step) for step in (2, 3)]
-    assert not torch.equal(*learned) and torch.equal(*still)
 
 
 def test_the_network_is_sized_as_the_presets_decoders_and_fills_its_texture():

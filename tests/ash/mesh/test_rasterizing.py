@@ -9,13 +9,7 @@ import trimesh
 from torch import Tensor
 
 from ash.files import InputError
-from ash.mesh.rasterizing import (
-    Rasterized,
-    project_vertices,
-    rasterize_by_warp,
-    rasterize_mesh,
-    rasterize_mesh_naive,
-)
+from ash.mesh.rasterizing import Rasterized, project_vertices, rasterize_by_warp, rasterize_mesh, rasterize_mesh_naive
 from ash.native.library import use_instruction_set
 
 WIDTH, HEIGHT = 96, 80

@@ -179,15 +179,6 @@ def test_scans_are_there_for_training_frames_only(capture):
             read_scan(capture, frame)
 
 
-def test_what_a_capture_does_not_show_is_no_supervision(tmp_path):
-    """Without scans none are made up."""
-    made = write_tube_capture(tmp_path / "capture")
-    shutil.rmtree(made.folder / "scans")
-    scans = TemplateConfig(**SMALL)
-    with pytest.raises(InputError, match="expected a scan of training frame 0, found none"):
-        learned_template(scans, made, seed=0)
-
-
 def test_noise_and_holes_of_a_scan_are_borne(capture, tmp_path):
     """Grain of 2 mm, a hole, strays 4 cm off: nothing follows strays, or is drawn across the hole."""
     shutil.copytree(capture.folder, tmp_path, dirs_exist_ok=True)
