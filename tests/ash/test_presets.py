@@ -4,7 +4,7 @@ from dataclasses import asdict, replace
 
 import pytest
 import torch
-from helpers.captures import tube_model_config, write_tube_capture
+from helpers.captures import tube_model_config
 from helpers.learning import training_views
 
 from ash.avatar import AshAvatar
@@ -21,11 +21,6 @@ from ash.training.adam import Adam
 from ash.training.batches import draw_batch
 from ash.training.images import load_training_images
 from ash.training.losses import view_loss
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
 
 
 def small(config: AshConfig, **training) -> AshConfig:

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.captures import write_tube_capture
 from helpers.numerics import relative_error
 from torch import Tensor, nn
 from torch.autograd import Function
@@ -138,8 +137,7 @@ def test_where_there_are_no_tiles_decoders_learn_in_float32(monkeypatch):
 
 
 @pytest.mark.parametrize("method", ["ash", "ddc"])
-def test_training_in_bfloat16_says_in_which_precision_it_was(method, tmp_path):
-    capture = write_tube_capture(tmp_path / "capture")
+def test_training_in_bfloat16_says_in_which_precision_it_was(method, capture, tmp_path):
     config = plus("ci")
     model = replace(config.model, texels=16, width=16, levels=2, window=2)
     training = replace(config.training, steps=6, warmup_steps=2, views_per_step=1, precision="bfloat16")

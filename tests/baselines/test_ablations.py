@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.captures import tiny_preset, write_tube_capture
+from helpers.captures import tiny_preset
 
 from ash import presets
 from ash.capture.dataset import Capture, Pose
@@ -20,9 +20,8 @@ from benchmarks.suites.suites import MethodSpec
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    made = write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
-    return replace(made, store=tmp_path_factory.mktemp("store"))  # Tracked once for all rows.
+def capture(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return replace(capture, store=tmp_path_factory.mktemp("store"))  # Tracked once for all rows.
 
 
 @pytest.fixture(autouse=True)

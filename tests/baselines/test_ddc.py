@@ -2,7 +2,6 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from helpers.captures import write_tube_capture
 from helpers.figures import front_camera, tube_motion
 
 from ash.capture.dataset import Pose
@@ -12,11 +11,6 @@ from ash.files import InputError
 from ash.mesh.drawing import SUPERSAMPLING, sample_texture
 from ash.presets import named, plus
 from baselines.ddc import DdcAvatar, ddc_config
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
 
 
 def avatar(capture, *, steps: int = 120) -> DdcAvatar:

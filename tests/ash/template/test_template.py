@@ -3,7 +3,6 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from helpers.captures import write_tube_capture
 from helpers.figures import tube_mesh, tube_motion, tube_skeleton
 
 from ash.capture.dataset import Motion, Pose
@@ -59,11 +58,6 @@ def test_kept_frames_do_not_mix_up_motions():
     first = template.pose(Pose(a, 3)).vertices.clone()
     assert not torch.allclose(template.pose(Pose(b, 3)).vertices, first)
     torch.testing.assert_close(template.pose(Pose(a, 3)).vertices, first)
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
 
 
 def errors_m(capture, error_mm: float, seed: int = 0, **kind) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from helpers.captures import tube_model_config, write_tube_capture
+from helpers.captures import tube_model_config
 from helpers.learning import training_views
 
 from ash import presets
@@ -24,11 +24,6 @@ from ash.training.adam import Adam
 from ash.training.batches import draw_batch, make_batch
 from ash.training.images import load_training_images
 from ash.training.loop import Diverged, Interrupted
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
 
 
 def config(**changes) -> AshConfig:
