@@ -14,8 +14,8 @@ import pytest
 from helpers.scenes import small_scene
 
 import synth.source_hash
-from ash.capture.dataset import Capture, image_path, pixels_path, scan_path, surface_path
-from ash.capture.formats import load_capture, read_template_truth
+from ash.capture.dataset import Capture, image_path, pixels_path, scan_path
+from ash.capture.formats import load_capture, read_surface_mesh_truth, read_template_truth
 from ash.capture.manifest import read_manifest, verify_capture
 from ash.files import InputError, read_arrays, sha256_of
 from synth import cost, presets
@@ -38,13 +38,6 @@ def capture(folder: Path) -> Capture:
     return load_capture(folder)
 
 
-def _surface(capture: Capture, frame: int) -> tuple[np.ndarray, np.ndarray]:
-    faces = read_arrays(capture.folder / "truth" / "surface.npz", expected=("faces",))["faces"]
-    return read_arrays(surface_path(capture.folder, frame), expected=("vertices",))["vertices"].astype(
-        np.float64
-    ), faces
-
-
 def test_the_capture_is_whole(capture: Capture):
     assert verify_capture(capture.folder) == []
     pairs = {pair for split in capture.splits.values() for pair in split.views}
@@ -60,7 +53,7 @@ def test_every_pixel_knows_what_it_sees(capture: Capture):
     """Triangle and barycentrics, projected by our own camera, land in the middle of their pixel."""
     agreements = []  # of a mask by one ray per pixel with one by four, which differ along the outline alone
     for camera, frame in capture.splits["train"].views:
-        vertices, faces = _surface(capture, frame)
+        vertices, faces = read_surface_mesh_truth(capture, frame)
         truth = read_arrays(pixels_path(capture.folder, camera, frame), expected=("triangle", "barycentric", "noise"))
         seen = truth["triangle"] >= 0
         rest = truth["barycentric"][seen].astype(np.float64)
@@ -84,7 +77,7 @@ def test_visible_vertices_hit_depth_and_mask(capture: Capture):
     studio = studio_of(small_scene(), capture.folder, probe())
     missed, off_pixels, off_mm = [], [], []
     for camera, frame in capture.splits["train"].views[:4]:
-        vertices, faces = _surface(capture, frame)
+        vertices, faces = read_surface_mesh_truth(capture, frame)
         view = capture.cameras[camera]
         studio.dress(vertices)
         point, triangle = studio.hits(view.position, vertices)
