@@ -5,6 +5,7 @@ import pytest
 import torch
 from helpers.figures import tube_mesh
 from helpers.numerics import relative_error
+from helpers.unets import network_and_inputs, value_and_gradients
 
 from ash.config import ModelConfig
 from ash.decoders import Decoders, TexelRows, UNet
@@ -99,25 +100,6 @@ SHAPES = {  # inputs, outputs, width, levels, height, width of the texture, feat
     "of no round number": (5, 3, 5, 1, 6, 10, 2),
     "one pixel at the bottom": (3, 17, 4, 2, 4, 4, 3),
 }
-
-
-def network_and_inputs(shape: tuple[int, ...]) -> tuple[UNet, torch.Tensor, torch.Tensor | None]:
-    inputs, outputs, width, levels, rows, columns, features = shape
-    torch.manual_seed(0)
-    net = UNet(inputs, outputs, width=width, levels=levels, norm="none", bottleneck_features=features)
-    for parameter in (net.head.weight, *(p for p in net.parameters() if p.dim() == 1)):
-        torch.nn.init.normal_(parameter)
-    return net, torch.randn(1, inputs, rows, columns), torch.randn(features) if features else None
-
-
-def value_and_gradients(net, texture, features, call) -> list[torch.Tensor]:
-    leaves = list(net.parameters())
-    if features is not None:
-        features = features.clone().requires_grad_()
-        leaves.append(features)
-    value = call(texture, features)
-    weights = torch.randn(value.shape, generator=torch.Generator().manual_seed(1)).to(value)
-    return [value.detach(), *torch.autograd.grad((value * weights).sum(), leaves)]
 
 
 def compare_with_the_definition(shape: tuple[int, ...], *, channels_last: bool) -> None:

@@ -11,6 +11,7 @@ import trimesh
 from helpers.captures import known_model, write_tube_capture
 from helpers.devices import META, _all_chosen, step_of, without_numbers
 from helpers.figures import front_camera, tube_mesh, tube_motion, tube_skeleton
+from helpers.scoring import foreground_psnr
 from torch import Tensor, nn
 
 from ash.capture.dataset import Capture, Motion, Pose
@@ -60,16 +61,6 @@ SMALL = {
 def made(row: str, capture: Capture, **changes: Any) -> FieldAvatar:
     overrides = SMALL | {key.replace("__", "."): value for key, value in changes.items()}
     return FieldAvatar.from_capture(ROWS[row].with_overrides(overrides).config("ci"), capture)
-
-
-def psnr(avatar: FieldAvatar, capture: Capture, split: str = "novel_view") -> float:
-    """Foreground, over black."""
-    errors = []
-    for camera, frame in capture.splits[split].views:
-        truth = capture.image(camera, frame).astype(np.float64) / 255
-        drawn = avatar.render(Pose(capture.motion, frame), capture.cameras[camera], clock=StageClock())
-        errors.append(((drawn[..., :3] - truth[..., :3] * truth[..., 3:]) ** 2)[truth[..., 3] > 0.5].mean())
-    return float(-10 * np.log10(np.mean(errors)))
 
 
 # ---- the renderer
@@ -322,7 +313,7 @@ def test_texture_features_beat_none_where_looks_follow_the_motion(
             training__learning_rate=1e-2,
             field__channels=channels,
         )
-        scores[channels] = psnr(avatar, capture)
+        scores[channels] = foreground_psnr(avatar, capture, capture.splits["novel_view"].views)
     assert scores[8] > scores[0] + 0.5, scores
 
 

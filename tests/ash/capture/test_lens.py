@@ -64,10 +64,7 @@ def test_a_pinhole_is_written_as_before_and_a_lens_read_back(tmp_path: Path):
 def test_known_points_land_on_their_pixels(shape: str):
     """The centre of gravity of each small square's picture is where the camera says, within 0.05 pixels."""
     plain = camera(192, 176, fx=190.0, fy=190.0)
-    view = {
-        "square": plain,
-        "skewed": camera(192, 176, fx=170.0, fy=150.0, skew=11.0),
-    }.get(shape, plain)
+    view = camera(192, 176, fx=170.0, fy=150.0, skew=11.0) if shape == "skewed" else plain
     view = replace(view, distortion=np.array(LENSES.get(shape, (0, 0, 0, 0)), dtype=np.float64))
     centres = np.concatenate([GRID, np.zeros((len(GRID), 1))], axis=1)
     pose = squares(centres, 0.04)

@@ -11,14 +11,13 @@ import safetensors.torch
 import torch
 from helpers.captures import tube_model_config
 from helpers.learning import training_views
+from helpers.scoring import foreground_psnr
 
 from ash import presets
 from ash.avatar import AshAvatar
-from ash.capture.dataset import Pose
 from ash.checkpoints import read_safetensors
 from ash.config import AshConfig
 from ash.files import InputError
-from ash.protocol import StageClock
 from ash.training import loop, stopping
 from ash.training.adam import Adam
 from ash.training.batches import draw_batch, make_batch
@@ -35,21 +34,13 @@ def weights(avatar: AshAvatar) -> dict[str, torch.Tensor]:
     return {name: value.clone() for name, value in avatar.module.state_dict().items()}
 
 
-def psnr(avatar, capture, split: str) -> float:
-    errors = []
-    for camera, frame in capture.splits[split].views:
-        truth = capture.image(camera, frame).astype(np.float64) / 255
-        drawn = avatar.render(Pose(capture.motion, frame), capture.cameras[camera], clock=StageClock())
-        errors.append((((drawn[..., :3] - truth[..., :3] * truth[..., 3:])[truth[..., 3] > 0.5]) ** 2).mean())
-    return -10 * np.log10(np.mean(errors))
-
-
 def test_known_gaussians_are_recovered_from_their_images(capture, tmp_path):
     avatar = AshAvatar.from_capture(config(steps=300, warmup_steps=200, base_learning_rate=5e-2), capture)
-    before = psnr(avatar, capture, "novel_view")
+    new_views, new_poses = (capture.splits[name].views for name in ("novel_view", "novel_pose"))
+    before = foreground_psnr(avatar, capture, new_views)
     avatar.fit(capture, folder=tmp_path)
-    assert psnr(avatar, capture, "novel_view") > before + 12
-    assert psnr(avatar, capture, "novel_pose") > before + 12
+    assert foreground_psnr(avatar, capture, new_views) > before + 12
+    assert foreground_psnr(avatar, capture, new_poses) > before + 12
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert rows[-1]["step"] == 300
     assert rows[-1]["loss"] < 0.5 * rows[0]["loss"]
