@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.executing import InThisProcess
 from helpers.scenes import small_scene
 
 import synth.source_hash
@@ -186,7 +187,7 @@ def test_a_finished_capture_returns_at_once_and_shards_bring_back_what_is_lost(t
     scan_path(other, 0).unlink()
     for shard, first, share in (((2, 2), 4, 5), ((1, 2), 4, 7)):
         told.clear()
-        make_capture(scene, other, shard=shard, progress=lambda *now: told.append(now))
+        make_capture(scene, other, shard=shard, executor=InThisProcess(), progress=lambda *now: told.append(now))
         assert told[0] == (first, share) and told[-1] == (share, share)
         assert is_finished(scene, other) == (shard == (1, 2))
     assert sha256_of(other / "manifest.json") == sha256_of(folder / "manifest.json")

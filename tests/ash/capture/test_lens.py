@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.executing import InThisProcess
 from helpers.scenes import small_scene
 from helpers.squares import camera, squares, studio
 
@@ -109,7 +110,7 @@ def test_a_distorted_capture_is_exact_and_undistorted_it_is_that_of_pinholes(tmp
     """Against a render by pinholes of the same K: equal masks and truth, images equal up to noise and resampling."""
     rig = Rig(cameras=3, held_out=1, width=96, height=96, pixel_aspect=1.2, distortion=(-0.9, 0.5, 0.01, 0.0))
     scene = replace(small_scene(), rig=rig, samples=12, train=small_scene().test, novel_view_stride=2)
-    bent = make_capture(scene, tmp_path / "bent")
+    bent = make_capture(scene, tmp_path / "bent", executor=InThisProcess())
     capture = load_capture(bent)
     assert verify_capture(bent) == []
     with pytest.raises(InputError, match="ash-bench export --format undistorted"):
@@ -130,7 +131,8 @@ def test_a_distorted_capture_is_exact_and_undistorted_it_is_that_of_pinholes(tmp
     straight.training_only()
     _require_exact_truth(folder)
     assert all(view.is_pinhole for view in straight.cameras.values())
-    _require_alike(bent, folder, make_capture(replace(scene, rig=_rig_of(straight, tmp_path)), tmp_path / "pinhole"))
+    by_pinholes = replace(scene, rig=_rig_of(straight, tmp_path))
+    _require_alike(bent, folder, make_capture(by_pinholes, tmp_path / "pinhole", executor=InThisProcess()))
     with pytest.raises(InputError, match="empty folder"):
         undistort_capture(bent, folder)
 
