@@ -143,7 +143,6 @@ CAMERAS = {"batches"}
 NO_MOTION = DECODERS | {"textures", "rates", "warm_up"}  # no decoders, nothing that they would see
 STATIC = NO_MOTION | {"start"}  # `ash` learns no texels, but for this.
 LATTICE = {"places", "start", "textures", "decoding", "posing"}  # other texels: all that is one per texel
-UNLEARNED = {"start", "rates", "warm_up"}  # no learned texels
 CHANGED_BY_ROW = {
     "wo_disp": {"posing"},
     "wo_mot": STATIC,
@@ -278,11 +277,8 @@ ELSEWHERE = {
     },
     "ddc_plus": {"device": ("baselines/test_baseline_devices.py", "test_a_training_step_stays_on_its_device")},
 }
-OF_THE_TEMPLATE = ("kind", "error_mm", "supervision", "network", "steps")
-HERE: dict[str, dict[str, Callable[..., None]]] = {
-    "ash_plus": {},
-    "ddc_plus": {f"template.{name}": test_the_mesh_stands_on_the_template_that_ash_gets for name in OF_THE_TEMPLATE},
-}
+SHARED = {"template.kind", "template.error_mm", "template.supervision", "template.network", "template.steps"}
+HERE = {"ash_plus": set[str](), "ddc_plus": SHARED}  # `test_the_mesh_stands_on_the_template_that_ash_gets`
 ROWS_OF_ASH = [
     *(row.changes for row in SWITCHES.values()),
     *(changed(presets.ci(), offered(name, "ci")) for name in CHANGED_BY_ROW if not name.startswith("ddc")),
