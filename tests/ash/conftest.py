@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 import pytest
+from helpers.tube import capture  # noqa: F401  (a fixture)
 
 from ash.native.library import instruction_set, use_instruction_set
 

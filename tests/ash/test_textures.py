@@ -8,13 +8,7 @@ from ash.capture.dataset import Motion, Pose
 from ash.rotations import RigidTransforms, rotvec_to_unitquat
 from ash.template.motion import normalised_motion
 from ash.template.template import RestDeformation, Template
-from ash.textures import (
-    TexelLattice,
-    TextureDrawer,
-    build_lattice,
-    motion_aware_textures,
-    texture_statistics,
-)
+from ash.textures import TexelLattice, TextureDrawer, build_lattice, motion_aware_textures, texture_statistics
 
 RESOLUTION = 16
 

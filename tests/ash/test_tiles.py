@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.captures import write_tube_capture
 from helpers.numerics import relative_error
+from helpers.unets import network_and_inputs, value_and_gradients
 from torch import Tensor, nn
 from torch.autograd import Function
 
@@ -57,15 +57,6 @@ class Rounded(nn.Module):
         return _RoundedConvolution.apply(x, self.exact.weight) + self.exact.bias[:, None, None]
 
 
-def network(shape: tuple[int, ...]) -> tuple[UNet, Tensor, Tensor | None]:
-    inputs, outputs, width, levels, rows, columns, features = shape
-    torch.manual_seed(0)
-    net = UNet(inputs, outputs, width=width, levels=levels, norm="none", bottleneck_features=features)
-    for parameter in (net.head.weight, *(p for p in net.parameters() if p.dim() == 1)):
-        nn.init.normal_(parameter)
-    return net, torch.randn(1, inputs, rows, columns), torch.randn(features) if features else None
-
-
 def definition_of(net: UNet) -> UNet:
     exact = deepcopy(net).double()
     for block in [module for module in exact.modules() if isinstance(module, ConvBlock)]:
@@ -73,16 +64,6 @@ def definition_of(net: UNet) -> UNet:
             if isinstance(layer, nn.Conv2d):
                 block[index] = Rounded(layer)
     return exact
-
-
-def value_and_gradients(net: UNet, texture: Tensor, features: Tensor | None, call) -> list[Tensor]:
-    leaves = list(net.parameters())
-    if features is not None:
-        features = features.clone().requires_grad_()
-        leaves.append(features)
-    value = call(texture, features)
-    weights = torch.randn(value.shape, generator=torch.Generator().manual_seed(1)).to(value)
-    return [value.detach(), *torch.autograd.grad((value * weights).sum(), leaves)]
 
 
 def in_tiles(net: UNet, texture: Tensor, features: Tensor | None) -> list[Tensor]:
@@ -95,7 +76,7 @@ def in_tiles(net: UNet, texture: Tensor, features: Tensor | None) -> list[Tensor
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 @pytest.mark.parametrize("channels_last", [True, False])
 def test_convolutions_on_tiles_are_those_of_rounded_factors(shape, channels_last):
-    net, texture, features = network(shape)
+    net, texture, features = network_and_inputs(shape)
     exact = definition_of(net)
     doubles = texture.double(), None if features is None else features.double()
     truth = value_and_gradients(exact, *doubles, exact.forward_naive)
@@ -111,7 +92,7 @@ def test_convolutions_on_tiles_are_those_of_rounded_factors(shape, channels_last
 
 @needs_tiles
 def test_threads_and_earlier_calls_change_no_bit_of_what_tiles_make():
-    net, texture, features = network(SHAPES["as wide as trained"])
+    net, texture, features = network_and_inputs(SHAPES["as wide as trained"])
     before, results = torch.get_num_threads(), []
     try:
         for threads in (1, 2, 3):
@@ -125,7 +106,7 @@ def test_threads_and_earlier_calls_change_no_bit_of_what_tiles_make():
 
 
 def test_where_there_are_no_tiles_decoders_learn_in_float32(monkeypatch):
-    net, texture, _ = network(SHAPES["as wide as trained"])
+    net, texture, _ = network_and_inputs(SHAPES["as wide as trained"])
     monkeypatch.setattr(ash.native.library, "has_tiles", lambda: False)
     assert decoding_precision("bfloat16", CPU, 16) == "float32"
     with torch.autocast("cpu", torch.bfloat16):
@@ -138,8 +119,7 @@ def test_where_there_are_no_tiles_decoders_learn_in_float32(monkeypatch):
 
 
 @pytest.mark.parametrize("method", ["ash", "ddc"])
-def test_training_in_bfloat16_says_in_which_precision_it_was(method, tmp_path):
-    capture = write_tube_capture(tmp_path / "capture")
+def test_training_in_bfloat16_says_in_which_precision_it_was(method, capture, tmp_path):
     config = plus("ci")
     model = replace(config.model, texels=16, width=16, levels=2, window=2)
     training = replace(config.training, steps=6, warmup_steps=2, views_per_step=1, precision="bfloat16")

@@ -5,7 +5,6 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.captures import write_tube_capture
 from helpers.devices import META, step_of, tiny, without_numbers
 
 from ash.capture.dataset import Capture
@@ -38,38 +37,35 @@ FIELDS: dict[str, MethodFactory[Any]] = {  # Their step on `meta` is that of the
 }
 
 
-@pytest.fixture(scope="module")
-def tube(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    return write_tube_capture(tmp_path_factory.mktemp("tube"))
-
-
 def avatar_of(name: str, capture: Capture) -> Any:
     recipe = (RECIPES | FIELDS)[name]
     return recipe.build(tiny(recipe.config("ci")), capture)
 
 
 @pytest.mark.parametrize("name", RECIPES)
-def test_a_training_step_stays_on_its_device(name: str, tube: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_training_step_stays_on_its_device(name: str, capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     without_numbers(monkeypatch)
     if name.startswith("mlp"):  # `meta` has no autocast; its half precision is of no account here.
         monkeypatch.setattr(torch, "autocast", lambda *_, **__: torch.enable_grad())
-    learned = step_of(avatar_of(name, tube), tube, META)
+    learned = step_of(avatar_of(name, capture), capture, META)
     assert learned and all(parameter.device == META for parameter in learned)
 
 
 @pytest.mark.parametrize("name", RECIPES | FIELDS)
-def test_nothing_of_a_step_is_made_on_the_default_device(name: str, tube: Capture) -> None:
-    avatar = avatar_of(name, tube)
+def test_nothing_of_a_step_is_made_on_the_default_device(name: str, capture: Capture) -> None:
+    avatar = avatar_of(name, capture)
     with META:
-        learned = step_of(avatar, tube, CPU)
+        learned = step_of(avatar, capture, CPU)
     assert learned and all(bool(torch.isfinite(parameter).all()) for parameter in learned)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
 @pytest.mark.parametrize("name", RECIPES | FIELDS)
-def test_a_gpu_learns_what_the_cpu_learns(name: str, tube: Capture) -> None:
+def test_a_gpu_learns_what_the_cpu_learns(name: str, capture: Capture) -> None:
     recipe = (RECIPES | FIELDS)[name]
     config = tiny(recipe.config("ci"))
-    there, here = (recipe.build(replace(config, device=device), tube) for device in ("cuda", "cpu"))
-    for learned, expected in zip(step_of(there, tube, torch.device("cuda")), step_of(here, tube, CPU), strict=True):
+    there, here = (recipe.build(replace(config, device=device), capture) for device in ("cuda", "cpu"))
+    for learned, expected in zip(
+        step_of(there, capture, torch.device("cuda")), step_of(here, capture, CPU), strict=True
+    ):
         torch.testing.assert_close(learned.grad.cpu(), expected.grad, rtol=1e-2, atol=1e-2 * expected.grad.abs().max())

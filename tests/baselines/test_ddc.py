@@ -1,27 +1,16 @@
-import shutil
 from dataclasses import fields, replace
 
-import numpy as np
 import pytest
 import torch
-from helpers.captures import write_tube_capture
 from helpers.figures import front_camera, tube_motion
-from helpers.learning import training_views
 
-from ash.capture.dataset import Pose, image_path
-from ash.capture.formats import load_capture
+from ash.capture.dataset import Pose
 from ash.config import TemplateConfig
 from ash.fields import apply_overrides
-from ash.files import InputError, write_image
+from ash.files import InputError
 from ash.mesh.drawing import SUPERSAMPLING, sample_texture
 from ash.presets import named, plus
-from ash.protocol import StageClock
 from baselines.ddc import DdcAvatar, ddc_config
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
 
 
 def avatar(capture, *, steps: int = 120) -> DdcAvatar:
@@ -63,44 +52,6 @@ def test_gradients_reach_exactly_the_texture_pixels_that_are_seen(capture):
     assert not texture.grad[[0, 2]].any()
     lit = texture.grad[1] != 0
     assert 0.3 < lit.float().mean() < 0.7  # The camera sees one half of the tube's unrolled surface.
-
-
-def test_a_known_texture_is_recovered_from_its_images(capture, tmp_path):
-    known = avatar(capture)
-    known.module.base_texture.data = torch.rand(3, 8, 8).repeat_interleave(4, 1).repeat_interleave(4, 2)
-    folder = shutil.copytree(capture.folder, tmp_path / "capture")
-    for split in capture.splits.values():
-        for camera, frame in split.views:
-            drawn = known.render(Pose(capture.motion, frame), capture.cameras[camera], clock=StageClock())
-            straight = np.concatenate([drawn[..., :3] / np.maximum(drawn[..., 3:], 0.25), drawn[..., 3:]], -1)
-            write_image(image_path(folder, camera, frame), (255 * straight).round().astype(np.uint8))
-    redrawn = load_capture(folder)
-    learner = avatar(redrawn)
-    before = _psnr(learner, redrawn)
-    learner.fit(redrawn, folder=tmp_path / "run")
-    assert _psnr(learner, redrawn) > before + 4
-
-
-def _psnr(made, capture) -> float:
-    errors = []
-    for camera, frame in capture.splits["novel_view"].views:
-        truth = capture.image(camera, frame).astype(np.float64) / 255
-        drawn = made.render(Pose(capture.motion, frame), capture.cameras[camera], clock=StageClock())
-        errors.append(((drawn[..., :3] - truth[..., :3])[truth[..., 3] > 0.95] ** 2).mean())
-    return float(-10 * np.log10(np.mean(errors)))
-
-
-def test_noise_in_the_textures_is_for_learning_alone(capture):
-    config = plus("ci")
-    config = replace(config, training=replace(config.training, texture_noise=0.5, warmup_steps=2))
-    avatar = DdcAvatar.from_capture(ddc_config(config, seed=0, template=TemplateConfig(kind="exact")), capture)
-    for parameter in avatar.module.network.parameters():
-        parameter.data += 0.05 * torch.randn(parameter.shape, generator=torch.manual_seed(0))
-    cameras = [capture.cameras["cam1"]]
-    learned = [training_views(avatar, 0, cameras, torch.zeros(3), step).detach() for step in (2, 3)]
-    with torch.no_grad():
-        still = [training_views(avatar, 0, cameras, torch.zeros(3), step) for step in (2, 3)]
-    assert not torch.equal(*learned) and torch.equal(*still)
 
 
 def test_the_network_is_sized_as_the_presets_decoders_and_fills_its_texture():

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers.captures import write_tube_capture
 
+from ash.capture.dataset import Capture
 from ash.files import InputError
 from baselines.display import pyrender_or_refuse
 
@@ -58,8 +58,7 @@ print(json.dumps(found))
 """
 
 
-def test_opengl_draws_what_the_training_renderer_draws(tmp_path: Path) -> None:
-    capture = write_tube_capture(tmp_path / "capture")
+def test_opengl_draws_what_the_training_renderer_draws(capture: Capture, tmp_path: Path) -> None:
     environment = {name: value for name, value in os.environ.items() if name != "PYOPENGL_PLATFORM"}
     command = [sys.executable, "-c", DRIVER, str(capture.folder), str(tmp_path / "run")]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)

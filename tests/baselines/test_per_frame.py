@@ -4,18 +4,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
-from helpers.captures import tiny_plus, write_tube_capture
+from helpers.captures import tiny_plus
 
 from ash.capture.dataset import Capture, Pose
 from ash.presets import ash_plus
 from ash.protocol import StageClock
 from baselines.per_frame import PerFrameAvatar, per_frame
-
-
-@pytest.fixture(scope="module")
-def tube(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    return write_tube_capture(tmp_path_factory.mktemp("tube"))
 
 
 def made(capture: Capture, steps: int = 12) -> PerFrameAvatar:
@@ -26,30 +20,30 @@ def made(capture: Capture, steps: int = 12) -> PerFrameAvatar:
     return PerFrameAvatar.from_capture(replace(config, training=replace(config.training, learning_rate=0.02)), capture)
 
 
-def test_a_frame_draws_its_own_gaussians_and_another_pose_those_of_the_nearest(tube: Capture) -> None:
-    avatar = made(tube)
+def test_a_frame_draws_its_own_gaussians_and_another_pose_those_of_the_nearest(capture: Capture) -> None:
+    avatar = made(capture)
     table = avatar.module.decoders
     for row, frame in enumerate(table.frames):
         frame.data.fill_(float(row))
-    frames = tube.splits["train"].frames
+    frames = capture.splits["train"].frames
     decoded = [table([avatar._inputs_of(frame)])[0].mean().item() for frame in frames]
     assert decoded == [0.0, 1.0, 2.0, 3.0]
-    moved = replace(tube.motion, dofs=tube.motion.dofs.copy())
+    moved = replace(capture.motion, dofs=capture.motion.dofs.copy())
     moved.dofs[2, :3] += 1.0  # Elsewhere in the room it is the same pose,
     moved.dofs[2, 8] += 1e-3  # and nearly the same one a little bent.
     assert table([avatar.module.frame_inputs(Pose(moved, 2))])[0].mean().item() == 2.0
 
 
-def test_a_step_moves_the_frame_that_was_drawn_and_training_is_resumed(tube: Capture, tmp_path: Path) -> None:
-    avatar = made(tube)
-    avatar.fit(tube.training_only(), folder=tmp_path / "run")
+def test_a_step_moves_the_frame_that_was_drawn_and_training_is_resumed(capture: Capture, tmp_path: Path) -> None:
+    avatar = made(capture)
+    avatar.fit(capture.training_only(), folder=tmp_path / "run")
     assert all(bool(frame.any()) for frame in avatar.module.decoders.frames)
-    again = made(tube)
-    again.fit(tube.training_only(), folder=tmp_path / "run")
-    pose, camera = Pose(tube.motion, 5), tube.cameras["cam0"]
+    again = made(capture)
+    again.fit(capture.training_only(), folder=tmp_path / "run")
+    pose, camera = Pose(capture.motion, 5), capture.cameras["cam0"]
     images = [one.render(pose, camera, clock=StageClock()) for one in (avatar, again)]
     np.testing.assert_array_equal(*images)
-    alone = made(tube)
+    alone = made(capture)
     inputs = [alone._inputs_of(1)]
     alone.module.decoders(inputs).sum().backward()
     grads = [frame.grad is not None for frame in alone.module.decoders.frames]

@@ -7,12 +7,12 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from helpers.captures import tiny_preset, write_tube_capture
+from helpers.captures import tiny_preset
 from helpers.figures import tube_mesh
 from helpers.scoring import draw, foreground_psnr
 
 from ash import presets
-from ash.capture.dataset import Camera, Capture, Motion, Pose, image_path
+from ash.capture.dataset import Camera, Motion, Pose, image_path
 from ash.capture.formats import load_capture, write_template
 from ash.files import InputError, write_image
 from ash.protocol import Avatar, StageClock
@@ -21,11 +21,6 @@ from baselines.nearest import central_frame, move_image, nearest, see_root
 from baselines.oracle_texture import oracle_texture
 from baselines.static import of_one_frame, static
 from benchmarks.cell.registry import WRONG_BY_MM, find_method
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Capture:
-    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
 
 
 @pytest.fixture(autouse=True)

@@ -11,11 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.executing import InThisProcess
 from helpers.scenes import small_scene
 
 import synth.source_hash
-from ash.capture.dataset import Capture, image_path, pixels_path, surface_path
-from ash.capture.formats import load_capture, read_template_truth
+from ash.capture.dataset import Capture, image_path, pixels_path, scan_path
+from ash.capture.formats import load_capture, read_surface_mesh_truth, read_template_truth
 from ash.capture.manifest import read_manifest, verify_capture
 from ash.files import InputError, read_arrays, sha256_of
 from synth import cost, presets
@@ -38,13 +39,6 @@ def capture(folder: Path) -> Capture:
     return load_capture(folder)
 
 
-def _surface(capture: Capture, frame: int) -> tuple[np.ndarray, np.ndarray]:
-    faces = read_arrays(capture.folder / "truth" / "surface.npz", expected=("faces",))["faces"]
-    return read_arrays(surface_path(capture.folder, frame), expected=("vertices",))["vertices"].astype(
-        np.float64
-    ), faces
-
-
 def test_the_capture_is_whole(capture: Capture):
     assert verify_capture(capture.folder) == []
     pairs = {pair for split in capture.splits.values() for pair in split.views}
@@ -60,7 +54,7 @@ def test_every_pixel_knows_what_it_sees(capture: Capture):
     """Triangle and barycentrics, projected by our own camera, land in the middle of their pixel."""
     agreements = []  # of a mask by one ray per pixel with one by four, which differ along the outline alone
     for camera, frame in capture.splits["train"].views:
-        vertices, faces = _surface(capture, frame)
+        vertices, faces = read_surface_mesh_truth(capture, frame)
         truth = read_arrays(pixels_path(capture.folder, camera, frame), expected=("triangle", "barycentric", "noise"))
         seen = truth["triangle"] >= 0
         rest = truth["barycentric"][seen].astype(np.float64)
@@ -84,7 +78,7 @@ def test_visible_vertices_hit_depth_and_mask(capture: Capture):
     studio = studio_of(small_scene(), capture.folder, probe())
     missed, off_pixels, off_mm = [], [], []
     for camera, frame in capture.splits["train"].views[:4]:
-        vertices, faces = _surface(capture, frame)
+        vertices, faces = read_surface_mesh_truth(capture, frame)
         view = capture.cameras[camera]
         studio.dress(vertices)
         point, triangle = studio.hits(view.position, vertices)
@@ -183,16 +177,19 @@ def test_a_killed_capture_resumes_to_the_same_manifest(kills: int, tmp_path: Pat
     assert verify_capture(target) == []
 
 
-def test_a_finished_capture_returns_at_once_and_a_lost_image_comes_back(tmp_path: Path, folder: Path):
-    other = tmp_path / "other"
-    shutil.copytree(folder, other)
+def test_a_finished_capture_returns_at_once_and_shards_bring_back_what_is_lost(tmp_path: Path, folder: Path):
+    """An image of the second shard and a scan of the first one: each makes its own share, and the last one finishes."""
+    other, scene = shutil.copytree(folder, tmp_path / "other"), small_scene()
     told: list[tuple[int, int]] = []
-    make_capture(small_scene(), other, progress=lambda done, total: told.append((done, total)))
+    make_capture(scene, other, progress=lambda *now: told.append(now))
     assert told == []
-    lost = next(other.rglob("frames/*/*.png"))
-    lost.unlink()
-    make_capture(small_scene(), other, progress=lambda done, total: told.append((done, total)))
-    assert told[0] == (11, 12) and told[-1] == (12, 12)
+    image_path(other, wanted_views(scene)[3].camera, 1).unlink()
+    scan_path(other, 0).unlink()
+    for shard, first, share in (((2, 2), 4, 5), ((1, 2), 4, 7)):
+        told.clear()
+        make_capture(scene, other, shard=shard, executor=InThisProcess(), progress=lambda *now: told.append(now))
+        assert told[0] == (first, share) and told[-1] == (share, share)
+        assert is_finished(scene, other) == (shard == (1, 2))
     assert sha256_of(other / "manifest.json") == sha256_of(folder / "manifest.json")
 
 
@@ -227,18 +224,6 @@ def test_the_code_that_counts_is_all_that_making_a_capture_imports():
                 waiting |= {part for part in named if part.is_file()} - found
     assert found <= set(synth.source_hash.maker_sources())
     assert not any(path.is_relative_to(root / "synth" / "readers") for path in found)
-
-
-def test_two_shards_make_what_one_run_makes(tmp_path: Path, folder: Path):
-    target = tmp_path / "shards"
-    counts = []
-    for shard in ((2, 2), (1, 2)):
-        told: list[tuple[int, int]] = []
-        make_capture(small_scene(), target, shard=shard, progress=lambda *now, told=told: told.append(now))
-        counts.append(told[-1])
-        assert is_finished(small_scene(), target) == (shard == (1, 2))
-    assert [done for done, _ in counts] == [total for _, total in counts] and sum(total for _, total in counts) == 12
-    assert sha256_of(target / "manifest.json") == sha256_of(folder / "manifest.json")
 
 
 def test_wrong_folders_are_refused(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch):

@@ -1,5 +1,6 @@
 """`splat` against its definition in value and gradient, the definition against closed forms, and wrong input."""
 
+import itertools
 import math
 import os
 from collections.abc import Callable
@@ -166,24 +167,20 @@ NODES = {
 }
 
 
-@pytest.mark.parametrize("factor", [0.0, 0.5])
 @pytest.mark.parametrize(
-    ("drawer", "parameter"),
-    [(drawer, name) for drawer, (*_, names) in NODES.items() for name in (*names, "means2d")],
+    ("drawer", "parameter"), [(drawer, name) for drawer, (*_, names) in NODES.items() for name in (*names, "means2d")]
 )
-def test_a_halved_or_zeroed_gradient_is_noticed(
-    drawer: Drawer, parameter: str, factor: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_halved_gradient_is_noticed(drawer: Drawer, parameter: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And so is one that is zeroed, which is off by twice as much."""
     project, blend, names = NODES[drawer]
     node, position = (blend, 2) if parameter == "means2d" else (project, 1 + names.index(parameter))
     honest = node.backward
 
     def mutant(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         results = list(honest(ctx, *grads))
-        results[position] = factor * results[position]
+        results[position] = 0.5 * results[position]
         return tuple(results)
 
-    compare(random_scene(), drawer=drawer)
     monkeypatch.setattr(node, "backward", staticmethod(mutant))
     with pytest.raises(AssertionError, match=f"grad_{parameter}"):
         compare(random_scene(), drawer=drawer)
@@ -232,36 +229,23 @@ def test_backward_may_come_twice_and_late(drawer: Drawer) -> None:
     assert torch.equal(scene.gaussians.means.grad, 2 * once)
 
 
-def test_a_camera_finds_its_way_back() -> None:
-    """Descending the gradient of the pose undoes a shift of a calibrated camera."""
-    scene = random_scene(count=300)
-    target = draw(splat, scene).rgb
-    shift = torch.tensor([0.02, -0.015, 0.03])
-    offset = shift.clone().requires_grad_()
-    optimizer = torch.optim.Adam([offset], lr=3e-3)
-    for _ in range(40):
-        viewmats = scene.viewmats.clone()
-        viewmats[:, :3, 3] += offset
-        loss = (draw(splat, replace(scene, viewmats=viewmats)).rgb - target).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    assert offset.detach().norm() < 0.15 * shift.norm()
-
-
 # --- wrong input ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("drawer", [splat_naive, splat])
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("name", [*PARAMETERS, "viewmats", "Ks"])
+@pytest.mark.parametrize(
+    ("drawer", "name"),
+    [*itertools.product((splat_naive, splat), (*PARAMETERS, "viewmats", "Ks")), *((splat_warp, n) for n in PARAMETERS)],
+)
 def test_nan_and_infinity_are_named(name: str, bad: float, drawer: Drawer) -> None:
-    scene = random_scene(count=20, coefficients=16)
+    """The fast paths say at which Gaussian, too."""
+    scene = random_scene(count=20, coefficients=16, cameras=2)
     owner = scene if name in ("viewmats", "Ks") else scene.gaussians
     tensor = getattr(owner, name).clone()
     tensor.view(-1)[-1 if owner is scene.gaussians else 2] = bad
     wrong = replace(scene, **{name: tensor}) if owner is scene else change(scene, **{name: tensor})
-    with pytest.raises(InputError, match=name):
+    where = ": .* at Gaussian 19$" if drawer is not splat_naive and owner is scene.gaussians else ""
+    with pytest.raises(InputError, match=name + where):
         draw(drawer, wrong)
 
 
@@ -281,17 +265,6 @@ def test_wrong_numbers_are_named(drawer: Drawer) -> None:
         draw(drawer, replace(scene, Ks=scene.Ks + torch.tensor([[0.0, 1, 0], [0, 0, 0], [0, 0, 0]])))
     with pytest.raises(InputError, match="size"):
         draw(drawer, replace(scene, width=0))
-
-
-@FAST
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("name", PARAMETERS)
-def test_the_gaussian_with_nan_or_infinity_is_named(name: str, bad: float, drawer: Drawer) -> None:
-    scene = random_scene(count=20, coefficients=16, cameras=2)
-    tensor = getattr(scene.gaussians, name).clone()
-    tensor.view(-1)[-1] = bad
-    with pytest.raises(InputError, match=f"{name}: .* at Gaussian 19$"):
-        draw(drawer, change(scene, **{name: tensor}))
 
 
 @FAST

@@ -1,4 +1,4 @@
-"""The differentiable mesh drawer: its gradients against finite differences, and an outline that finds its place."""
+"""The differentiable mesh drawer: its gradients against finite differences, and coverage against areas."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from helpers.figures import front_camera, tube_mesh
 from helpers.numerics import relative_error
 
 from ash.capture.dataset import Camera
-from ash.mesh.drawing import SUPERSAMPLING, _weights_of, corner_weights, draw_mesh, sample_texture, topology_of
+from ash.mesh.drawing import SUPERSAMPLING, _weights_of, corner_weights, draw_mesh, topology_of
 from ash.mesh.rasterizing import project_vertices, rasterize_mesh
 
 
@@ -111,50 +111,6 @@ def test_interior_edges_are_no_outlines():
     coverage = picture(rest, front_camera(64, 64))[..., 2]
     inside = coverage[24:40, 30:34]
     torch.testing.assert_close(inside, torch.ones_like(inside), atol=1e-12, rtol=0)
-
-
-def test_a_silhouette_finds_its_place():
-    """The mesh starts beside the truth by half a pixel of 25 mm; coverage alone brings it back to a tenth of that."""
-    rest, faces = tube()
-    rest = rest.float()
-    topology, camera, truth = topology_of(faces), front_camera(64, 64), torch.tensor([0.012, 0.009, 0.0])
-
-    def coverage(shift: torch.Tensor) -> torch.Tensor:
-        return draw_mesh(rest + shift, topology, camera, lambda t, w: w[:, :1], torch.zeros(1), outlines=True)[..., 1]
-
-    with torch.no_grad():
-        target = coverage(truth)
-    shift = torch.zeros(3, requires_grad=True)
-    optimiser = torch.optim.Adam([shift], lr=1e-3)
-    for _ in range(80):
-        optimiser.zero_grad()
-        ((coverage(shift) - target) ** 2).sum().backward()
-        optimiser.step()
-    assert (shift - truth)[:2].abs().max() < 2e-3
-
-
-def test_a_texture_pulls_the_surface_along_itself():
-    """Nothing but colour tells how a plate lies within its own outline."""
-    corners = torch.tensor([[-2.0, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]])
-    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
-    uvs = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
-    y, x = torch.meshgrid(torch.linspace(0, 40, 128), torch.linspace(0, 40, 128), indexing="ij")
-    texture = (0.5 + 0.25 * torch.sin(x) + 0.25 * torch.sin(y))[None]
-    topology, camera, truth = topology_of(faces), front_camera(32, 32), torch.tensor([0.03, -0.02, 0.0])
-
-    def draw(shift: torch.Tensor) -> torch.Tensor:
-        shade = lambda t, w: sample_texture(texture, (uvs[faces[t]] * w[..., None]).sum(1))  # noqa: E731
-        return draw_mesh(corners + shift, topology, camera, shade, torch.zeros(1))[..., :1]
-
-    with torch.no_grad():
-        target = draw(truth)
-    shift = torch.zeros(3, requires_grad=True)
-    optimiser = torch.optim.Adam([shift], lr=3e-3)
-    for _ in range(80):
-        optimiser.zero_grad()
-        ((draw(shift) - target) ** 2).sum().backward()
-        optimiser.step()
-    assert (shift - truth)[:2].abs().max() < 1e-3
 
 
 def test_pictures_with_and_without_gradients_agree():

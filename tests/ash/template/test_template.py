@@ -3,7 +3,6 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from helpers.captures import write_tube_capture
 from helpers.figures import tube_mesh, tube_motion, tube_skeleton
 
 from ash.capture.dataset import Motion, Pose
@@ -61,11 +60,6 @@ def test_kept_frames_do_not_mix_up_motions():
     torch.testing.assert_close(template.pose(Pose(a, 3)).vertices, first)
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
-
-
 def errors_m(capture, error_mm: float, seed: int = 0, **kind) -> np.ndarray:
     truth = read_template_truth(capture)
     template = exact_template(capture, truth, planted=PlantedError(rms_mm=error_mm, **kind), seed=seed)
@@ -89,14 +83,14 @@ def test_a_planted_error_of_zero_is_the_exact_surface(capture):
     np.testing.assert_allclose(errors_m(capture, 0.0), 0, atol=1e-6)
 
 
-@pytest.mark.parametrize("static", [0.0, 0.2, 0.7])
+@pytest.mark.parametrize("static", [0.0, 0.7])
 def test_the_stated_share_of_a_planted_errors_square_is_the_same_in_all_frames(static):
     perturbed = planted(3, static=static)
     errors = np.stack([perturbed.error(frame) for frame in range(400)])
     assert (errors.mean(0) ** 2).sum(1).mean() / 8e-3**2 == pytest.approx(static, abs=0.02)
 
 
-@pytest.mark.parametrize("lag", [0.0, 0.3, -0.4, 0.9])
+@pytest.mark.parametrize("lag", [0.0, -0.4, 0.9])
 def test_what_changes_of_a_planted_error_falls_off_as_stated_in_time(lag):
     perturbed = planted(3, lag=lag)
     static = 8e-3 * np.sqrt(0.2) * perturbed.static

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from helpers.captures import tiny_preset, write_tube_capture
+from helpers.captures import tiny_preset
 from helpers.learning import training_views
 
 from ash import presets
@@ -15,11 +15,6 @@ from ash.training.batches import draw_batch, over
 from ash.training.images import load_training_images
 from ash.training.losses import view_loss
 from benchmarks.cell.registry import find_method
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
 
 
 def test_where_a_mask_is_too_large_the_studio_explains_what_it_shows(capture):

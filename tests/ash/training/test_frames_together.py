@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.captures import tiny_plus, write_tube_capture
+from helpers.captures import tiny_plus
 from helpers.numerics import relative_error
 
 from ash.avatar import AshAvatar
@@ -19,11 +19,6 @@ from ash.training.images import ReadAhead, load_training_images
 from baselines.ddc import DdcAvatar, ddc_config
 
 FRAMES, STEP = 3, 4  # a step of so many frames, after the warm-up
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
 
 
 def of_frames(count: int = FRAMES, *, noise: float = 0.0, **model: Any) -> AshConfig:

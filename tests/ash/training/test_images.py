@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.captures import tiny_plus, write_tube_capture
+from helpers.captures import tiny_plus
 
 import ash.capture.dataset
 import ash.training.loop
@@ -24,11 +24,6 @@ from ash.training.images import STEPS_AHEAD, ReadAhead, load_training_images, re
 from ash.training.loop import Trainer
 
 STEPS = 24
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
 
 
 @pytest.fixture

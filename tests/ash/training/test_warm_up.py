@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.captures import tiny_plus, write_tube_capture
+from helpers.captures import tiny_plus
 
 import ash.avatar
 from ash.avatar import FITTED_EVERY, FITTED_GAIN, FITTED_LOOK, AshAvatar
@@ -20,8 +20,8 @@ LOOK = 5  # in place of a hundred steps
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture").training_only()
+def capture(capture: Capture) -> Capture:
+    return capture.training_only()
 
 
 def avatar(capture: Capture, **training: Any) -> AshAvatar:

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ash.capture.dataset import surface_path
+from ash.capture.formats import read_surface_truth
 from ash.files import read_arrays
 from synth.cloth.checks import penetrations, self_intersections, stretch
 from synth.person.mannequin import mannequin
@@ -36,12 +36,8 @@ def test_cloth_that_passes_through_itself_is_found():
 
 def test_a_capture_tells_what_its_clothes_do_in_every_frame(small_capture: Path):
     folder = small_capture
-    told = read_arrays(
-        folder / "truth" / "clothes.npz", expected=("penetrating", "penetration_mm", "stretch")
-    )  # fmt: skip
-    posed = np.stack(
-        [read_arrays(surface_path(folder, t), expected=("vertices",))["vertices"] for t in range(5)]
-    ).astype(np.float64)
+    told = read_arrays(folder / "truth" / "clothes.npz", expected=("penetrating", "penetration_mm", "stretch"))
+    posed = np.stack([read_surface_truth(folder, frame) for frame in range(5)]).astype(np.float64)
     np.testing.assert_allclose(told["stretch"], stretch(BODY, posed, "skirt"), atol=1e-5)
     np.testing.assert_allclose(told["penetration_mm"], 1000 * penetrations(BODY, posed).deepest, atol=1e-3)
     assert told["stretch"].max() < 1.08 and told["penetrating"].max() < 0.01

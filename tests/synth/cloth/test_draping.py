@@ -65,11 +65,11 @@ def test_strength_goes_from_the_skinned_skirt_to_the_free_one():
     motion = _clips("squat", frames=3)
     posed = _skinned(motion)
     np.testing.assert_array_equal(true_surface(BODY, motion, Outfit(skirt=True), seed=0), posed)
-    away = [np.sqrt(np.mean((swing(BODY, motion, posed, s) - posed)[:, SKIRT] ** 2)) for s in (1e-6, 0.1, 1.0)]
+    swung = [swing(BODY, motion, posed, strength) for strength in (1e-6, 0.1, 1.0)]
+    away = [np.sqrt(np.mean((each - posed)[:, SKIRT] ** 2)) for each in swung]
     assert away[0] < 1e-6 and away == sorted(away)
     assert away[2] > 2 * away[1]
-    rest = ~SKIRT
-    np.testing.assert_array_equal(swing(BODY, motion, posed, 0.5)[:, rest], posed[:, rest])
+    np.testing.assert_array_equal(swung[1][:, ~SKIRT], posed[:, ~SKIRT])
 
 
 def test_a_single_frame_is_a_sequence_too():

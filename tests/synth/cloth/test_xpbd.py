@@ -3,18 +3,7 @@ import pytest
 from scipy.optimize import brentq
 
 from synth.cloth.checks import self_intersections
-from synth.cloth.xpbd import (
-    Contacts,
-    Sheet,
-    State,
-    colour,
-    crowd,
-    edges_of,
-    hinges_of,
-    limit_stretch,
-    make_sheet,
-    step,
-)
+from synth.cloth.xpbd import Contacts, Sheet, State, colour, crowd, edges_of, hinges_of, limit_stretch, make_sheet, step
 
 
 def _grid(rows: int, columns: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.captures import write_tube_capture
 from PIL import Image
 
 from ash.capture.dataset import Capture, scan_path
@@ -63,6 +62,9 @@ def test_plain_files_say_where_a_point_of_the_template_is_seen(capture: Capture,
     views = json.loads((tmp_path / "views.json").read_text())["views"]
     assert {(view["camera"], view["frame"]) for view in views} == set(capture.splits["train"].views)
     cameras = {row["name"]: row for row in json.loads((tmp_path / "cameras.json").read_text())["cameras"]}
+    for frame in capture.splits["train"].frames:
+        vertices = np.load(scan_path(tmp_path, frame))["vertices"]
+        np.testing.assert_array_equal(vertices, read_scan(capture, frame)[0])
     poses, template = np.load(tmp_path / "poses.npz"), np.load(tmp_path / "template.npz")
     np.testing.assert_array_equal(poses["dofs"], capture.motion.dofs[poses["frame"]])
     rigid = template["skin_weights"].max(axis=1) > 0.999
@@ -112,14 +114,6 @@ def test_no_export_of_the_training_part_holds_a_test_image(capture: Capture, tmp
     held_out = {capture.image(*view)[..., :3].tobytes() for view in tests} - train
     images = [np.array(Image.open(path).convert("RGB")).tobytes() for path in tmp_path.rglob("*.png")]
     assert set(images) & train and held_out and not set(images) & held_out
-
-
-def test_scans_are_part_of_the_plain_files(tmp_path: Path):
-    capture = write_tube_capture(tmp_path / "tube")
-    export(capture, tmp_path / "plain", form="plain")
-    for frame in capture.splits["train"].frames:
-        vertices, _ = read_scan(capture, frame)
-        np.testing.assert_array_equal(np.load(scan_path(tmp_path / "plain", frame))["vertices"], vertices)
 
 
 def test_unknown_formats_are_refused(capture: Capture, tmp_path: Path):

@@ -109,6 +109,7 @@ def test_skinning_the_rest_pose_reproduces_the_obj(meta: Path, capture: Capture)
     rest = _motion(meta / "ddc.motion")
     vertices, uvs, faces = _obj(meta / "ddc.obj")
     weights = _skin(meta / "ddc.skin", skeleton)
+    assert (meta / "ddc.skin").read_text().splitlines()[:2] == ["Skeletool character skinning file V1.0", "bones:"]
     assert rest.shape == (1, 66) and np.abs(weights.sum(axis=1) - 1).max() < 1e-6
     relative = skeleton.frames(rest[0]) @ np.linalg.inv(skeleton.frames(rest[0]))
     weights /= weights.sum(axis=1, keepdims=True)
@@ -192,13 +193,6 @@ def test_cached_arrays_pose_the_canonical_template_onto_the_truth(meta: Path, ca
         )
         assert canonical.shape == (3, len(truth[0]), 4) and (canonical[..., 3] == 1).all()
         assert arrays["cached_temp_vert_normal"][frame].shape == (3, len(truth[0]), 3)
-
-
-def test_every_training_image_and_mask_is_there(meta: Path, capture: Capture):
-    folder = meta.parent.parent / "raw_data" / "Synthetic" / "metadata" / "training"
-    train = capture.splits["train"]
-    for kind in ("images", "foregroundSegmentation"):
-        assert len(list((folder / kind).rglob("image_c_*_f_*.png"))) == len(train.cameras) * len(train.frames)
 
 
 def _release_graph(vertices: np.ndarray, faces: np.ndarray, nodes: np.ndarray) -> tuple[list[int], np.ndarray]:
@@ -294,15 +288,13 @@ def test_cached_normals_are_means_of_unit_normals(meta: Path, capture: Capture):
     assert np.rad2deg(np.arccos(np.clip(cosine, -1, 1))).max() < 0.01
 
 
-def test_masks_are_black_or_white(meta: Path, capture: Capture):
-    folder = meta.parent.parent / "raw_data" / "Synthetic" / "metadata" / "training" / "foregroundSegmentation"
-    train = capture.splits["train"]
+def test_every_training_image_is_there_with_a_mask_of_black_and_white(meta: Path, capture: Capture):
+    training = meta.parent.parent / "raw_data" / "Synthetic" / "metadata" / "training"
+    folder, train = training / "foregroundSegmentation", capture.splits["train"]
+    for each in (training / "images", folder):
+        assert len(list(each.rglob("image_c_*_f_*.png"))) == len(train.cameras) * len(train.frames)
     for index, camera in enumerate(train.cameras):
         alpha = capture.image(camera, train.frames[0])[..., 3]
         with Image.open(folder / f"{index}/image_c_{index}_f_{train.frames[0]}.png") as image:
             mask = np.array(image)
         np.testing.assert_array_equal(mask, np.repeat(np.where(alpha >= 128, 255, 0)[..., None], 3, axis=-1))
-
-
-def test_the_skin_file_begins_as_the_release_begins_its_own(meta: Path):
-    assert (meta / "ddc.skin").read_text().splitlines()[:2] == ["Skeletool character skinning file V1.0", "bones:"]

@@ -115,9 +115,7 @@ def test_runs_are_parts_of_one_motion():
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [{"runs": 2}, {"runs": 3, "span": 11}, {"history": 4}, {"stride": 0}, {"runs": 0}, {"span": 2}],
-    ids=str,
+    "wrong", [{"runs": 2}, {"runs": 3, "span": 11}, {"history": 4}, {"stride": 0}, {"runs": 0}, {"span": 2}], ids=str
 )
 def test_clips_that_cannot_be_are_refused(wrong: dict[str, int]):
     with pytest.raises(InputError, match=r"expected|do not fit"):

@@ -2,9 +2,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.scenes import small_scene
 
 from ash.capture.formats import read_template
-from synth.capture import describe, make_body
+from synth.capture import make_body
 from synth.person.bare import MANNEQUIN_CLOTH, bare_template
 from synth.presets import scene
 
@@ -22,10 +23,7 @@ def test_the_bare_mannequin_lies_inside_its_clothes_and_wears_no_skirt():
     assert np.abs(bare.vertices[hips, 2]).max() < 0.12 < np.abs(dressed.surface.vertices[:, 2]).max()
 
 
-def test_a_capture_brings_the_bare_body(tmp_path: Path):
-    named = scene("skinned", size="ci")
-    describe(named, tmp_path)
-    joints = len(make_body(named).skeleton.names)
-    np.testing.assert_array_equal(
-        read_template(tmp_path / "body.npz", joints=joints).vertices, bare_template(named).vertices
-    )
+def test_a_capture_brings_the_bare_body(small_capture: Path):
+    joints = len(make_body(small_scene()).skeleton.names)
+    found = read_template(small_capture / "body.npz", joints=joints)
+    np.testing.assert_array_equal(found.vertices, bare_template(small_scene()).vertices)

@@ -1,0 +1,3 @@
+"""What tests of baselines share."""
+
+from helpers.tube import capture  # noqa: F401  (a fixture)
