@@ -15,7 +15,7 @@ from jinja2 import Environment, StrictUndefined
 
 from ash.files import InputError, write_atomic
 from benchmarks.analysis.results import Quantity, compare, foreground, read_csv, samples_of, summarise
-from benchmarks.analysis.statistics import Comparison, corrected
+from benchmarks.analysis.statistics import Comparison
 from benchmarks.analysis.style import style_of
 from benchmarks.cell.metrics import METRICS, PROTOCOL
 from benchmarks.cell.registry import code_version
@@ -39,7 +39,7 @@ def read_me(folder: Path = FOLDER) -> str:
     """
     environment = Environment(undefined=StrictUndefined, keep_trailing_newline=True)
     numbers = Numbers(folder)
-    names = ("score", "difference", "scores", "differences", "claims", "origin", "state", "title")
+    names = [name for name in vars(Numbers) if not name.startswith("_")]
     return environment.from_string((folder / f"{NAME}.j2").read_text()).render(
         {name: getattr(numbers, name) for name in names}
     )
@@ -52,19 +52,16 @@ class Numbers:
         self.folder = folder
         self._rows = cache(self._read)
 
-    def title(self, method: str) -> str:
-        """As tables write it."""
-        return style_of(method).title
-
     def score(self, report: str, scene: str, method: str, split: str = "novel_view", metric: str = "psnr") -> str:
         """The mean over people."""
         return self._score(report, scene, method, _quantity(split, metric))
 
     def difference(
-        self, report: str, scene: str, a: str, b: str, split: str = "novel_view", metric: str = "psnr"
+        self, report: str, scene: str, a: str, b: str, split: str = "novel_view", metric: str = "psnr", region: str = ""
     ) -> str:
-        """Row `a` minus row `b` in pairs over people, with its 95 % interval."""
-        return _told(self._compared(report, scene, a, b, _quantity(split, metric)), metric)
+        """Row `a` minus row `b` in pairs over people, with its 95 % interval. `region`: by default that of tables."""
+        quantity = Quantity(split, region, metric) if region else _quantity(split, metric)
+        return _told(self._compared(report, scene, a, b, quantity), metric)
 
     def scores(self, report: str, scene: str) -> str:
         """A table in Markdown: PSNR and LPIPS on all held-out splits, milliseconds and training seconds."""
@@ -76,27 +73,6 @@ class Numbers:
             for method in methods
         ]
         return _markdown(["", *(": ".join(head_of(quantity)) for quantity in wanted)], cells)
-
-    def differences(self, report: str, scenes: Sequence[str], pairs: Sequence[tuple[str, str]]) -> str:
-        """A table in Markdown: differences on novel views and new poses, p after Holm's correction."""
-        measured = set(self._rows(report)["metric"])
-        asked = [
-            (scene, a, b, _quantity(split, metric))
-            for scene in scenes
-            for a, b in pairs
-            for split in ("novel_view", "novel_pose")
-            for metric in ("psnr", "lpips")
-            if metric in measured
-        ]
-        tests = corrected([self._compared(report, *each) for each in asked])
-        cells = [
-            [
-                *(scene, f"{self.title(a)} - {self.title(b)}", head_of(quantity)[0], METRICS[quantity.metric].title),
-                *(_told(test, quantity.metric), "" if math.isnan(test.p) else f"{test.p:.2g}"),
-            ]
-            for (scene, a, b, quantity), test in zip(asked, tests, strict=True)
-        ]
-        return _markdown(["scene", "rows", "images", "metric", "difference [95 %]", "p (Holm)"], cells)
 
     def claims(self) -> str:
         """The claims that were judged, as a table in Markdown."""
@@ -115,6 +91,22 @@ class Numbers:
         rows = self._rows(report)
         hours = rows[(rows["metric"] == "train_cpu_s") & (rows["split"] == "speed")]["value"].sum() / 3600
         return f"`{run.command}`, code of {commits}, {machines}, {hours:.1f} core-hours of training"
+
+    def cells(self, report: str) -> int:
+        """How many trainings a report has."""
+        return len(self._plateaus(report))
+
+    def at_plateau(self, report: str) -> int:
+        """How many of them had reached their plateau."""
+        return int(self._plateaus(report).sum())
+
+    def people(self, report: str) -> int:
+        """How many people a report has."""
+        return self._rows(report)["subject"].nunique()
+
+    def _plateaus(self, report: str) -> pd.Series:
+        rows = self._rows(report)
+        return rows[(rows["split"] == "speed") & (rows["metric"] == "plateau")]["value"]
 
     def state(self, report: str) -> str:
         """Whether today's code made a published report."""
@@ -145,6 +137,8 @@ class Numbers:
 
 
 def _quantity(split: str, metric: str) -> Quantity:
+    if split in ("speed", "memory"):
+        return Quantity(split, "", metric)
     return Quantity(split, "full", metric) if metric in ON_WHOLE_FRAMES else foreground(split, metric)
 
 

@@ -68,7 +68,8 @@ def _finding(tables: RunTables, scene: str) -> str:
     """The verdict on each pair, and where there is none on the two best methods."""
     if pairs := [pair for pair in PAIRS if set(pair) <= set(tables.methods(scene))]:
         ranked = differences(tables, scenes=(scene,))
-        return f"On {scene}, {' '.join(_pair(tables, scene, ranked, *pair) for pair in pairs)}"
+        first, *others = (_pair(tables, scene, ranked, *pair) for pair in pairs)
+        return " ".join([f"On {scene}, {first}", *(text[0].upper() + text[1:] for text in others)])
     means = tables.values(scene, foreground(), tables.methods(scene, oracles=False))
     first, *others = sorted(means, key=lambda name: -means[name]) or [""]
     if not first:
