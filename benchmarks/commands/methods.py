@@ -1,4 +1,4 @@
-"""Commands that look at single methods: check-method, display, retarget."""
+"""The command that checks a method against the rules: check-method."""
 
 import tempfile
 from dataclasses import dataclass

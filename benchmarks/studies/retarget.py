@@ -58,7 +58,7 @@ def retarget(cells: list[Cell], motion: Path, out: Path, *, frames: int, workers
     rows = []
     for place in dict.fromkeys(cell.capture_folder for cell in driven):
         own = load_capture(place)
-        truth = render_truth(own, motion, out / f"truth-{own.scene}", frames=frames, workers=workers)
+        truth = render_truth(own, motion, out / f"truth-{place.name}", frames=frames, workers=workers)
         far = novelty_deg(own, truth)
         here = [cell for cell in driven if cell.capture_folder == place]
         scored = [score(cell, own, truth, out) for cell in here]
@@ -74,7 +74,7 @@ def retarget(cells: list[Cell], motion: Path, out: Path, *, frames: int, workers
             "novelty_deg": far,
             "avatars": [asdict(row) for row in scored],
         }
-        write_json(out / f"result-{own.scene}.json", content)
+        write_json(out / f"result-{place.name}.json", content)
     return rows
 
 
@@ -98,7 +98,7 @@ def score(cell: Cell, own: Capture, truth: Capture, out: Path) -> Retargeted:
     split = truth.splits["novel_pose"]
     images, vertices = drawn_in_isolation(cell, own, truth)
     scores = {view: metrics.score_view(image, metrics.on_black(truth.image(*view))) for view, image in images.items()}
-    write_image(out / f"strip-{own.scene}-{cell.config.method}-{cell.config.seed}.png", strip(truth, images))
+    write_image(out / f"strip-{cell.capture_folder.name}-{cell.config.method}-{cell.config.seed}.png", strip(truth, images))
     before = result_of(cell)
 
     def mean(region: str, metric: str) -> float:
