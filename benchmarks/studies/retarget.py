@@ -98,7 +98,9 @@ def score(cell: Cell, own: Capture, truth: Capture, out: Path) -> Retargeted:
     split = truth.splits["novel_pose"]
     images, vertices = drawn_in_isolation(cell, own, truth)
     scores = {view: metrics.score_view(image, metrics.on_black(truth.image(*view))) for view, image in images.items()}
-    write_image(out / f"strip-{cell.capture_folder.name}-{cell.config.method}-{cell.config.seed}.png", strip(truth, images))
+    write_image(
+        out / f"strip-{cell.capture_folder.name}-{cell.config.method}-{cell.config.seed}.png", strip(truth, images)
+    )
     before = result_of(cell)
 
     def mean(region: str, metric: str) -> float:
