@@ -182,7 +182,7 @@ def wilson(failures: int, trials: int) -> tuple[float, float]:
     """95 % interval of a rate (Wilson 1927); also right for 0 of 5."""
     if not 0 <= failures <= trials or trials == 0:
         raise ValueError(f"expected 0 <= failures <= trials and a trial, got {failures} of {trials}")
-    from scipy.stats import binomtest  # A second of imports that no report needs.
+    from scipy.stats import binomtest  # A second of imports that stability alone needs.
 
     interval = binomtest(failures, trials).proportion_ci(LEVEL, method="wilson")
     return float(interval.low), float(interval.high)

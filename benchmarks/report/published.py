@@ -27,7 +27,6 @@ from benchmarks.suites.runs import read_run, results_of
 
 FOLDER = Path(__file__).parents[2] / "reports"
 NAME = "README.md"
-NEWLINE = "\n"
 FACT = re.compile(r"^\| (code|commit) \| (.*?) \|$", re.MULTILINE)  # of a report's provenance
 
 
@@ -51,6 +50,7 @@ class Numbers:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._rows = cache(self._read)
+        self._means = cache(lambda report: summarise(self._rows(report)))
 
     def score(self, report: str, scene: str, method: str, split: str = "novel_view", metric: str = "psnr") -> str:
         """The mean over people."""
@@ -114,7 +114,7 @@ class Numbers:
         return "current" if facts.get("code") == code_version("ash") else f"stale, {facts.get('commit', 'unknown')}"
 
     def _score(self, report: str, scene: str, method: str, quantity: Quantity) -> str:
-        table = summarise(self._rows(report))
+        table = self._means(report)
         key = (scene, method, *quantity)
         if key not in table.index:
             return "n/a"
@@ -155,9 +155,9 @@ def _told(test: Comparison, metric: str) -> str:
 
 def _markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [heads, ["---", *["---:"] * (len(heads) - 1)], *rows]
-    return NEWLINE.join(f"| {' | '.join(line)} |" for line in lines)
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 if __name__ == "__main__":
-    place = Path(*sys.argv[1:2]) if len(sys.argv) > 1 else FOLDER
+    place = Path(sys.argv[1]) if len(sys.argv) > 1 else FOLDER
     write_atomic(place / NAME, read_me(place).encode())
