@@ -10,6 +10,7 @@ from ash.capture.formats import write_cameras, write_skeleton, write_template
 from ash.files import InputError, write_arrays, write_atomic, write_image, write_json
 from synth.export.official import export_official
 from synth.export.readme import PLAIN, TEST_VIEWS, readme
+from synth.export.undistorted import undistort
 from synth.posing import bone_frames, dual_quaternion_skinning, rotmat_to_unitquat, skinning_transforms
 
 
@@ -157,22 +158,14 @@ def _write_model(capture: Capture, folder: Path, *, cameras: Sequence[str], fram
         write_arrays(folder / "posed_template" / f"{frame:06d}.npz", vertices=posed.astype(np.float32))
 
 
-def export_undistorted(capture: Capture, folder: Path) -> Path:
-    """A capture of pinhole cameras; see `synth.export.undistorted`."""
-    from synth.export.undistorted import undistort
-
-    return undistort(capture.folder, folder)
-
-
 FORMATS: dict[str, Callable[..., Path]] = {
     "ash": export_official,
     "nerfstudio": export_nerfstudio,
     "colmap": export_colmap,
     "plain": export_plain,
     "test-views": export_test_views,
-    "undistorted": export_undistorted,
+    "undistorted": lambda capture, folder: undistort(capture.folder, folder),
 }
-OF_ONE_SPLIT = ("nerfstudio", "colmap")
 
 
 def export(
@@ -189,15 +182,11 @@ def export(
     `split` and `frame` choose what nerfstudio and COLMAP hold; `views` are the scored ones, for `test-views`.
 
     Raises:
-        InputError: an unknown format, split or frame, or a folder that cannot be written.
+        InputError: an unknown split or frame, or a folder that cannot be written.
     """
-    if form not in FORMATS:
-        raise InputError(f"format: expected one of {', '.join(FORMATS)}, got {form!r}")
-    choice: dict = {"split": split or "train", "frame": frame} if form in OF_ONE_SPLIT else {}
+    choice: dict = {"split": split or "train", "frame": frame} if form in ("nerfstudio", "colmap") else {}
     if form == "test-views":
-        choice["views"] = views
-    if not choice.get("split") and (split, frame) != (None, None):
-        raise InputError(f"a split or a frame is chosen with {' or '.join(OF_ONE_SPLIT)}, got the format {form}")
+        choice = {"views": views}
     try:
         return FORMATS[form](capture, folder, **choice)
     except OSError as error:

@@ -5,11 +5,14 @@ angles count three times, as in the released skeletons, because the released cod
 """
 
 import pickle
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array, csr_array, eye_array
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial.transform import Rotation
+from trimesh.geometry import mean_vertex_normals
 
 from ash.capture.dataset import Camera, Capture, Skeleton, TemplateMesh
 from ash.capture.formats import read_template_truth
@@ -25,9 +28,7 @@ from synth.posing import (
 MM = 1000.0
 YAW_WEIGHT = 3.0
 INFLUENCES = 6
-NODE_REACH = (
-    2  # edges from any vertex to its nearest graph node; the release links up to 3, and knows no farther than 6
-)
+SUBJECT = "Synthetic"
 FOREGROUND = 127  # alpha above which the release's binary masks are on
 AXES = {"rx": (1, 0, 0), "ry": (0, 1, 0), "rz": (0, 0, 1)}
 
@@ -66,21 +67,12 @@ def skeleton_text(skeleton: Skeleton) -> str:
     return "\n".join(lines) + "\n"
 
 
-def euler_angles(rotations: np.ndarray, order: str) -> np.ndarray:
-    """Angles `[..., 3]` with R = R_first R_second R_third about the axes of `order` ("yzx" or "zyx"), radians."""
-    i, j, k = ("xyz".index(axis) for axis in order)
-    sign = 1.0 if (i, j, k) in ((0, 1, 2), (1, 2, 0), (2, 0, 1)) else -1.0
-    # R = R_i(a) R_j(b) R_k(c): the entry (i, k) is sign * sin(b).
-    second = np.arcsin(np.clip(sign * rotations[..., i, k], -1, 1))
-    first = np.arctan2(-sign * rotations[..., j, k], rotations[..., k, k])
-    third = np.arctan2(-sign * rotations[..., i, j], rotations[..., i, i])
-    return np.stack([first, second, third], axis=-1)
-
-
-def to_official_dofs(skeleton: Skeleton, dofs: np.ndarray) -> np.ndarray:
+def to_official_dofs(dofs: np.ndarray) -> np.ndarray:
     """Our degrees of freedom `[t, 3 + 3 j]` as those of `skeleton_text`; the root's angles are thirds."""
-    rotations = rotvec_to_rotmat(dofs[:, 3:].reshape(len(dofs), -1, 3))
-    angles = np.concatenate([euler_angles(rotations[:, :1], "yzx"), euler_angles(rotations[:, 1:], "zyx")], axis=1)
+    angles = np.empty((len(dofs), dofs.shape[1] // 3 - 1, 3))
+    for joint in range(angles.shape[1]):
+        rotations = Rotation.from_rotvec(dofs[:, 3 + 3 * joint : 6 + 3 * joint])
+        angles[:, joint] = rotations.as_euler("ZYX" if joint else "YZX")  # about axes that turn along
     angles = np.unwrap(angles, axis=0)
     angles[:, 0] /= YAW_WEIGHT
     return np.concatenate([dofs[:, :3], angles.reshape(len(dofs), -1)], axis=1)
@@ -126,9 +118,9 @@ def skin_text(skeleton: Skeleton, weights: np.ndarray) -> str:
     return "\n".join(lines) + "\n"
 
 
-def obj_text(vertices: np.ndarray, faces: np.ndarray, *, uvs: np.ndarray, uv_faces: np.ndarray, material: str) -> str:
+def obj_text(vertices: np.ndarray, faces: np.ndarray, *, uvs: np.ndarray, uv_faces: np.ndarray) -> str:
     """An OBJ in millimetres as the released reader wants it: colours behind vertices, `v/vt` faces."""
-    lines = [f"mtllib ./{material}"]
+    lines = ["mtllib ./ddc.obj.mtl"]
     lines += ["v {:.9f} {:.9f} {:.9f} 0.7 0.7 0.7".format(*point) for point in vertices * MM]
     lines += ["vt {:.9f} {:.9f}".format(*uv) for uv in uvs]
     for face, uv in zip(faces + 1, uv_faces + 1, strict=True):
@@ -180,7 +172,6 @@ def cached_arrays(capture: Capture) -> dict[str, dict[int, np.ndarray]]:
     Of a capture without truth they are those of the template that the skeleton alone moves.
     """
     template, motion, skeleton = capture.template, capture.motion, capture.skeleton
-    frames = sorted(capture.splits["train"].frames)
     transforms = skinning_transforms(skeleton, motion.dofs)
     if (capture.folder / "truth" / "template.npz").is_file():
         posed = read_template_truth(capture) * MM
@@ -190,7 +181,7 @@ def cached_arrays(capture: Capture) -> dict[str, dict[int, np.ndarray]]:
     transforms[..., :3, 3] *= MM
     heads = bone_frames(skeleton, motion.dofs)[:, :, :3, 3] * MM
     result: dict[str, dict[int, np.ndarray]] = {name: {} for name in CACHED}
-    for frame in frames:
+    for frame in sorted(capture.splits["train"].frames):
         window = motion.window(frame, 3)
         pieces = [blended_dual_quaternions(template.skin_weights, transforms[k]) for k in window]
         canonical = np.stack([_unpose(posed[k], *piece) for k, piece in zip(window, pieces, strict=True)])
@@ -218,10 +209,7 @@ def unit_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     across = np.cross(b - a, c - a)
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
-    normals = np.zeros_like(vertices)
-    for k in range(3):
-        np.add.at(normals, faces[:, k], across)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    return mean_vertex_normals(len(vertices), faces, across)
 
 
 CACHED = (
@@ -236,36 +224,40 @@ CACHED = (
 
 def _unpose(posed: np.ndarray, real: np.ndarray, dual: np.ndarray) -> np.ndarray:
     """Invert the rigid motion of unit dual quaternions: x = R^T (y - t)."""
-    w, axis = real[:, :1], -real[:, 1:]
     shift = 2 * (real[:, :1] * dual[:, 1:] - dual[:, :1] * real[:, 1:] + np.cross(real[:, 1:], dual[:, 1:]))
-    moved = posed - shift
-    return moved + 2 * np.cross(axis, np.cross(axis, moved) + w * moved)
+    return Rotation.from_quat(real, scalar_first=True).apply(posed - shift, inverse=True)
 
 
 def graph_nodes(template: TemplateMesh) -> np.ndarray:
-    """Vertices that serve as nodes of the embedded graph, so that on every piece of the mesh all have one in reach.
+    """Vertices that serve as nodes of the embedded graph, each more than two edges from all others.
 
-    The release looks a node up as the nearest vertex that is not taken yet, so of two vertices at one point it may take
-    the other one; what that leaves out of reach becomes a node as well.
+    The release reaches vertices up to three edges from a node. It looks a node up as the nearest vertex that is not
+    taken yet, so of two vertices at one point it may take the other one; what that leaves out of reach becomes a node.
 
     Raises:
         InputError: the mesh is in so many pieces with vertices at one point that this never ends.
     """
-    edges = _edges(template)
-    nodes = _spread(edges, np.arange(len(template.vertices)), np.zeros(0, dtype=np.int64))
-    while True:
-        far = np.flatnonzero(_hops(edges, taken_vertices(template.vertices, nodes)) > NODE_REACH + 1)
-        if not len(far):
-            return nodes
-        if not len(new := _spread(edges, far, nodes)):
+    step = _edges(template) + eye_array(len(template.vertices), format="csr")
+    near = step @ step
+    reach = near @ step
+    nodes: list[int] = []
+    far = np.arange(len(template.vertices))
+    while len(far):
+        covered, before = near[np.array(nodes, dtype=np.int64)].sum(axis=0) > 0, len(nodes)
+        for vertex in far:
+            if not covered[vertex]:
+                nodes.append(vertex)
+                covered[near.indices[near.indptr[vertex] : near.indptr[vertex + 1]]] = True
+        if len(nodes) == before:
             raise InputError(
                 f"template.npz: the release's graph cannot reach {len(far)} vertices, as others lie at the same points;"
                 " expected faces that share their vertices"
             )
-        nodes = np.concatenate([nodes, new])
+        far = np.flatnonzero(reach[taken_vertices(template.vertices, nodes)].sum(axis=0) == 0)
+    return np.array(nodes)
 
 
-def taken_vertices(vertices: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+def taken_vertices(vertices: np.ndarray, nodes: Sequence[int]) -> np.ndarray:
     """Which vertex the release takes for each node, in the order of the graph's file."""
     free = np.ones(len(vertices), dtype=bool)
     taken = []
@@ -296,70 +288,37 @@ def _edges(template: TemplateMesh) -> csr_array:
     return coo_array((np.ones(len(ends[0])), ends), shape=(count, count)).tocsr()
 
 
-def _hops(edges: csr_array, nodes: np.ndarray) -> np.ndarray:
-    """Edges from each vertex to its nearest node; infinite where there is none on its piece of the mesh."""
-    if not len(nodes):
-        return np.full(edges.shape[0], np.inf)
-    return dijkstra(edges, directed=False, indices=nodes, unweighted=True, min_only=True)
-
-
-def _spread(edges: csr_array, wanted: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """New nodes among `wanted`, in their order, each more than the reach away from all others."""
-    covered = _hops(edges, nodes) <= NODE_REACH
-    new = []
-    for vertex in wanted:
-        if not covered[vertex]:
-            new.append(vertex)
-            ball = {int(vertex)}
-            for _ in range(NODE_REACH):
-                ball |= {int(n) for v in ball for n in edges.indices[edges.indptr[v] : edges.indptr[v + 1]]}
-            covered[list(ball)] = True
-    return np.array(new, dtype=np.int64)
-
-
-def export_official(capture: Capture, folder: Path, *, subject: str = "Synthetic") -> Path:
+def export_official(capture: Capture, folder: Path) -> Path:
     """Write everything that the released trainer reads of a subject. Training views only, as there."""
-    skeleton, template = capture.skeleton, capture.template
-    meta = folder / "meta_data" / subject
-    dofs = to_official_dofs(skeleton, capture.motion.dofs)
+    skeleton, template, train = capture.skeleton, capture.template, capture.splits["train"]
+    cameras = [capture.cameras[name] for name in train.cameras]
+    _require_readable(capture, cameras)
+    meta = folder / "meta_data" / SUBJECT
+    dofs = to_official_dofs(capture.motion.dofs)
     windows = np.stack([capture.motion.window(frame, 3) for frame in range(len(dofs))])
-    cameras = [capture.cameras[name] for name in capture.splits["train"].cameras]
-    if not all(camera.is_pinhole for camera in cameras):
-        raise InputError(f"{capture.folder}: a lens distorts; expected pinholes: ash-bench export --format undistorted")
-    training = max(capture.splits["train"].frames) + 1
-    if capture.splits["train"].parts:
-        raise InputError(
-            f"{capture.folder}: a part of the cameras saw each frame, and the release reads an image of every camera in"
-            " every frame; make the capture with --rig.cameras-per-frame 0"
-        )
-    _require_faces_everywhere(capture)
+    training = max(train.frames) + 1
     nodes = graph_nodes(template)
     node_faces = graph_faces(template, nodes)
+    hands = dict.fromkeys(skeleton.names, "0\n") | {"hand_left": "1\n", "hand_right": "2\n"}
     texts = {
         "ddc.skeleton": skeleton_text(skeleton),
         "ddc.skin": skin_text(skeleton, template.skin_weights),
         "ddc.motion": motion_text(np.zeros((1, dofs.shape[1]))),
-        "ddc.obj": obj_text(
-            template.vertices, template.faces, uvs=template.uvs, uv_faces=template.uv_faces, material="ddc.obj.mtl"
-        ),
+        "ddc.obj": obj_text(template.vertices, template.faces, uvs=template.uvs, uv_faces=template.uv_faces),
         "ddc.obj.mtl": "newmtl cloth\nmap_Kd ddc.png\n",
         "ddc_graph.obj": obj_text(
-            template.vertices[nodes],
-            node_faces,
-            uvs=np.zeros((len(nodes), 2)),
-            uv_faces=node_faces,
-            material="ddc.obj.mtl",
+            template.vertices[nodes], node_faces, uvs=np.zeros((len(nodes), 2)), uv_faces=node_faces
         ),
-        "segmentation.txt": "\n".join(["0"] * len(template.vertices)) + "\n",
-        "hand_segmentation.txt": "\n".join(_hands(capture)) + "\n",
+        "segmentation.txt": "0\n" * len(template.vertices),
+        "hand_segmentation.txt": "".join(hands[skeleton.names[j]] for j in np.argmax(template.skin_weights, axis=1)),
         "real_translation.txt": "0 0 0\n",
         "cameras.calibration": calibration_text(cameras),
     }
-    for name, frames in (("skeletoolToGTPose", slice(0, training)), ("skeletoolToGTPoseTest", slice(training, None))):
-        if len(dofs[frames]):
-            texts[f"{name}/poseAngles.motion"] = motion_text(dofs[frames])
-            relative = normalise_motion(dofs, windows)[3 * (frames.start) : 3 * (frames.stop or len(dofs))]
-            texts[f"{name}/poseAnglesRotationNormalized.motion"] = motion_text(relative)
+    relative = normalise_motion(dofs, windows)
+    for name, first, last in (("skeletoolToGTPose", 0, training), ("skeletoolToGTPoseTest", training, len(dofs))):
+        if first < last:
+            texts[f"{name}/poseAngles.motion"] = motion_text(dofs[first:last])
+            texts[f"{name}/poseAnglesRotationNormalized.motion"] = motion_text(relative[3 * first : 3 * last])
     for name, text in texts.items():
         write_atomic(meta / name, text.encode())
     write_json(meta / "cameras.json", cameras_json(cameras))
@@ -368,29 +327,26 @@ def export_official(capture: Capture, folder: Path, *, subject: str = "Synthetic
         write_atomic(meta / "ddc.png", texture.read_bytes())
     for name, array in cached_arrays(capture).items():
         write_atomic(folder / "cached_files" / f"{name}.pkl", pickle.dumps(array, protocol=4))
-    _write_images(capture, folder / "raw_data" / subject / "metadata" / "training")
-    return folder
-
-
-def _require_faces_everywhere(capture: Capture) -> None:
-    """The release's embedded graph knows no vertex that belongs to no face."""
-    unused = len(capture.template.vertices) - len(np.unique(capture.template.faces))
-    if unused:
-        raise InputError(f"{capture.folder}/template.npz: {unused} vertices belong to no face, expected none")
-
-
-def _hands(capture: Capture) -> list[str]:
-    heaviest = np.argmax(capture.template.skin_weights, axis=1)
-    marks = {"hand_left": "1", "hand_right": "2"}
-    return [marks.get(capture.skeleton.names[j], "0") for j in heaviest]
-
-
-def _write_images(capture: Capture, folder: Path) -> None:
-    train = capture.splits["train"]
+    images = folder / "raw_data" / SUBJECT / "metadata" / "training"
     for index, camera in enumerate(train.cameras):
         for frame in train.frames:
             rgba = capture.image(camera, frame)
             name = f"{index}/image_c_{index}_f_{frame}.png"
-            write_image(folder / "images" / name, rgba[..., :3])
+            write_image(images / "images" / name, rgba[..., :3])
             mask = np.where(rgba[..., 3:] > FOREGROUND, np.uint8(255), np.uint8(0))
-            write_image(folder / "foregroundSegmentation" / name, np.repeat(mask, 3, axis=-1))
+            write_image(images / "foregroundSegmentation" / name, np.repeat(mask, 3, axis=-1))
+    return folder
+
+
+def _require_readable(capture: Capture, cameras: list[Camera]) -> None:
+    """The release reads pinholes, an image of every camera in every frame, and no vertex that belongs to no face."""
+    if not all(camera.is_pinhole for camera in cameras):
+        raise InputError(f"{capture.folder}: a lens distorts; expected pinholes: ash-bench export --format undistorted")
+    if capture.splits["train"].parts:
+        raise InputError(
+            f"{capture.folder}: a part of the cameras saw each frame, and the release reads an image of every camera in"
+            " every frame; make the capture with --rig.cameras-per-frame 0"
+        )
+    unused = len(capture.template.vertices) - len(np.unique(capture.template.faces))
+    if unused:
+        raise InputError(f"{capture.folder}/template.npz: {unused} vertices belong to no face, expected none")

@@ -14,7 +14,6 @@ from ash.capture.formats import load_capture, read_surface_truth, write_cameras
 from ash.files import InputError, link_or_copy, read_arrays, sha256_of, write_arrays, write_image
 from synth.camera.render import Studio, probe
 from synth.camera.resampling import resample, resample_rgba
-from synth.person.body import Surface
 from synth.scene import Light
 from synth.truth.pixels import surface_truth
 
@@ -29,16 +28,19 @@ def undistort(source: Path, folder: Path) -> Path:
     if folder.exists() and any(folder.iterdir()):
         raise InputError(f"{folder}: expected an empty folder")
     pinholes = {name: replace(camera, distortion=np.zeros(4)) for name, camera in capture.cameras.items()}
-    written = {"cameras.json"}
     write_cameras(folder / "cameras.json", list(pinholes.values()))
-    views = sorted({view for split in capture.splits.values() for view in split.views}, key=lambda view: view[1])
+    written = {"cameras.json"}
     studio = _studio(capture) if (source / "truth" / "surface.npz").is_file() else None
-    for name, frame in views:
-        if not capture.cameras[name].is_pinhole:
-            written |= _write_image(capture, pinholes[name], frame, folder)
-            if studio is not None:
-                studio.dress(read_surface_truth(capture.folder, frame))
-                written |= _write_truth(capture, pinholes[name], frame, studio, folder)
+    for name, frame in {view for split in capture.splits.values() for view in split.views}:
+        camera, pinhole = capture.cameras[name], pinholes[name]
+        if camera.is_pinhole:
+            continue
+        write_image(image_path(folder, name, frame), resample_rgba(capture.image(name, frame), camera, pinhole))
+        written.add(str(image_path(Path(), name, frame)))
+        if studio is not None:
+            studio.dress(read_surface_truth(source, frame))
+            write_arrays(pixels_path(folder, name, frame), **_pixel_truth(capture, pinhole, frame, studio))
+            written.add(str(pixels_path(Path(), name, frame)))
     for name in set(capture.manifest.files) - written:
         link_or_copy(source / name, folder / name)
     files = {
@@ -48,30 +50,15 @@ def undistort(source: Path, folder: Path) -> Path:
     return folder
 
 
-def _write_image(capture: Capture, pinhole: Camera, frame: int, folder: Path) -> set[str]:
-    camera = capture.cameras[pinhole.name]
-    image = resample_rgba(capture.image(camera.name, frame), camera, pinhole)
-    write_image(image_path(folder, camera.name, frame), image)
-    return {str(image_path(Path(), camera.name, frame))}
-
-
-def _write_truth(capture: Capture, pinhole: Camera, frame: int, studio: Studio, folder: Path) -> set[str]:
-    camera = capture.cameras[pinhole.name]
-    noise = read_arrays(pixels_path(capture.folder, camera.name, frame), expected=("noise",))["noise"]
-    variance, squares = resample(noise[..., None], camera, pinhole)
+def _pixel_truth(capture: Capture, pinhole: Camera, frame: int, studio: Studio) -> dict[str, np.ndarray]:
+    noise = read_arrays(pixels_path(capture.folder, pinhole.name, frame), expected=("noise",))["noise"]
+    variance, squares = resample(noise[..., None], capture.cameras[pinhole.name], pinhole)
     triangle, barycentric = studio.look(pinhole)
-    write_arrays(
-        pixels_path(folder, camera.name, frame),
-        triangle=triangle,
-        barycentric=barycentric.astype(np.float16),
-        noise=(variance[..., 0] * squares).astype(np.float16),
-    )
-    return {str(pixels_path(Path(), camera.name, frame))}
+    noise = (variance[..., 0] * squares).astype(np.float16)
+    return {"triangle": triangle, "barycentric": barycentric.astype(np.float16), "noise": noise}
 
 
 def _studio(capture: Capture) -> Studio:
     """A studio that only asks what lies where: its texture and light are of no matter."""
     blank = np.zeros((8, 8, 3), dtype=np.uint8)
-    truth = surface_truth(capture)
-    surface = Surface(vertices=truth.rest, faces=truth.faces, uvs=truth.uvs, uv_faces=truth.uv_faces, part=truth.part)
-    return Studio(probe(), surface, blank, Light(), depth=2)
+    return Studio(probe(), surface_truth(capture), blank, Light(), depth=2)

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from PIL import Image
+from scipy.ndimage import map_coordinates
 
 from ash.capture.dataset import Capture, pixels_path
 from ash.capture.formats import read_surface_truth
 from ash.files import InputError, read_arrays
-from synth.person.body import vertex_normals
+from synth.person.body import Surface, vertex_normals
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -28,17 +29,6 @@ class PixelTruth:
     def covered(self) -> np.ndarray:
         """Where the surface is hit, `[h, w]` bool."""
         return self.triangle >= 0
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SurfaceTruth:
-    """The rendered surface's topology and rest shape."""
-
-    rest: np.ndarray  # [s, 3]
-    faces: np.ndarray  # [f, 3]
-    uvs: np.ndarray  # [u, 2]
-    uv_faces: np.ndarray  # [f, 3]
-    part: np.ndarray  # [f] index into synth.person.body.PARTS
 
 
 def pixel_truth(capture: Capture, camera: str, frame: int) -> PixelTruth:
@@ -66,12 +56,13 @@ def pixel_truth(capture: Capture, camera: str, frame: int) -> PixelTruth:
     )
 
 
-def surface_truth(capture: Capture) -> SurfaceTruth:
-    """Read the surface that all frames share."""
+def surface_truth(capture: Capture) -> Surface:
+    """Read the rendered surface at rest, whose faces and UVs all frames share."""
     names = ("rest", "faces", "uvs", "uv_faces", "part")
     arrays = read_arrays(capture.folder / "truth" / "surface.npz", expected=names)
-    kinds = {"f": np.float64, "i": np.int64}
-    return SurfaceTruth(**{name: array.astype(kinds[array.dtype.kind]) for name, array in arrays.items()})
+    rest, uvs = (arrays[name].astype(np.float64) for name in ("rest", "uvs"))
+    faces, uv_faces, part = (arrays[name].astype(np.int64) for name in ("faces", "uv_faces", "part"))
+    return Surface(vertices=rest, faces=faces, uvs=uvs, uv_faces=uv_faces, part=part)
 
 
 def posed_surface(capture: Capture, frame: int) -> np.ndarray:
@@ -137,24 +128,7 @@ def albedo(capture: Capture, pixels: PixelTruth) -> np.ndarray:
     """Colour of the cloth before light, `[h, w, 3]` sRGB in 0..1, read bilinearly from the painted texture."""
     with Image.open(capture.folder / "truth" / "texture.png") as image:
         texture = np.asarray(image, dtype=np.float64) / 255
-    size = np.array([texture.shape[1], texture.shape[0]])
-    where = uvs(capture, pixels) * [1, -1] + [0, 1]
-    place = np.clip(where * size - 0.5, 0, size - 1)
-    low = np.minimum(np.floor(place).astype(np.int64), size - 2)
-    share = place - low
-    result = np.zeros((*where.shape[:2], 3))
-    for dx in (0, 1):
-        for dy in (0, 1):
-            weight = np.abs(1 - dx - share[..., 0]) * np.abs(1 - dy - share[..., 1])
-            result += weight[..., None] * texture[low[..., 1] + dy, low[..., 0] + dx]
-    return np.where(pixels.covered[..., None], result, 0.0)
-
-
-def noise_ceiling(capture: Capture, views: list[tuple[str, int]]) -> float:
-    """Foreground PSNR, decibels, that a perfect method would reach on these views, given the renders' own noise."""
-    total, count = 0.0, 0
-    for camera, frame in views:
-        foreground = capture.image(camera, frame)[..., 3] > 127
-        total += float(pixel_truth(capture, camera, frame).noise[foreground].sum())
-        count += int(foreground.sum())
-    return float(-10 * np.log10(max(total / max(count, 1), 1e-12)))
+    u, v = np.moveaxis(uvs(capture, pixels), -1, 0)
+    place = (1 - v) * texture.shape[0] - 0.5, u * texture.shape[1] - 0.5  # row and column
+    colours = [map_coordinates(texture[..., channel], place, order=1, mode="nearest") for channel in range(3)]
+    return np.where(pixels.covered[..., None], np.stack(colours, axis=-1), 0.0)

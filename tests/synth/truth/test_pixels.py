@@ -75,10 +75,6 @@ def test_damaged_truth_is_refused(capture: Capture, tmp_path: Path, view: truth.
         truth.pixel_truth(load_capture(other), view.camera, 0)
 
 
-def test_noise_lowers_the_ceiling(capture: Capture):
-    assert 15 < truth.noise_ceiling(capture, capture.splits["train"].views[:3]) < 45
-
-
 def test_no_perturbation_changes_no_byte(capture: Capture, tmp_path: Path):
     same = load_capture(perturb(capture.folder, tmp_path / "same", Perturbation()))
     assert same.manifest.files == capture.manifest.files and same.splits == capture.splits
