@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.executing import InThisProcess
 from helpers.scenes import small_scene
 
 from ash.capture.dataset import Capture, scan_path, surface_path
@@ -30,7 +31,9 @@ def rotating_scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def capture(shared) -> Capture:
-    return load_capture(shared("rotating", lambda folder: make_capture(rotating_scene(), folder, workers=2)))
+    return load_capture(
+        shared("rotating", lambda folder: make_capture(rotating_scene(), folder, executor=InThisProcess()))
+    )
 
 
 def images_of(folder: Path) -> set[tuple[str, int]]:

@@ -73,7 +73,7 @@ def test_a_rig_in_other_units_is_refused_with_the_guess(scale: int, unit: str, t
         viewmats(tmp_path / "rig.json")
 
 
-def test_rounded_rotations_are_made_orthonormal_and_wrong_ones_refused(tmp_path: Path) -> None:
+def test_rounded_rotations_are_made_orthonormal(tmp_path: Path) -> None:
     path = ours(tmp_path / "rig.json")
     rows = json.loads(path.read_text())["cameras"]
     for row in rows:
@@ -82,14 +82,12 @@ def test_rounded_rotations_are_made_orthonormal_and_wrong_ones_refused(tmp_path:
     found = viewmats(path)[:, :3, :3]
     np.testing.assert_allclose(found @ np.swapaxes(found, 1, 2), np.broadcast_to(np.eye(3), (4, 3, 3)), atol=1e-12)
     np.testing.assert_allclose(found, np.stack(matrices())[:, :3, :3], atol=1e-4)
-    rows[2]["viewmat"][0][0] += 0.01
-    path.write_text(json.dumps(rows))
-    with pytest.raises(InputError, match=r"camera cam2: its rotation is not orthonormal: off by 0\.0"):
-        rig_from_file(path)
 
 
 def test_exact_rotations_keep_their_bits(tmp_path: Path) -> None:
-    np.testing.assert_array_equal(viewmats(ours(tmp_path / "rig.json")), np.stack(matrices()))
+    cameras = make_cameras(rig_from_file(ours(tmp_path / "rig.json")), PERSON)
+    np.testing.assert_array_equal([camera.viewmat for camera in cameras], np.stack(matrices()))
+    assert [camera.name for camera in cameras] == ["cam0", "cam1", "cam2", "cam3"]
 
 
 @pytest.mark.parametrize(
@@ -104,9 +102,3 @@ def test_other_coefficients_are_refused_by_camera_and_field(tmp_path: Path) -> N
     path = ours(tmp_path / "rig.json", distortion=[-0.1, 0.02, 0.001, 0.0, -0.02])
     with pytest.raises(InputError, match=r"rig\.json: camera cam0: k3 is -0\.02, expected 0"):
         rig_from_file(path)
-
-
-def test_another_file_is_refused_by_what_is_read(tmp_path: Path) -> None:
-    (tmp_path / "other.json").write_text('{"intrinsics": []}')
-    with pytest.raises(InputError, match=r"expected a list of cameras: .* 3D Gaussian Splatting .* nerfstudio"):
-        rig_from_file(tmp_path / "other.json")

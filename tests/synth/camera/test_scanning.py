@@ -9,7 +9,7 @@ import pytest
 from helpers.scenes import small_scene
 from scipy.spatial import cKDTree
 
-from ash.capture.dataset import scan_path
+from ash.capture.dataset import Camera, scan_path
 from ash.capture.formats import load_capture, read_scan, read_surface_mesh_truth
 from ash.capture.manifest import read_manifest
 from ash.files import InputError
@@ -31,6 +31,19 @@ def studio(small_capture: Path) -> Studio:
     return dressed
 
 
+@pytest.fixture(scope="module")
+def normals(studio: Studio) -> np.ndarray:
+    """Of its true surface."""
+    return vertex_normals(studio.vertices.astype(np.float64), studio.surface.faces)
+
+
+@pytest.fixture(scope="module")
+def cameras(small_capture: Path) -> list[Camera]:
+    """Those of training."""
+    capture = load_capture(small_capture)
+    return [capture.cameras[name] for name in capture.splits["train"].cameras]
+
+
 def test_training_frames_are_scanned_and_the_manifest_says_how_well(small_capture: Path) -> None:
     folder = small_capture
     capture, manifest = load_capture(folder), read_manifest(folder)
@@ -41,12 +54,12 @@ def test_training_frames_are_scanned_and_the_manifest_says_how_well(small_captur
     assert len(sizes) > 1 and max(sizes) < 0.95 * len(read_surface_mesh_truth(capture, 0)[0])
 
 
-def test_a_scan_is_a_function_of_the_seed_and_the_frame(studio: Studio, small_capture: Path) -> None:
-    capture = load_capture(small_capture)
-    cameras = [capture.cameras[name] for name in capture.splits["train"].cameras]
+def test_a_scan_is_a_function_of_the_seed_and_the_frame(
+    studio: Studio, cameras: list[Camera], small_capture: Path
+) -> None:
     scene = small_scene()
     vertices, faces = scan(studio, cameras, scene.scanner, seed=stream(scene, "scan", 0))
-    stored = read_scan(capture, 0)
+    stored = read_scan(load_capture(small_capture), 0)
     assert np.array_equal(vertices, stored[0].astype(np.float32)) and np.array_equal(faces, stored[1])
     other, _ = scan(studio, cameras, scene.scanner, seed=stream(scene, "scan", 1))
     assert other.shape == vertices.shape and not np.array_equal(other, vertices)
@@ -54,14 +67,11 @@ def test_a_scan_is_a_function_of_the_seed_and_the_frame(studio: Studio, small_ca
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_a_scan_is_off_along_the_normal_by_exactly_the_stated_rms(
-    studio: Studio, share: float, small_capture: Path
+    share: float, studio: Studio, normals: np.ndarray, cameras: list[Camera]
 ) -> None:
-    capture = load_capture(small_capture)
-    cameras = [capture.cameras[name] for name in capture.splits["train"].cameras]
     scanner = Scanner(rms_mm=0.4, bump_share=share, bump_mm=40.0)
     vertices, faces = scan(studio, cameras, scanner, seed=3)
     surface = studio.vertices.astype(np.float64)
-    normals = vertex_normals(surface, studio.surface.faces)
     _, nearest = cKDTree(surface).query(vertices)
     off = vertices - surface[nearest]
     height = (off * normals[nearest]).sum(1)
@@ -72,11 +82,10 @@ def test_a_scan_is_off_along_the_normal_by_exactly_the_stated_rms(
     assert {0.0: -0.05 < alike < 0.05, 0.5: 0.3 < alike < 0.6, 1.0: alike > 0.7}[share]
 
 
-def test_the_error_grows_where_no_two_cameras_look_squarely(studio: Studio, small_capture: Path) -> None:
-    capture = load_capture(small_capture)
-    cameras = [capture.cameras[name] for name in capture.splits["train"].cameras]
+def test_the_error_grows_where_no_two_cameras_look_squarely(
+    studio: Studio, normals: np.ndarray, cameras: list[Camera]
+) -> None:
     surface = studio.vertices.astype(np.float64)
-    normals = vertex_normals(surface, studio.surface.faces)
     squarely = facing_of_second(studio, cameras, surface, normals)
     vertices, _ = scan(studio, cameras, Scanner(rms_mm=0.4), seed=3)
     _, nearest = cKDTree(surface).query(vertices)
@@ -86,11 +95,8 @@ def test_the_error_grows_where_no_two_cameras_look_squarely(studio: Studio, smal
     assert np.sqrt(np.mean(aside**2)) > 2 * np.sqrt(np.mean(square**2))
 
 
-def test_two_cameras_must_see_what_is_scanned(studio: Studio, small_capture: Path) -> None:
-    capture = load_capture(small_capture)
-    camera = capture.cameras[capture.splits["train"].cameras[0]]
-    surface = studio.vertices.astype(np.float64)
-    normals = vertex_normals(surface, studio.surface.faces)
+def test_two_cameras_must_see_what_is_scanned(studio: Studio, normals: np.ndarray, cameras: list[Camera]) -> None:
+    camera, surface = cameras[0], studio.vertices.astype(np.float64)
     assert not facing_of_second(studio, [camera], surface, normals).any()
     twice = facing_of_second(studio, [camera, camera], surface, normals)
     towards = camera.position - surface

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from ash.files import InputError
 from synth.motion.clips import make_motion
 from synth.motion.generators import GENERATORS
 from synth.motion.plans import FootStep, feet_tracks, solve, standing
@@ -80,15 +79,8 @@ def test_a_step_moves_the_foot_and_lifts_it_on_the_way():
 
 def test_the_mannequin_stays_above_the_floor():
     body = mannequin(skirt=True)
-    motion = make_motion(
-        body.skeleton, (Clip(generator="walk", frames=12), Clip(generator="dance", frames=12)), fps=12.0, seed=0
-    )
+    clips = tuple(Clip(generator=name, frames=12) for name in ("walk", "dance"))
+    motion = make_motion(body.skeleton, clips, fps=12.0, seed=0)
     for transforms in skinning_transforms(body.skeleton, motion.dofs):
         posed = linear_blend_skinning(body.surface.vertices, body.skin_weights, transforms)
         assert -0.02 < posed[:, 1].min() < 0.03
-
-
-@pytest.mark.parametrize(("name", "frames"), [("moonwalk", 10), ("walk", 1), ("walk", 10**9)])
-def test_bad_clips_are_refused(name: str, frames: int):
-    with pytest.raises(InputError, match=r"moonwalk|1 frames|1000000000 frames"):
-        Clip(generator=name, frames=frames)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from ash.capture.dataset import Camera, Capture, background_path, farthest_points, image_path, pixels_path
-from ash.capture.formats import load_capture, read_cameras, write_cameras
+from ash.capture.formats import load_capture
 from ash.capture.manifest import verify_capture
 from ash.files import InputError, read_image, write_arrays
-from synth.camera.rig import held_out, make_cameras, rig_from_file
+from synth.camera.rig import held_out, make_cameras
 from synth.person.body import PARTS
 from synth.perturbation.perturb import Perturbation, miscalibrate, mistrack, perturb, through_lens
 from synth.scene import RIGS, Rig
@@ -30,10 +30,7 @@ def test_depth_and_normals_agree_with_the_geometry(capture: Capture, view: truth
     camera = capture.cameras[view.camera]
     seen = view.covered
     points, depth, normals = truth.points(capture, view), truth.depth(capture, view), truth.normals(capture, view)
-    pixels, along = camera.project(points[seen])
-    rows, columns = np.nonzero(seen)
-    assert np.abs(pixels - np.stack([columns + 0.5, rows + 0.5], axis=1)).max() < 0.02
-    np.testing.assert_allclose(depth[seen], along, rtol=1e-12)
+    np.testing.assert_allclose(depth[seen], camera.project(points[seen])[1], rtol=1e-12)
     assert not depth[~seen].any()
     np.testing.assert_allclose(np.linalg.norm(normals[seen], axis=-1), 1.0, atol=1e-9)
     towards = np.sum(normals[seen] * (camera.position - points[seen]), axis=-1)
@@ -208,20 +205,3 @@ def test_subsets_are_nested_and_spread():
     assert twelve[:4] == four and len(set(twelve)) == 12
     apart = np.linalg.norm(positions[four][:, None] - positions[four], axis=-1)[~np.eye(4, dtype=bool)]
     assert apart.min() > 0.9
-
-
-def test_own_cameras_are_taken_as_they_are(capture: Capture, tmp_path: Path):
-    path = tmp_path / "cameras.json"
-    write_cameras(path, list(capture.cameras.values()))
-    rig = rig_from_file(path, held_out=1)
-    for camera, own in zip(
-        make_cameras(rig, np.array([[0, 0.6, 0], [0, 1.4, 0]])), read_cameras(path).values(), strict=True
-    ):
-        assert camera.name == own.name
-        np.testing.assert_array_equal(camera.viewmat, own.viewmat)
-    write_cameras(path, [replace(camera, width=32 + k) for k, camera in enumerate(capture.cameras.values())])
-    with pytest.raises(InputError, match="one size"):
-        rig_from_file(path, held_out=1)
-    path.write_text('{"cameras": [{"name": "../../etc/passwd"}]}')
-    with pytest.raises(InputError, match="camera name"):
-        rig_from_file(path, held_out=1)
