@@ -139,7 +139,6 @@ def _image(camera: str, frame: int, *, split: str = "") -> str:
 def _write_model(capture: Capture, folder: Path, *, cameras: Sequence[str], frames: Sequence[int]) -> None:
     """Cameras, skeleton, template, and the poses of some frames, also as the template that the skeleton moves."""
     motion, chosen = capture.motion, list(frames)
-    transforms = skinning_transforms(capture.skeleton, motion.dofs[chosen])
     write_cameras(folder / "cameras.json", [capture.cameras[name] for name in cameras])
     write_skeleton(folder / "skeleton.json", capture.skeleton)
     write_template(folder / "template.npz", capture.template)
@@ -150,12 +149,11 @@ def _write_model(capture: Capture, folder: Path, *, cameras: Sequence[str], fram
         fps=np.array(motion.fps),
         dofs=motion.dofs[chosen],
         joints=bone_frames(capture.skeleton, motion.dofs[chosen]),
-        skinning=transforms,
+        skinning=skinning_transforms(capture.skeleton, motion.dofs[chosen]),
     )
-    rest, weights = capture.template.vertices, capture.template.skin_weights
-    for frame, moved in zip(chosen, transforms, strict=True):
-        posed = dual_quaternion_skinning(rest, weights, moved)
-        write_arrays(folder / "posed_template" / f"{frame:06d}.npz", vertices=posed.astype(np.float32))
+    for frame in chosen:
+        posed = posed_template(capture, frame).astype(np.float32)
+        write_arrays(folder / "posed_template" / f"{frame:06d}.npz", vertices=posed)
 
 
 FORMATS: dict[str, Callable[..., Path]] = {

@@ -5,6 +5,7 @@ angles count three times, as in the released skeletons, because the released cod
 """
 
 import pickle
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -180,12 +181,15 @@ def cached_arrays(capture: Capture) -> dict[str, dict[int, np.ndarray]]:
         posed = MM * np.stack([dual_quaternion_skinning(rest, weights, moved) for moved in transforms])
     transforms[..., :3, 3] *= MM
     heads = bone_frames(skeleton, motion.dofs)[:, :, :3, 3] * MM
-    result: dict[str, dict[int, np.ndarray]] = {name: {} for name in CACHED}
+    # The root slides along x, then y, then z; the three joints of a ball joint are at one point.
+    sliding = MM * (skeleton.heads[0] + np.tril(np.ones((3, 3))) * motion.dofs[:, None, :3])
+    joints = np.concatenate([sliding, np.repeat(heads, 3, axis=1)], axis=1)
+    result: dict[str, dict[int, np.ndarray]] = defaultdict(dict)
     for frame in sorted(capture.splits["train"].frames):
         window = motion.window(frame, 3)
         pieces = [blended_dual_quaternions(template.skin_weights, transforms[k]) for k in window]
         canonical = np.stack([_unpose(posed[k], *piece) for k, piece in zip(window, pieces, strict=True)])
-        result["cached_joints"][frame] = joint_places(skeleton, motion.dofs[frame], heads[frame])
+        result["cached_joints"][frame] = joints[frame]
         result["cached_ret_posed_delta"][frame] = posed[window]
         result["cached_ret_canonical_delta"][frame] = np.concatenate(
             [canonical, np.ones((*canonical.shape[:2], 1))], axis=-1
@@ -195,31 +199,12 @@ def cached_arrays(capture: Capture) -> dict[str, dict[int, np.ndarray]]:
     return result
 
 
-def joint_places(skeleton: Skeleton, dofs: np.ndarray, heads: np.ndarray) -> np.ndarray:
-    """Where every joint of `skeleton_text` is, `[3 + 3 j, 3]` millimetres: the root slides along x, then y, then z.
-
-    `heads` `[j, 3]` are where ours are; the three joints of a ball joint are at one point.
-    """
-    sliding = skeleton.heads[0] + np.tril(np.ones((3, 3))) * dofs[:3]
-    return np.concatenate([sliding * MM, np.repeat(heads, 3, axis=0)])
-
-
 def unit_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Normals `[v, 3]` as the release has them: the mean of the adjacent faces' unit normals, not weighted by area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     across = np.cross(b - a, c - a)
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
     return mean_vertex_normals(len(vertices), faces, across)
-
-
-CACHED = (
-    "cached_joints",
-    "cached_ret_posed_delta",
-    "cached_ret_canonical_delta",
-    "cached_fin_rotation_quad",
-    "cached_fin_translation_quad",
-    "cached_temp_vert_normal",
-)
 
 
 def _unpose(posed: np.ndarray, real: np.ndarray, dual: np.ndarray) -> np.ndarray:

@@ -11,9 +11,10 @@ import numpy as np
 
 from ash.capture.dataset import Camera, Capture, image_path, pixels_path
 from ash.capture.formats import load_capture, read_surface_truth, write_cameras
-from ash.files import InputError, link_or_copy, read_arrays, sha256_of, write_arrays, write_image
+from ash.files import InputError, read_arrays, write_arrays, write_image
 from synth.camera.render import Studio, probe
 from synth.camera.resampling import resample, resample_rgba
+from synth.perturbation.perturb import finish_copy
 from synth.scene import Light
 from synth.truth.pixels import surface_truth
 
@@ -41,13 +42,8 @@ def undistort(source: Path, folder: Path) -> Path:
             studio.dress(read_surface_truth(source, frame))
             write_arrays(pixels_path(folder, name, frame), **_pixel_truth(capture, pinhole, frame, studio))
             written.add(str(pixels_path(Path(), name, frame)))
-    for name in set(capture.manifest.files) - written:
-        link_or_copy(source / name, folder / name)
-    files = {
-        name: sha256_of(folder / name) if name in written else digest for name, digest in capture.manifest.files.items()
-    }
-    replace(capture.manifest, undistorted={"of": capture.identity}, files=files).write(folder)
-    return folder
+    manifest = replace(capture.manifest, undistorted={"of": capture.identity})
+    return finish_copy(source, folder, manifest, written=written, unchanged=set(manifest.files))
 
 
 def _pixel_truth(capture: Capture, pinhole: Camera, frame: int, studio: Studio) -> dict[str, np.ndarray]:

@@ -4,7 +4,6 @@ Only what a method may learn from or is told changes (training images, tracked m
 which views exist); test images, their cameras and everything under `truth/` are the original's bytes.
 """
 
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter1d
 
 from ash.capture.dataset import Camera, Capture, Motion, background_path, image_path, pixels_path, spread_cameras
 from ash.capture.formats import load_capture, write_cameras, write_motion
+from ash.capture.manifest import Manifest
 from ash.files import InputError, hash_of, link_or_copy, read_arrays, read_image, sha256_of, write_image
 from synth.camera.resampling import resample_rgba
 from synth.posing import rotvec_to_rotmat
@@ -51,13 +51,24 @@ def perturb(source: Path, folder: Path, perturbation: Perturbation, *, seed: int
     if folder.exists() and any(folder.iterdir()):
         raise InputError(f"{folder}: expected an empty folder")
     changed = _subset(capture, perturbation)
-    written = dict(_changed_files(capture, changed, folder, perturbation, seed))
-    unchanged = _unchanged_files(changed, perturbation)
-    for name in unchanged - set(written):
-        link_or_copy(source / name, folder / name)
-    files = {name: written.get(name) or capture.manifest.files[name] for name in sorted(unchanged | set(written))}
+    written = _write_changed(capture, changed, folder, perturbation, seed)
     perturbed = {"of": capture.identity, "seed": seed, **asdict(perturbation)}
-    replace(capture.manifest, splits=changed.splits, perturbed=perturbed, files=files).write(folder)
+    manifest = replace(capture.manifest, splits=changed.splits, perturbed=perturbed)
+    return finish_copy(source, folder, manifest, written=written, unchanged=_unchanged_files(changed, perturbation))
+
+
+def finish_copy(source: Path, folder: Path, manifest: Manifest, *, written: set[str], unchanged: set[str]) -> Path:
+    """Link the unchanged files of the capture `source` beside those `written` into `folder`; the manifest comes last.
+
+    `manifest`: with the hashes of the files of `source`. Returns `folder`.
+    """
+    for name in unchanged - written:
+        link_or_copy(source / name, folder / name)
+    files = {
+        name: sha256_of(folder / name) if name in written else manifest.files[name]
+        for name in sorted(unchanged | written)
+    }
+    replace(manifest, files=files).write(folder)
     return folder
 
 
@@ -67,15 +78,13 @@ def _subset(capture: Capture, perturbation: Perturbation) -> Capture:
     cameras, frames = train.cameras, train.frames
     if perturbation.cameras is not None:
         cameras = spread_cameras(capture, perturbation.cameras)
+    for count in (perturbation.frames, perturbation.first_frames):
+        if count is not None and count > len(frames):
+            raise InputError(f"perturbation: {count} frames of {len(frames)}")
     if perturbation.frames is not None:
-        if perturbation.frames > len(frames):
-            raise InputError(f"perturbation: {perturbation.frames} frames of {len(frames)}")
         chosen = np.unique(np.round(np.linspace(0, len(frames) - 1, perturbation.frames)).astype(int))
         frames = tuple(frames[k] for k in chosen)
-    if perturbation.first_frames is not None:
-        if perturbation.first_frames > len(frames):
-            raise InputError(f"perturbation: the first {perturbation.first_frames} frames of {len(frames)}")
-        frames = frames[: perturbation.first_frames]
+    frames = frames[: perturbation.first_frames]
     return replace(capture, splits={**capture.splits, "train": train.only(cameras=cameras, frames=frames)})
 
 
@@ -90,13 +99,14 @@ def _unchanged_files(capture: Capture, perturbation: Perturbation) -> set[str]:
     return {name for name in capture.manifest.files if name in shown or not name.startswith(dropped)}
 
 
-def _changed_files(
+def _write_changed(
     original: Capture, capture: Capture, folder: Path, perturbation: Perturbation, seed: int
-) -> Iterator[tuple[str, str]]:
-    """Write what changes; yields each file's name and hash."""
+) -> set[str]:
+    """Write what changes, and return the files' names."""
+    written = set()
     if perturbation.tracking_deg or perturbation.tracking_mm:
         write_motion(folder / "motion.npz", mistrack(original.motion, perturbation, seed=seed))
-        yield "motion.npz", sha256_of(folder / "motion.npz")
+        written.add("motion.npz")
     if perturbation.calibration_px:
         names = set(capture.splits["train"].cameras)
         cameras = [
@@ -104,13 +114,13 @@ def _changed_files(
             for name, camera in original.cameras.items()
         ]
         write_cameras(folder / "cameras.json", cameras)
-        yield "cameras.json", sha256_of(folder / "cameras.json")
+        written.add("cameras.json")
     drifts = perturbation.exposure_stops or perturbation.colour_stops
     if perturbation.mask_px or perturbation.lens_px or drifts or perturbation.noise_factor > 1:
         for camera, frame in capture.splits["train"].views:
-            path = image_path(folder, camera, frame)
-            write_image(path, _spoil(original, camera, frame, perturbation, seed))
-            yield str(image_path(Path(), camera, frame)), sha256_of(path)
+            write_image(image_path(folder, camera, frame), _spoil(original, camera, frame, perturbation, seed))
+            written.add(str(image_path(Path(), camera, frame)))
+    return written
 
 
 def mistrack(motion: Motion, perturbation: Perturbation, *, seed: int) -> Motion:

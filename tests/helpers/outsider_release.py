@@ -41,43 +41,59 @@ def project(points_mm, camera):
     return ((ndc + 1) * (width, height) - 1) / 2
 
 
-def read_faces(path):
-    """Triangles of an OBJ whose vertices have colours and whose faces are v/vt."""
-    faces = []
+def read_obj(path):
+    """Vertices (mm), UVs and faces `[f, 3, 2]` (vertex, UV) of an OBJ whose vertices have colours."""
+    vertices, uvs, faces = [], [], []
     for line in path.read_text().splitlines():
         kind, *rest = line.split()
         if kind == "v":
             assert len(rest) == 6, line
-        if kind == "f":
-            faces.append([int(corner.split("/")[0]) - 1 for corner in rest])
-    return np.array(faces)
+            vertices.append([float(value) for value in rest[:3]])
+        elif kind == "vt":
+            uvs.append([float(value) for value in rest])
+        elif kind == "f":
+            faces.append([[int(index) - 1 for index in corner.split("/")] for corner in rest])
+    return np.array(vertices), np.array(uvs), np.array(faces)
 
 
-def forward_kinematics(text, dofs):
-    """Where the joints of `ddc.skeleton` are, `[j, 3]` mm: one axis per joint, parameters summed from DoFs."""
-    lines = iter(text.splitlines()[1:])
-    rows = [next(lines).split() for _ in range(int(next(lines).split()[1]))]
-    names, parameters = [row[0] for row in rows], np.zeros(len(rows))
-    for _ in range(int(next(lines).split()[1])):
-        next(lines)  # markers
-    assert next(lines) == "scaling joints: 0"
-    for dof in dofs[: int(next(lines).split()[1])]:
-        entries = int(next(lines).split()[1])
-        next(lines)  # limits
-        for _ in range(entries):
-            joint, weight = next(lines).split()
-            parameters[names.index(joint)] += float(weight) * dof
-    frames = {}
-    for (name, kind, parent, *numbers), parameter in zip(rows, parameters, strict=True):
-        offset, axis, scale = np.array(numbers[:3], float), np.array(numbers[3:6], float), float(numbers[6])
-        local = np.eye(4)
-        local[:3, 3] = offset * scale + (axis * parameter if kind == "prismatic" else 0)
-        if kind == "revolute":
-            x, y, z = axis / np.linalg.norm(axis)
-            cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-            local[:3, :3] += np.sin(parameter) * cross + (1 - np.cos(parameter)) * cross @ cross
-        frames[name] = local if parent == "none" else frames[parent] @ local
-    return np.array([frames[name][:3, 3] for name in names])
+def read_motion(path):
+    """Degrees of freedom `[t, d]`, frame by frame."""
+    lines = path.read_text().splitlines()
+    assert lines[0] == "Skeletool Motion File V1.0"
+    return np.array([[float(value) for value in line.split()[1:]] for line in lines[1:]])
+
+
+class Skeletool:
+    """A reader of `ddc.skeleton` and its forward kinematics: one axis per joint, parameters summed from DoFs."""
+
+    def __init__(self, path):
+        lines = iter(path.read_text().splitlines())
+        assert next(lines).startswith("Skeletool Skeleton Definition")
+        self.rows = [next(lines).split() for _ in range(int(next(lines).removeprefix("joints: ")))]
+        self.names = [row[0] for row in self.rows]
+        assert [next(lines), next(lines)] == ["markers: 0", "scaling joints: 0"]
+        dofs = int(next(lines).removeprefix("dofs: "))
+        self.mixing = np.zeros((len(self.rows), dofs))
+        for dof in range(dofs):
+            entries = int(next(lines).split()[1])
+            assert next(lines) == "nolimits"
+            for _ in range(entries):
+                joint, weight = next(lines).split()
+                self.mixing[self.names.index(joint), dof] += float(weight)
+
+    def frames(self, dofs):
+        """Joint to world `[j, 4, 4]`, mm."""
+        frames = {}
+        for (name, kind, parent, *numbers), parameter in zip(self.rows, self.mixing @ dofs, strict=True):
+            offset, axis, scale = np.array(numbers[:3], float), np.array(numbers[3:6], float), float(numbers[6])
+            local = np.eye(4)
+            local[:3, 3] = offset * scale + (axis * parameter if kind == "prismatic" else 0)
+            if kind == "revolute":
+                x, y, z = axis / np.linalg.norm(axis)
+                cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+                local[:3, :3] += np.sin(parameter) * cross + (1 - np.cos(parameter)) * cross @ cross
+            frames[name] = local if parent == "none" else frames[parent] @ local
+        return np.array([frames[name] for name in self.names])
 
 
 def pose(canonical, real, dual):
@@ -102,12 +118,11 @@ def main(folder):
     (meta,) = (folder / "meta_data").iterdir()
     training = folder / "raw_data" / meta.name / "metadata" / "training"
     cached = {name: pickle.loads((folder / "cached_files" / f"cached_{name}.pkl").read_bytes()) for name in CACHED}
-    motion = (meta / "skeletoolToGTPose" / "poseAngles.motion").read_text().splitlines()[1:]
-    dofs = {int(line.split()[0]): np.array(line.split()[1:], float) for line in motion}
-    skeleton, faces = (meta / "ddc.skeleton").read_text(), read_faces(meta / "ddc.obj")
+    dofs = read_motion(meta / "skeletoolToGTPose" / "poseAngles.motion")
+    skeleton, faces = Skeletool(meta / "ddc.skeleton"), read_obj(meta / "ddc.obj")[2][..., 0]
     joints_mm, posed_mm, ious, offset_px = [], [], [], []
     for frame, posed in cached["ret_posed_delta"].items():
-        joints_mm.append(np.abs(forward_kinematics(skeleton, dofs[frame]) - cached["joints"][frame]).max())
+        joints_mm.append(np.abs(skeleton.frames(dofs[frame])[:, :3, 3] - cached["joints"][frame]).max())
         canonical = cached["ret_canonical_delta"][frame][0, :, :3]
         moved = pose(canonical, cached["fin_rotation_quad"][frame], cached["fin_translation_quad"][frame])
         posed_mm.append(np.abs(moved - posed[0]).max())
