@@ -22,19 +22,9 @@ CAMERAS, FRAMES, SIZE, TEXELS = 5, 6, 48, 16
 
 def tube_model_config(**changes) -> ModelConfig:
     """A model small enough for tests."""
-    settings = {
-        "texels": TEXELS,
-        "window": 2,
-        "yaw_normalise": True,
-        "width": 4,
-        "levels": 2,
-        "norm": "none",
-        "shared_trunk": True,
-        "sh_degree": 0,
-        "base": True,
-        "dilation": 0.05,
-    }
-    return ModelConfig(**(settings | changes))
+    small = {"texels": TEXELS, "window": 2, "width": 4, "levels": 2, "norm": "none", "shared_trunk": True}
+    plain = {"yaw_normalise": True, "sh_degree": 0, "base": True, "dilation": 0.05}
+    return ModelConfig(**(small | plain | changes))
 
 
 def tiny_preset(*, steps: int, warmup_steps: int) -> AshConfig:

@@ -12,18 +12,8 @@ def config(
     method: str = "ash", seed: int = 0, *, scene: str = "loose", axis: str = "", severity: float = 0.0
 ) -> CellConfig:
     """A config at size `ci`."""
-    return CellConfig(
-        scene=scene,
-        size="ci",
-        capture_seed=0,
-        capture="c" * 64,
-        method=method,
-        preset="ci",
-        seed=seed,
-        code="0",
-        axis=axis,
-        severity=severity,
-    )
+    fixed = {"size": "ci", "capture_seed": 0, "capture": "c" * 64, "preset": "ci", "code": "0"}
+    return CellConfig(scene=scene, method=method, seed=seed, axis=axis, severity=severity, **fixed)
 
 
 def cell(method: str, psnr: float, *, seed: int = 0, axis: str = "", severity: float = 0.0) -> CellResult:

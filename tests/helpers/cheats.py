@@ -6,12 +6,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-from helpers.fakes import FakeAvatar
+from helpers.fakes import FakeAvatar, install
 from PIL import Image
 
 from ash.capture.dataset import Camera, Capture, Pose
 from ash.protocol import StageClock
-from benchmarks.cell.sandbox import METHOD_PATH
 
 
 class Honest(FakeAvatar):
@@ -105,63 +104,20 @@ class Careless(FakeAvatar):
     """Draws whatever pose it is asked for."""
 
 
-def honest(capture: Capture, *, seed: int, preset: str) -> Honest:
-    return Honest(capture, detail=0.9, seed=seed)
+class OneSeed(Honest):
+    """Has the same weights whatever the seed."""
+
+    def __init__(self, capture: Capture, *, seed: int, preset: str) -> None:
+        super().__init__(capture, seed=7)
 
 
-def peeking(capture: Capture, *, seed: int, preset: str) -> Peeking:
-    return Peeking(capture, detail=0.9, seed=seed)
-
-
-def linking(capture: Capture, *, seed: int, preset: str) -> Linking:
-    return Linking(capture, detail=0.9, seed=seed)
-
-
-def unseeded(capture: Capture, *, seed: int, preset: str) -> Unseeded:
-    return Unseeded(capture, detail=0.9, seed=seed)
-
-
-def one_seed(capture: Capture, *, seed: int, preset: str) -> Honest:
-    return Honest(capture, detail=0.9, seed=7)
-
-
-def not_a_number(capture: Capture, *, seed: int, preset: str) -> NotANumber:
-    return NotANumber(capture, detail=0.9, seed=seed)
-
-
-def hoarding(capture: Capture, *, seed: int, preset: str) -> Hoarding:
-    return Hoarding(capture, detail=0.9, seed=seed)
-
-
-def mutating(capture: Capture, *, seed: int, preset: str) -> Mutating:
-    return Mutating(capture, detail=0.9, seed=seed)
-
-
-def overwriting(capture: Capture, *, seed: int, preset: str) -> Overwriting:
-    return Overwriting(capture, detail=0.9, seed=seed)
-
-
-def sleeping(capture: Capture, *, seed: int, preset: str) -> Sleeping:
-    return Sleeping(capture, detail=0.9, seed=seed)
-
-
-def careless(capture: Capture, *, seed: int, preset: str) -> Careless:
-    return Careless(capture, detail=0.9, seed=seed)
-
-
-NAMES = (
-    "honest", "peeking", "linking", "unseeded", "one_seed", "not_a_number", "hoarding", "mutating", "overwriting",
-    "sleeping", "careless",
-)  # fmt: skip
+METHODS = {
+    "honest": "Honest", "peeking": "Peeking", "linking": "Linking", "unseeded": "Unseeded", "one_seed": "OneSeed",
+    "not_a_number": "NotANumber", "hoarding": "Hoarding", "mutating": "Mutating", "overwriting": "Overwriting",
+    "sleeping": "Sleeping", "careless": "Careless",
+}  # fmt: skip
 
 
 def use(folder: Path, monkeypatch) -> None:
-    """Install the cheats for this process and for the processes of trials and cells."""
-    info = folder / "ash_bench_cheats-1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: ash-bench-cheats\nVersion: 1.0\n")
-    lines = ["[ash_bench.methods]", *(f"{name} = helpers.cheats:{name}" for name in NAMES)]
-    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
-    paths = [str(folder), str(Path(__file__).parents[1]), *filter(None, [os.environ.get(METHOD_PATH)])]
-    monkeypatch.setenv(METHOD_PATH, os.pathsep.join(paths))
-    monkeypatch.syspath_prepend(str(folder))
+    """Install the cheats."""
+    install(folder, monkeypatch, "cheats", METHODS)

@@ -6,6 +6,7 @@ The person is three textured boxes (trunk and two arms) that swing; every image 
 import os
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +24,8 @@ from ash.capture.dataset import (
     surface_path,
 )
 from ash.capture.formats import write_cameras, write_motion, write_skeleton, write_template
-from ash.capture.manifest import SCHEMA
-from ash.files import sha256_of, write_arrays, write_image, write_json
+from ash.capture.manifest import Manifest, Split, hash_files
+from ash.files import write_arrays, write_image
 from ash.protocol import StageClock
 from benchmarks.cell.sandbox import METHOD_PATH
 
@@ -98,18 +99,13 @@ def posed(dofs: np.ndarray) -> np.ndarray:
 
 def cameras() -> list[Camera]:
     """Five cameras on a ring, looking at the chest."""
+    from synth.camera.rig import look_at  # Not above: no process of a method sees synth.
+
     focal = 1.25 * SIZE
     K = np.array([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1.0]])
     found = []
     for index, angle in enumerate(np.linspace(0, 2 * np.pi, 5, endpoint=False)):
-        position = np.array([2.2 * np.sin(angle), 1.3, 2.2 * np.cos(angle)])
-        forward = np.array([0, 1.1, 0]) - position
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0, 1, 0])
-        right /= np.linalg.norm(right)
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-        viewmat[:3, 3] = -viewmat[:3, :3] @ position
+        viewmat = look_at(np.array([2.2 * np.sin(angle), 1.3, 2.2 * np.cos(angle)]), np.array([0, 1.1, 0]))
         found.append(Camera(name=f"cam{index}", width=SIZE, height=SIZE, K=K, viewmat=viewmat))
     return found
 
@@ -157,22 +153,22 @@ def write_capture(folder: Path) -> Path:
         write_arrays(pixels_path(folder, camera.name, frame), noise=noise, **nothing)
     for frame in range(len(truth)):
         write_arrays(surface_path(folder, frame), vertices=truth[frame])
-    held_out = [camera.name for camera in rig[3:]]
+    shown, held_out = (tuple(camera.name for camera in some) for some in (rig[:3], rig[3:]))
     splits = {
-        "train": {"cameras": [camera.name for camera in rig[:3]], "frames": list(train)},
-        "novel_view": {"cameras": held_out, "frames": list(train)},
-        "novel_pose": {"cameras": held_out, "frames": list(test)},
+        "train": Split(cameras=shown, frames=tuple(train)),
+        "novel_view": Split(cameras=held_out, frames=tuple(train)),
+        "novel_pose": Split(cameras=held_out, frames=tuple(test)),
     }
-    files = {str(p.relative_to(folder)): sha256_of(p) for p in sorted(folder.rglob("*")) if p.is_file()}
-    manifest = {"schema": SCHEMA, "scene": "boxes", "seed": 0, "splits": splits, "files": files, "complete": True}
-    write_json(folder / "manifest.json", manifest)
+    Manifest(scene="boxes", seed=0, splits=splits, files=hash_files(folder)).write(folder)
     return folder
 
 
 class FakeAvatar:
     """Draws the boxes; `detail` is how much of the stripes it has learned, `shift_m` how far its template is off."""
 
-    def __init__(self, capture: Capture, *, detail: float, shift_m: float = 0.0, seed: int = 0) -> None:
+    def __init__(
+        self, capture: Capture, *, detail: float = 0.9, shift_m: float = 0.0, seed: int = 0, preset: str = ""
+    ) -> None:
         rng = np.random.default_rng(seed)
         self.weights = np.array([detail + 0.02 * rng.standard_normal(), shift_m])
 
@@ -209,9 +205,11 @@ class FakeAvatar:
 
 
 class Broken(FakeAvatar):
-    """Fails in the way its name says."""
+    """Fails in the way that `failure` says."""
 
-    failure = ""
+    def __init__(self, capture: Capture, *, failure: str, **settings) -> None:
+        super().__init__(capture, detail=0.5, **settings)
+        self.failure = failure
 
     def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
         image = super().render(pose, camera, clock=clock)
@@ -230,12 +228,10 @@ class Broken(FakeAvatar):
         return image
 
 
-def good(capture: Capture, *, seed: int, preset: str) -> FakeAvatar:
-    return FakeAvatar(capture, detail=0.9, seed=seed)
-
-
-def bad(capture: Capture, *, seed: int, preset: str) -> FakeAvatar:
-    return FakeAvatar(capture, detail=0.2, shift_m=0.02, seed=seed)
+good, bad = FakeAvatar, partial(FakeAvatar, detail=0.2, shift_m=0.02)
+nan, raising, dying, sleeping, growing = (
+    partial(Broken, failure=failure) for failure in ("nan", "raise", "die", "sleep", "grow")
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -282,34 +278,12 @@ class TellsGpus(FakeAvatar):
 
 
 def placed(capture: Capture, *, seed: int, preset: str, config: Placed | None = None) -> FakeAvatar:
-    return TellsGpus(capture, detail=0.9, seed=seed)
+    return TellsGpus(capture, seed=seed)
 
 
 placed.config = lambda preset: Placed()
 
-
-def broken(failure: str):
-    def make(capture: Capture, *, seed: int, preset: str) -> Broken:
-        avatar = Broken(capture, detail=0.5, seed=seed)
-        avatar.failure = failure
-        return avatar
-
-    return make
-
-
-nan, raising, dying, sleeping, growing = (broken(failure) for failure in ("nan", "raise", "die", "sleep", "grow"))
-
 METHODS = ("good", "tuned", "placed", "bad", "nan", "raising", "dying", "sleeping", "growing")
-
-
-def install(folder: Path) -> Path:
-    """Register the fake methods as an installed package would: an entry-point file in a folder on the path."""
-    info = folder / "ash_bench_fakes-1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: ash-bench-fakes\nVersion: 1.0\n")
-    lines = ["[ash_bench.methods]", *(f"fake_{name} = helpers.fakes:{name}" for name in METHODS)]
-    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
-    return folder
 
 
 def write_suite(folder: Path, capture: Path, *methods: str, name: str = "boxes", preset: str = "ci") -> Path:
@@ -328,10 +302,18 @@ def write_suite(folder: Path, capture: Path, *methods: str, name: str = "boxes",
 
 
 def use(folder: Path, monkeypatch) -> None:
-    """Install the fake methods for this process and for the processes of cells."""
-    install(folder)
-    here = str(Path(__file__).parents[1])
-    paths = [str(folder), here, *filter(None, [os.environ.get(METHOD_PATH)])]
+    """Install the fake methods."""
+    install(folder, monkeypatch, "fakes", {f"fake_{name}": name for name in METHODS})
+
+
+def install(folder: Path, monkeypatch, module: str, factories: dict[str, str]) -> None:
+    """Register factories of a helper as methods, as an installed distribution does: here and in processes of cells."""
+    info = folder / f"ash_bench_{module}-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: ash-bench-{module}\nVersion: 1.0\n")
+    lines = [f"{name} = helpers.{module}:{factory}\n" for name, factory in factories.items()]
+    (info / "entry_points.txt").write_text("[ash_bench.methods]\n" + "".join(lines))
+    paths = [str(folder), str(Path(__file__).parents[1]), *filter(None, [os.environ.get(METHOD_PATH)])]
     monkeypatch.setenv(METHOD_PATH, os.pathsep.join(paths))
     monkeypatch.syspath_prepend(str(folder))
 

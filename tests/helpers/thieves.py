@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +88,11 @@ class Thief(FakeAvatar):
 class Slow(FakeAvatar):
     """Draws in 30 ms and says that it took three."""
 
+    def __init__(self, capture: Capture, **settings) -> None:
+        super().__init__(capture, **settings)
+        real = time.perf_counter
+        time.perf_counter = lambda: real() / 10
+
     def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
         start = time.monotonic()
         while time.monotonic() - start < 0.03:
@@ -94,23 +100,22 @@ class Slow(FakeAvatar):
         return super().render(pose, camera, clock=clock)
 
 
-class Memoises(FakeAvatar):
-    """Draws in 30 ms, and a picture that it drew before in no time."""
+class PreparesElsewhere(FakeAvatar):
+    """Works half a second in the factory, in `save` and when it is asked what it is, and nothing in `fit`.
+
+    Draws in 30 ms, and a picture that it drew before in no time.
+    """
+
+    def __init__(self, capture: Capture, **settings) -> None:
+        super().__init__(capture, **settings)
+        self.drawn: dict[tuple[str, int], np.ndarray] = {}
+        _work(0.5)
 
     def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
-        drawn = self.__dict__.setdefault("drawn", {})
-        if (camera.name, pose.frame) not in drawn:
+        if (camera.name, pose.frame) not in self.drawn:
             time.sleep(0.03)
-            drawn[camera.name, pose.frame] = super().render(pose, camera, clock=clock)
-        return drawn[camera.name, pose.frame]
-
-
-class PreparesElsewhere(FakeAvatar):
-    """Works half a second in the factory, in `save` and when it is asked what it is, and nothing in `fit`."""
-
-    def __init__(self, capture: Capture, **settings: float) -> None:
-        super().__init__(capture, **settings)
-        _work(0.5)
+            self.drawn[camera.name, pose.frame] = super().render(pose, camera, clock=clock)
+        return self.drawn[camera.name, pose.frame]
 
     def save(self, path: Path) -> None:
         _work(0.5)
@@ -151,28 +156,6 @@ def _files(folder: Path) -> dict[str, int]:
     return {str(p.relative_to(folder)): p.stat().st_mtime_ns for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def warps(capture: Capture, *, seed: int, preset: str) -> Warps:
-    return Warps(capture, detail=0.9, seed=seed)
-
-
-def memoises(capture: Capture, *, seed: int, preset: str) -> Memoises:
-    return Memoises(capture, detail=0.9, seed=seed)
-
-
-def prepares_elsewhere(capture: Capture, *, seed: int, preset: str) -> PreparesElsewhere:
-    return PreparesElsewhere(capture, detail=0.9, seed=seed)
-
-
-def thief(capture: Capture, *, seed: int, preset: str) -> Thief:
-    return Thief(capture, detail=0.9, seed=seed)
-
-
-def clock(capture: Capture, *, seed: int, preset: str) -> Slow:
-    real = time.perf_counter
-    time.perf_counter = lambda: real() / 10
-    return Slow(capture, detail=0.9, seed=seed)
-
-
 class Screen:
     """A display that draws what the avatar draws, or a black picture in no time."""
 
@@ -191,7 +174,9 @@ class Screen:
 class Shown(FakeAvatar):
     """Has a display of its own; `how` says which."""
 
-    how = ""
+    def __init__(self, capture: Capture, *, how: str, **settings) -> None:
+        super().__init__(capture, **settings)
+        self.how = how
 
     def open_display(self) -> Screen:
         if self.how == "screenless":
@@ -200,9 +185,11 @@ class Shown(FakeAvatar):
 
 
 class Ends(FakeAvatar):
-    """Ends in the way its name says."""
+    """Ends in the way that `how` says."""
 
-    how = ""
+    def __init__(self, capture: Capture, *, how: str, **settings) -> None:
+        super().__init__(capture, **settings)
+        self.how = how
 
     def fit(self, capture: Capture, *, folder: Path) -> None:
         super().fit(capture, folder=folder)
@@ -212,18 +199,15 @@ class Ends(FakeAvatar):
             case "exit_0":
                 (folder / "result.json").write_text("{}")
                 os._exit(0)
-            case "exit_130":
-                sys.exit(130)
             case "os_error":
                 raise OSError(28, "No space left on device", "/nowhere")
             case "input_error":
                 raise InputError("the method's own refusal")
             case "keyboard":
                 raise KeyboardInterrupt
-            case "leaves":
+            case "loud":
                 program = "import os, time; os.setsid(); open('/dev/shm/x', 'w'); time.sleep(600)"
                 subprocess.Popen([sys.executable, "-c", program, "left-behind-by-a-method"], start_new_session=True)
-            case "loud":
                 for _ in range(300):
                     print("x" * (1 << 16), flush=True)
                 print("last words", flush=True)
@@ -256,30 +240,14 @@ class Ends(FakeAvatar):
                 (folder / "waits").touch()
                 time.sleep(600)
 
-    def render(self, pose: Pose, camera: Camera, *, clock: StageClock) -> np.ndarray:
-        image = super().render(pose, camera, clock=clock)
-        return (image * 255).astype(np.uint8) if self.how == "bytes" else image * 255 if self.how == "units" else image
-
-    def parameter_count(self) -> int:
-        return -5 if self.how == "negative" else 2
-
 
 HOW = (
-    "exit_2", "exit_0", "exit_130", "os_error", "input_error", "keyboard", "leaves", "loud", "waits", "bytes",
-    "units", "negative", "resumes", "sleeps", "spoils", "works", "overwrites", "fills", "forks",
+    "exit_2", "exit_0", "os_error", "input_error", "keyboard", "loud", "waits", "resumes", "sleeps", "spoils", "works",
+    "overwrites", "fills", "forks",
 )  # fmt: skip
-
-
 SHOWN = ("shown", "decoy", "screenless")
-
-
-def _does(kind: type[Ends] | type[Shown], how: str):
-    def make(capture: Capture, *, seed: int, preset: str) -> FakeAvatar:
-        avatar = kind(capture, detail=0.9, seed=seed)
-        avatar.how = how
-        return avatar
-
-    return make
-
-
-globals().update({how: _does(kind, how) for kind, hows in ((Ends, HOW), (Shown, SHOWN)) for how in hows})
+METHODS = {
+    "thief": "Thief", "clock": "Slow", "warps": "Warps", "prepares_elsewhere": "PreparesElsewhere",
+    **{how: how for how in (*HOW, *SHOWN)},
+}  # fmt: skip
+globals().update({how: partial(kind, how=how) for kind, hows in ((Ends, HOW), (Shown, SHOWN)) for how in hows})

@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 from helpers import fakes, thieves
@@ -20,7 +21,8 @@ from ash.files import InputError, sha256_of
 from benchmarks.cell import sandbox, worker
 from benchmarks.cell.registry import find_method
 from benchmarks.cell.sandbox import seen_by_method
-from benchmarks.cell.schema import Cell, MethodFailed, failed_result, read_result, result_of, write_result
+from benchmarks.cell.schema import Cell, MethodFailed, View, failed_result, read_result, result_of, write_result
+from benchmarks.suites import engine
 from benchmarks.suites.engine import Limits, make_executor, plan_cells, run_cells
 from benchmarks.suites.progress import Progress
 from benchmarks.suites.runs import cell_for
@@ -28,15 +30,11 @@ from benchmarks.suites.suites import CaptureSpec, CellSpec
 
 LIMITS = Limits(seconds=300.0, memory_mb=4096)
 BOTH_WAYS = pytest.mark.both_ways  # Sets isolation itself, so that a kernel without namespaces changes nothing.
-METHODS = ("thief", "clock", "warps", "memoises", "prepares_elsewhere", *thieves.HOW, *thieves.SHOWN)
-ENDS = {  # how a method ends: status and reason of its cell
-    "exit_2": ("crashed", "exit code 2"), "exit_0": ("crashed", "exit code 0"),
-    "os_error": ("crashed", "No space left"), "input_error": ("crashed", "own refusal"),
-    "keyboard": ("crashed", "KeyboardInterrupt"), "exit_130": ("crashed", "SystemExit"),
-    "bytes": ("crashed", "expected an image float32"), "units": ("crashed", "expected 0 to 1"),
-    "negative": ("crashed", "expected a whole number"),
+ENDS = {  # how a method ends: the reason that its cell crashed
+    "exit_2": "exit code 2", "exit_0": "exit code 0", "os_error": "No space left", "input_error": "own refusal",
+    "keyboard": "KeyboardInterrupt",
 }  # fmt: skip
-ALONE = ("sleeps", "works", "clock", "memoises", "prepares_elsewhere", "loud", "leaves", *thieves.SHOWN, *ENDS)
+ALONE = ("sleeps", "works", "clock", "prepares_elsewhere", "loud", *thieves.SHOWN, *ENDS)
 
 
 @pytest.fixture
@@ -53,11 +51,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Fakes and thieves, as two installed distributions."""
     fakes.use(folder, monkeypatch)
-    info = folder / "ash_bench_thieves-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: ash-bench-thieves\nVersion: 1.0\n")
-    lines = ["[ash_bench.methods]", *(f"{name} = helpers.thieves:{name}" for name in METHODS)]
-    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    fakes.install(folder, monkeypatch, "thieves", thieves.METHODS)
 
 
 @pytest.fixture(scope="session")
@@ -164,14 +158,11 @@ def test_a_slow_clock_gains_nothing_and_a_busy_machine_ends_no_cell() -> None:
             worker.frame_times_ms(frames(way))
 
 
-def test_a_picture_that_was_drawn_before_is_not_timed(ran: Callable[[str], Cell]) -> None:
-    result = result_of(ran("memoises"))
-    assert result.status == "done" and min(result.timing.frame_ms) > 29, result
-
-
-def test_all_work_before_the_first_picture_is_training(ran: Callable[[str], Cell]) -> None:
+def test_all_work_before_the_first_picture_is_training_and_one_drawn_before_is_not_timed(
+    ran: Callable[[str], Cell],
+) -> None:
     result = result_of(ran("prepares_elsewhere"))
-    assert result.status == "done", result.reason
+    assert result.status == "done" and min(result.timing.frame_ms) > 29, result
     assert result.value("speed", "", "train_s") > 1.5 and result.value("speed", "", "train_cpu_s") > 1.4
 
 
@@ -185,28 +176,28 @@ def test_a_result_that_another_cell_changed_is_made_again(
     before = result_of(honest)
     lines = run([honest, cheat])
     again = result_of(honest)
-    assert result_of(cheat).status == "done" and [v.prediction for v in again.views] == [
-        v.prediction for v in before.views
-    ]
+    assert result_of(cheat).status == "done"
+    assert [view.prediction for view in again.views] == [view.prediction for view in before.views]
     assert ("its result was changed while another cell ran" in lines) == (sandbox.problem() is not None)
 
 
-@BOTH_WAYS
 def test_methods_that_change_each_other_s_results_end_the_run(
-    own_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(sandbox.ISOLATION, "off")
-    one, other = cell("overwrites", own_capture, tmp_path), cell("overwrites", own_capture, tmp_path, seed=1)
+    cells = [cell("overwrites", capture, tmp_path, seed=seed) for seed in (0, 1)]
+
+    def overwrite(folder: str, *_) -> str:
+        time.sleep(1)  # The run looks at what has finished before.
+        for each in cells:
+            write_result(each.folder, failed_result(each.config, "crashed", f"by {folder} at {time.monotonic()}"))
+        return "done"
+
+    monkeypatch.setattr(engine, "run_in_process", overwrite)
     with pytest.raises(InputError, match="its result was changed by other cells 2 times"):
-        run([one, other], workers=1)
+        run(cells, workers=1)
 
 
-@BOTH_WAYS
-@pytest.mark.parametrize("way", ["on", "off"])
-def test_a_method_s_folder_has_a_limit(
-    way: str, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(sandbox.ISOLATION, way)
+def test_a_method_s_folder_has_a_limit(capture: Path, tmp_path: Path) -> None:
     cheat = cell("fills", capture, tmp_path)
     run([cheat], replace(LIMITS, disk_mb=100))
     result = result_of(cheat)
@@ -241,8 +232,33 @@ def test_a_display_that_shows_something_else_fails_its_cell(ran: Callable[[str],
 
 @pytest.mark.parametrize("how", ENDS)
 def test_however_a_method_ends_its_cell_has_a_result(how: str, ran: Callable[[str], Cell]) -> None:
-    (status, reason), result = ENDS[how], result_of(ran(how))
-    assert result is not None and result.status == status and reason in result.reason, result.reason
+    result = result_of(ran(how))
+    assert result is not None and result.status == "crashed" and ENDS[how] in result.reason, result.reason
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((64, 64, 4), np.uint8), "expected an image float32"),
+        (np.zeros((64, 64, 3), np.float32), "expected an image float32"),
+        (np.full((64, 64, 4), 255, np.float32), "expected 0 to 1"),
+    ],
+)
+def test_a_picture_of_another_type_or_shape_or_in_other_units_is_refused(
+    image: np.ndarray, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answer = {"dtype": image.dtype.str, "shape": list(image.shape)}, image.tobytes()
+    monkeypatch.setattr(worker.MethodClient, "_ask", lambda *_, **__: answer)
+    client = worker.MethodClient(None, 0, 0, isolated=False)
+    with pytest.raises(MethodFailed, match=message):
+        client.draw(View(split="novel_view", camera="cam0", frame=0), fakes.cameras()[0])
+
+
+@pytest.mark.parametrize("count", [-5, 2.0, True, "two"])
+def test_a_count_that_is_none_is_refused(count: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker.MethodClient, "_ask", lambda *_, **__: ({"params": count, "gaussians": 1}, b""))
+    with pytest.raises(MethodFailed, match=r"params: .*expected a whole number"):
+        worker.MethodClient(None, 0, 0, isolated=False).describe()
 
 
 @BOTH_WAYS
@@ -276,16 +292,15 @@ def _kill_when_it_waits(sign: Path, *, times: int) -> int:
 
 
 def test_printing_is_bounded_and_processes_end_with_their_cell(ran: Callable[[str], Cell]) -> None:
-    loud, leaves = ran("loud"), ran("leaves")
+    loud = ran("loud")
     log = loud.folder / "output.log"
     assert log.stat().st_size < 2 << 20 and "last words" in log.read_text() and "bytes left out" in log.read_text()
     deadline = time.monotonic() + 10
     while left := _left_behind():
         assert time.monotonic() < deadline, left
         time.sleep(0.1)
-    for each in (loud, leaves):
-        result = read_result(each.folder)
-        assert result is not None and result.status == "done", result.reason
+    result = read_result(loud.folder)
+    assert result is not None and result.status == "done", result.reason
 
 
 def test_isolation_costs_a_cell_at_most_half_a_second(
@@ -304,13 +319,13 @@ def test_isolation_costs_a_cell_at_most_half_a_second(
                     pytest.skip("this kernel gives no namespaces")
             return time.perf_counter() - start
 
-    isolated, exposed = (min(times) for times in zip(*((seconds("on"), seconds("off")) for _ in range(5)), strict=True))
+    isolated, exposed = (min(times) for times in zip(*((seconds("on"), seconds("off")) for _ in range(3)), strict=True))
     print(f"isolated {isolated:.3f} s, not isolated {exposed:.3f} s")
     assert isolated - exposed < 0.5
 
 
 @BOTH_WAYS
-@pytest.mark.parametrize(("seeded", "way"), [(True, "on"), (True, "off"), (False, "on")])
+@pytest.mark.parametrize(("seeded", "way"), [(True, "on"), (False, "off")])
 def test_kernels_are_compiled_once_and_every_cell_has_its_own_copy(
     seeded: bool, way: str, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

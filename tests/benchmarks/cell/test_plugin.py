@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import cli
 from benchmarks.cell.sandbox import METHOD_PATH
 from benchmarks.cell.schema import read_result
 
@@ -14,8 +15,8 @@ PACKAGE = Path(__file__).parents[2] / "helpers" / "plugin"
 
 
 @pytest.fixture(scope="module")
-def environment(tmp_path_factory) -> dict[str, str]:
-    """The example package, installed offline into a folder on the path."""
+def site(tmp_path_factory) -> Path:
+    """The example package, installed offline into a folder."""
     pytest.importorskip("setuptools", reason="building the example package needs setuptools")
     folder = tmp_path_factory.mktemp("plugin")
     source, target = folder / "source", folder / "site"
@@ -26,12 +27,14 @@ def environment(tmp_path_factory) -> dict[str, str]:
     command = [sys.executable, "-m", "pip", "install", *options, "--target", str(target), str(source)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    return {**os.environ, METHOD_PATH: str(target), "OMP_NUM_THREADS": "1"}
+    return target
 
 
-def ash_bench(*arguments: str, environment: dict[str, str], folder: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "benchmarks.cli", *arguments]
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+@pytest.fixture
+def on_the_path(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(METHOD_PATH, os.pathsep.join([str(site), *filter(None, [os.environ.get(METHOD_PATH)])]))
+    monkeypatch.syspath_prepend(str(site))
+    monkeypatch.chdir(tmp_path)
 
 
 def test_the_example_is_short_enough_to_be_an_example() -> None:
@@ -40,18 +43,15 @@ def test_the_example_is_short_enough_to_be_an_example() -> None:
     assert len([line for line in method if line.strip()]) <= 50
 
 
-def test_the_example_keeps_all_rules(capture: Path, environment: dict[str, str], tmp_path: Path) -> None:
-    done = ash_bench("check-method", "painted", "--capture", str(capture), environment=environment, folder=tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "all rules kept" in done.stdout
+@pytest.mark.usefixtures("on_the_path")
+def test_the_example_keeps_all_rules(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check-method", "painted", "--capture", str(capture)]) == cli.DONE
+    assert "all rules kept" in capsys.readouterr().out
 
 
-def test_the_example_is_trained_and_scored_like_ours(
-    capture: Path, environment: dict[str, str], tmp_path: Path
-) -> None:
-    train = ["train", "painted", str(capture), "--preset", "ci", "--out", "runs"]
-    done = ash_bench(*train, environment=environment, folder=tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
+@pytest.mark.usefixtures("on_the_path")
+def test_the_example_is_trained_and_scored_like_ours(capture: Path, tmp_path: Path) -> None:
+    assert cli.main(["train", "painted", str(capture), "--preset", "ci", "--out", "runs"]) == cli.DONE
     (cell,) = (tmp_path / "runs" / "cells").iterdir()
     result = read_result(cell)
     assert result is not None and result.status == "done"

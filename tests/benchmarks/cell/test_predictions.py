@@ -21,7 +21,7 @@ from benchmarks.cell.schema import Cell, CellResult, prediction_path, read_cell,
 from benchmarks.suites.archive import write_archive
 from benchmarks.suites.runs import read_run
 
-pytestmark = pytest.mark.usefixtures("installed_fakes")
+pytestmark = pytest.mark.usefixtures("installed_fakes", "scored_once")
 
 
 @pytest.fixture(scope="session")

@@ -3,14 +3,15 @@ from dataclasses import replace
 import pytest
 from helpers.captures import write_tube_capture
 
+from ash.capture.formats import load_capture
 from ash.capture.manifest import Split
 from benchmarks.cell.evaluation import evaluated_views, playback
 from benchmarks.cell.schema import View
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return write_tube_capture(tmp_path_factory.mktemp("tube"))
+def capture(shared):
+    return load_capture(shared("tube_capture", write_tube_capture))
 
 
 def test_near_and_far_motion_is_scored_where_a_capture_has_it_and_changes_nothing_else(capture):
