@@ -34,19 +34,6 @@ def commit(root: Path | None = None) -> str:
     return revision + ("+" if changed else "") if revision else "unknown"
 
 
-def changed_since(revision: str) -> tuple[str, ...] | None:
-    """Files of the checkout that differ from a commit, new ones too; None where git cannot tell."""
-    root = Path(__file__).parent.parent
-    known = revision.rstrip("+")
-    if not (root / ".git").exists() or shutil.which("git") is None or not known.isalnum():
-        return None
-    if not _git(root, "rev-parse", "--verify", "--quiet", f"{known}^{{commit}}"):
-        return None
-    changed = _git(root, "diff", "--name-only", known, "--")
-    added = _git(root, "ls-files", "--others", "--exclude-standard")
-    return tuple(sorted({*changed.splitlines(), *added.splitlines()}))
-
-
 def machine() -> dict[str, str]:
     """Processor, cores, memory, operating system, GPU."""
     facts = {

@@ -43,6 +43,7 @@ CONTROL_SCENES = {
 }
 ZERO_STRENGTH = "skinned"  # equal to every factor scene of strength 0
 STRENGTHS = {"_half": 0.5, "": 1.0, "_twice": 2.0}  # by the ending of a scene's name
+OTHER_STRENGTHS = frozenset(f"{factor}{end}" for factor in FACTORS for end in STRENGTHS if end)  # scenes
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -73,11 +74,6 @@ class AblationEffect:
         return f"{self.mean:+z.2f} dB{interval}"
 
 
-def is_strength(scene: str) -> bool:
-    """Whether a scene is a factor scene at another strength than 1."""
-    return any(scene == f"{factor}{end}" for factor in FACTORS for end, strength in STRENGTHS.items() if strength != 1)
-
-
 def effects(table: pd.DataFrame, split: str) -> list[AblationEffect]:
     """All cells of a split, from `differences`; components that scenes need first."""
     cells = []
@@ -95,8 +91,8 @@ def effects(table: pd.DataFrame, split: str) -> list[AblationEffect]:
 
 def matrix(tables: RunTables, table: pd.DataFrame, split: str) -> list[AblationEffect]:
     """The cells of the matrix; none of fewer than two scenes or without an ablation."""
-    cells = [effect for effect in effects(table, split) if not is_strength(effect.scene)]
-    scenes = [scene for scene in tables.scenes if REFERENCE in tables.methods(scene) and not is_strength(scene)]
+    cells = [effect for effect in effects(table, split) if effect.scene not in OTHER_STRENGTHS]
+    scenes = [scene for scene in {*tables.scenes} - OTHER_STRENGTHS if REFERENCE in tables.methods(scene)]
     return cells if len(scenes) > 1 and any(effect.row != "ddc" for effect in cells) else []
 
 

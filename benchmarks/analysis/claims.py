@@ -95,27 +95,24 @@ def judge(claims: Sequence[Claim], runs: Mapping[str, pd.DataFrame]) -> pd.DataF
     tests = iter(corrected([test for _, _, test, _, _ in asked if test is not None]))
     records = []
     for claim, scene, test, missing, run in asked:
-        test = None if test is None else next(tests)
-        verdict, because = (
-            ("cannot be judged here", missing)
-            if test is None
-            else _verdict(claim, scene, test, _short_of_plateau(claim, scene, runs[run]))
-        )
-        records.append(
-            {
-                "name": claim.name,
-                "scene": scene,
-                "says": claim.says,
-                "where": claim.where,
-                "contrast": f"{claim.a} - {claim.b}" if claim.a else "",
-                "paper": claim.paper.get(scene),
-                **_numbers(test),
-                "unit": METRICS[claim.metric].unit,
-                "verdict": verdict,
-                "because": because,
-                "run": run,
-            }
-        )
+        record: dict[str, Any] = {
+            "name": claim.name,
+            "scene": scene,
+            "says": claim.says,
+            "where": claim.where,
+            "contrast": f"{claim.a} - {claim.b}" if claim.a else "",
+            "paper": claim.paper.get(scene),
+            "unit": METRICS[claim.metric].unit,
+            "verdict": "cannot be judged here",
+            "because": missing,
+            "run": run,
+        }
+        if test is not None:
+            test = next(tests)
+            record |= {"effect": test.mean, "low": test.low, "high": test.high, "p": test.p, "people": test.captures}
+            short = _short_of_plateau(claim, scene, runs[run])
+            record["verdict"], record["because"] = _verdict(claim, scene, test, short)
+        records.append(record)
     return pd.DataFrame(records, columns=COLUMNS)
 
 
@@ -161,12 +158,6 @@ def _short_of_plateau(claim: Claim, scene: str, rows: pd.DataFrame) -> str:
     ended = rows[(rows["scene"] == scene) & (rows["metric"] == "plateau") & (rows["value"] < 1)]
     short = [style_of(row).title for row in (claim.a, claim.b) if (ended["method"] == row).any()]
     return f"not at their plateau when training ended: {', '.join(short)}" if short else ""
-
-
-def _numbers(test: Comparison | None) -> dict[str, Any]:
-    if test is None:
-        return dict.fromkeys(("effect", "low", "high", "p", "people"))
-    return {"effect": test.mean, "low": test.low, "high": test.high, "p": test.p, "people": test.captures}
 
 
 def _verdict(claim: Claim, scene: str, test: Comparison, short: str) -> tuple[Verdict, str]:

@@ -20,7 +20,7 @@ NARROW_DEG = 1.0  # Motion that stays within it makes no curve.
 
 
 def _table(rows: list[tuple], *columns: str) -> pd.DataFrame:
-    return pd.DataFrame(rows, columns=[*columns, "psnr", "low", "high"]).astype({"low": float, "high": float})
+    return pd.DataFrame(rows, columns=[*columns, "psnr", "low", "high"])
 
 
 def time_to_quality(snapshots: pd.DataFrame) -> pd.DataFrame:
@@ -35,8 +35,8 @@ def time_to_quality(snapshots: pd.DataFrame) -> pd.DataFrame:
             for mark in marks:
                 scores = runs.groupby(["capture", "seed"]).apply(_score_at, mark, include_groups=False)
                 if scores.notna().all():
-                    interval = mean_interval(independent(scores.groupby("capture").agg(list).to_dict()))
-                    rows.append((scene, split, method, mark, interval.mean, interval.low, interval.high))
+                    values = independent(scores.groupby("capture").agg(list).to_dict())
+                    rows.append((scene, split, method, mark, *mean_interval(values)))
     return _table(rows, "scene", "split", "method", "seconds")
 
 
@@ -56,28 +56,27 @@ def crossings(table: pd.DataFrame) -> list[str]:
         wide = here.pivot(index="seconds", columns="method", values="psnr")
         for first, second in combinations(dict.fromkeys(here["method"]), 2):
             lead = (wide[first] - wide[second]).dropna()
-            names = {1: (first, second), -1: (second, first)}
             where = f"On {scene}, {SPLIT_NAMES[split].words}, "
-
-            def pair(sign: int, names: dict[int, tuple[str, str]] = names) -> str:
-                return " is ahead of ".join(style_of(name).title for name in names[sign])
-
-            for seconds, sign in _sign_changes(lead):
-                crossed.append(f"{where}{pair(sign)} from {seconds:.0f} s of training on.")
+            for seconds, value in _sign_changes(lead):
+                crossed.append(f"{where}{_ahead(first, second, value)} from {seconds:.0f} s of training on.")
             if len(lead) and ((lead > 0).all() or (lead < 0).all()):
-                least, most = abs(lead).min(), abs(lead).max()
-                sign = 1 if lead.iloc[0] > 0 else -1
-                never.append(f"{where}{pair(sign)} at every time, by {least:.1f} to {most:.1f} dB.")
+                span = f"{abs(lead).min():.1f} to {abs(lead).max():.1f}"
+                never.append(f"{where}{_ahead(first, second, lead.iloc[0])} at every time, by {span} dB.")
     return crossed + never
 
 
-def _sign_changes(lead: pd.Series) -> Iterator[tuple[float, int]]:
-    """Seconds at which a lead passes through zero, and its sign from there on."""
+def _ahead(first: str, second: str, lead: float) -> str:
+    names = (first, second) if lead > 0 else (second, first)
+    return " is ahead of ".join(style_of(name).title for name in names)
+
+
+def _sign_changes(lead: pd.Series) -> Iterator[tuple[float, float]]:
+    """Seconds at which a lead passes through zero, and the lead after them."""
     points = [(float(seconds), float(value)) for seconds, value in lead.items() if value != 0]
     for (before, low), (after, high) in pairwise(points):
         if low * high < 0:
             share = low / (low - high)
-            yield float(np.exp((1 - share) * np.log(before) + share * np.log(after))), int(np.sign(high))
+            yield float(np.exp((1 - share) * np.log(before) + share * np.log(after))), high
 
 
 def data_scaling(rows: pd.DataFrame) -> pd.DataFrame:
@@ -90,9 +89,8 @@ def data_scaling(rows: pd.DataFrame) -> pd.DataFrame:
         counts = here[here["metric"] == "train_frames"].groupby("method")["value"].max()
         for split in HELD_OUT_SPLITS:
             for method, samples in samples_of(here, foreground(split)).items():
-                interval = mean_interval(independent(samples))
                 frames = int(counts.get(method, FOOTAGE_FRAMES - severity))
-                records.append((scene, split, method, frames, interval.mean, interval.low, interval.high))
+                records.append((scene, split, method, frames, *mean_interval(independent(samples))))
     table = _table(records, "scene", "split", "method", "frames")
     order = table["split"].map(HELD_OUT_SPLITS.index)
     return table.assign(order=order).sort_values(["scene", "order", "method", "frames"]).drop(columns="order")
@@ -154,7 +152,7 @@ def _novelty_of(scene: str, images: pd.DataFrame) -> Iterator[tuple]:
             for method, seeds in here.groupby("method", sort=False)
         }
         for method, interval in intervals(samples).items():
-            yield scene, method, float(mean_deg), interval.mean, interval.low, interval.high
+            yield scene, method, float(mean_deg), *interval
 
 
 def losses_by_novelty(table: pd.DataFrame) -> list[str]:

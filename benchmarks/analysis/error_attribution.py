@@ -5,7 +5,6 @@ edge, surface that no training view shows, surface at a grazing angle, the rest.
 holds the largest share of the squared error among those where errors are denser than on average.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -32,39 +31,14 @@ VISIBILITY_FRAMES = 10  # training frames; a triangle hidden in all of them coun
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Share:
-    """A region's share of the pixels and of the squared error, 0..1."""
-
-    region: str
-    pixels: float
-    error: float
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class ErrorAttribution:
-    """A bad frame: its regions, the pose's distance to the nearest training pose, and where that ranks in its split."""
+    """A bad frame and its regions."""
 
     view: ViewScore
-    shares: tuple[Share, ...]
-    novelty_deg: float  # mean over joints
-    novelty_rank: float  # 0: the most ordinary pose of the split, 1: the most novel
+    explanation: str  # one line for a reader
     map: np.ndarray  # [h, w] index into REGIONS, -1: background
     truth: np.ndarray  # [h, w, 4] uint8 on black
     predicted: np.ndarray  # [h, w, 4] uint8 on black
-
-    @property
-    def explanation(self) -> str:
-        """One line for a reader."""
-        dense = [s for s in self.shares if s.pixels > 0 and s.error / s.pixels > DENSER and s.region != "interior"]
-        inside = next(s for s in self.shares if s.region == "interior")
-        main = max(dense, key=lambda s: s.error, default=inside)
-        if inside.error > main.error:
-            main = inside
-        text = (
-            f"{main.region}: {100 * main.error:.0f} % of the squared error on {100 * main.pixels:.0f} % of the pixels"
-        )
-        novel = f"; pose {self.novelty_deg:.0f} degrees from the nearest training pose"
-        return text + novel + (", among the most novel quarter" if self.novelty_rank >= NOVEL_QUARTILE else "")
 
 
 def worst_frames(
@@ -78,55 +52,43 @@ def worst_frames(
     worst_of_frame: dict[int, ViewScore] = {}
     for view in views:
         worst_of_frame.setdefault(view.frame, view)
-    chosen = list(worst_of_frame.values())[:count]
-    if not chosen:
+    frames = sorted(worst_of_frame)
+    if not frames:
         return ()
-    visible_triangles = _visible_triangles(capture.folder, capture.identity)
-    train = capture.splits["train"].frames
-    frames = sorted({view.frame for view in views})
-    novelty = dict(zip(frames, novelty_deg(capture.motion, train=train, test=frames), strict=True))
-    ranks = {frame: _rank(list(novelty.values()), novelty[frame]) for frame in frames}
-    return tuple(
-        _attribution(
-            capture, cell, view, visible_triangles, novelty_deg=novelty[view.frame], novelty_rank=ranks[view.frame]
-        )
-        for view in chosen
-    )
+    visible = _visible_triangles(capture.folder, capture.identity)
+    degrees = np.array(novelty_deg(capture.motion, train=capture.splits["train"].frames, test=frames))
+    found = []
+    for view in list(worst_of_frame.values())[:count]:
+        truth = metrics.on_black(capture.image(view.camera, view.frame))
+        predicted = stored_prediction(cell, capture, view)
+        masks = metrics.foreground(truth), metrics.foreground(predicted)
+        regions = region_map(capture, view.camera, view.frame, *masks, visible)
+        error = ((truth[..., :3].astype(float) - predicted[..., :3]) ** 2).sum(-1)
+        novelty = degrees[frames.index(view.frame)]
+        text = explanation(regions, error, novelty, (degrees < novelty).sum() / max(1, len(frames) - 1))
+        found.append(ErrorAttribution(view=view, explanation=text, map=regions, truth=truth, predicted=predicted))
+    return tuple(found)
 
 
-def _attribution(
-    capture: Capture,
-    cell: Cell,
-    view: ViewScore,
-    visible_triangles: np.ndarray,
-    *,
-    novelty_deg: float,
-    novelty_rank: float,
-) -> ErrorAttribution:
-    truth = metrics.on_black(capture.image(view.camera, view.frame))
-    predicted = stored_prediction(cell, capture, view)
-    masks = metrics.foreground(truth), metrics.foreground(predicted)
-    regions = region_map(capture, view.camera, view.frame, *masks, visible_triangles)
-    error = ((truth[..., :3].astype(float) - predicted[..., :3]) ** 2).sum(-1)
-    return ErrorAttribution(
-        view=view,
-        shares=shares(regions, error),
-        novelty_deg=novelty_deg,
-        novelty_rank=novelty_rank,
-        map=regions,
-        truth=truth,
-        predicted=predicted,
-    )
+def explanation(regions: np.ndarray, error: np.ndarray, novelty_deg: float, rank: float) -> str:
+    """The region that explains a frame, by the map of regions and the squared error, `[h, w]`.
 
-
-def shares(regions: np.ndarray, error: np.ndarray) -> tuple[Share, ...]:
-    """What each region holds of the pixels and of the error, both `[h, w]`, in the order of `REGIONS`."""
+    `novelty_deg`: distance of the pose to the nearest training pose, mean over joints; `rank`: 0 for the most ordinary
+    pose of the split, 1 for the most novel.
+    """
     inside = regions >= 0
-    pixels, total = max(1, int(inside.sum())), max(float(error[inside].sum()), 1e-12)
-    return tuple(
-        Share(region=name, pixels=(regions == index).sum() / pixels, error=float(error[regions == index].sum()) / total)
-        for index, name in enumerate(REGIONS)
+    pixels, errors = (
+        np.bincount(regions[inside], weights=weights, minlength=len(REGIONS)) for weights in (None, error[inside])
     )
+    pixels, errors = pixels / max(1, pixels.sum()), errors / max(1e-12, errors.sum())
+    candidates = errors > DENSER * pixels
+    candidates[REGIONS.index("interior")] = True
+    main = int(np.argmax(np.where(candidates, errors, -1.0)))
+    text = (
+        f"{REGIONS[main]}: {100 * errors[main]:.0f} % of the squared error on {100 * pixels[main]:.0f} % of the pixels"
+    )
+    text += f"; pose {novelty_deg:.0f} degrees from the nearest training pose"
+    return text + (", among the most novel quarter" if rank >= NOVEL_QUARTILE else "")
 
 
 def region_map(
@@ -184,7 +146,3 @@ def _visible_triangles(folder: Path, identity: str) -> np.ndarray:
     corners = np.zeros(faces.max() + 1, bool)
     corners[faces[visible]] = True
     return corners[faces].any(axis=1)
-
-
-def _rank(values: Sequence[float], value: float) -> float:
-    return sum(other < value for other in values) / max(1, len(values) - 1)

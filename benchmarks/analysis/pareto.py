@@ -58,8 +58,8 @@ def front(candidates: Sequence[Candidate]) -> tuple[str, ...]:
     return tuple(each.name for each in sorted(front, key=lambda each: each.frame_ms))
 
 
-def smallest_sufficient(candidates: Sequence[Candidate], *, margin: float = SUFFICIENT_DB) -> Sufficient | None:
-    """The cheapest whose loss to the best is below the margin (one-sided 95 % bound); None where nothing is known."""
+def smallest_sufficient(candidates: Sequence[Candidate]) -> Sufficient | None:
+    """The cheapest whose loss to the best is below `SUFFICIENT_DB` (one-sided 95 % bound); None: nothing is known."""
     if not candidates:
         return None
     best = max(candidates, key=lambda each: each.psnr)
@@ -68,7 +68,7 @@ def smallest_sufficient(candidates: Sequence[Candidate], *, margin: float = SUFF
         if loss is None or math.isnan(loss.high):
             return None
         bound = 0.0 if candidate is best else loss.high
-        if bound < margin:
+        if bound < SUFFICIENT_DB:
             return Sufficient(name=candidate.name, best=best.name, loss_bound_db=bound)
     return None
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from ash.files import InputError
-from benchmarks.analysis.statistics import LEVEL, Comparison, Samples, compare_samples, independent, mean_interval
+from benchmarks.analysis.statistics import Comparison, Samples, compare_samples, independent, mean_interval
 from benchmarks.analysis.style import is_ours
 from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.registry import is_oracle
@@ -107,7 +107,7 @@ def read_csv(path: Path) -> pd.DataFrame:
 
 
 def load_images(results: Sequence[CellResult]) -> pd.DataFrame:
-    """One row per scored image of unperturbed captures: its cell, `split`, `camera`, `frame`, and foreground scores.
+    """One row per scored image: its cell, `split`, `camera`, `frame`, and foreground scores.
 
     `novelty_deg`: that of its pose, NaN where the result has none.
     """
@@ -120,7 +120,6 @@ def load_images(results: Sequence[CellResult]) -> pd.DataFrame:
             **{metric: value for (region, metric), value in view.scores.items() if region in ("foreground", "")},
         }
         for result in results
-        if not result.config.axis
         for view in result.views
     ]
     columns = ["scene", "method", "capture", "seed", "split", "camera", "frame", "psnr"]
@@ -133,7 +132,6 @@ def load_curves(results: Sequence[CellResult]) -> pd.DataFrame:
     rows = [
         {**_cell(result), "seconds": point.seconds, "psnr": point.psnr}
         for result in results
-        if not result.config.axis
         for point in result.curve
         if point.psnr is not None and point.seconds > 0
     ]
@@ -144,7 +142,7 @@ def load_snapshots(results: Sequence[CellResult]) -> pd.DataFrame:
     """One row per snapshot and split of the trainings that left any, their ends included: cell, `seconds`, `psnr`."""
     rows = []
     for result in results:
-        if result.status == "done" and result.snapshots and not result.config.axis:
+        if result.status == "done" and result.snapshots:
             end = result.training.seconds if result.training else result.value("speed", "", "train_s")
             points = [(point.split, point.seconds, point.psnr) for point in result.snapshots]
             points += [(split, end, result.value(*foreground(split))) for split in HELD_OUT_SPLITS]
@@ -165,7 +163,7 @@ def load_outcomes(results: Sequence[CellResult]) -> pd.DataFrame:
             "template": end.template or "",
         }
         for result in results
-        if not result.config.axis and (end := result.training) is not None
+        if (end := result.training) is not None
     ]
     names = ["scene", "method", "capture", "seed", "plateau", "dead", "template"]
     return pd.DataFrame(rows, columns=names)
@@ -187,7 +185,7 @@ def samples_of(rows: pd.DataFrame, quantity: Quantity) -> dict[str, Samples]:
     return dict(samples)
 
 
-def compare(rows: pd.DataFrame, a: str, b: str, quantity: Quantity, *, level: float = LEVEL) -> Comparison | None:
+def compare(rows: pd.DataFrame, a: str, b: str, quantity: Quantity) -> Comparison | None:
     """Method `a` against method `b` on one scene; None where either was not run there, or a cell of it failed."""
     both = rows[rows["method"].isin((a, b))]
     if (both["status"] != "done").any():
@@ -198,7 +196,6 @@ def compare(rows: pd.DataFrame, a: str, b: str, quantity: Quantity, *, level: fl
         samples.get(b, {}),
         margin=metric.abs_tol,
         higher_is_better=metric.direction == "up",
-        level=level,
     )
 
 
@@ -213,8 +210,7 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
     for samples in by_key.values():
         values = independent(samples)
         interval = mean_interval(values)
-        half = math.nan if interval.high is None else interval.high - interval.mean
-        records.append((interval.mean, half, min(values), max(values), len(values)))
+        records.append((interval.mean, interval.high - interval.mean, min(values), max(values), len(values)))
     index = pd.MultiIndex.from_tuples(by_key, names=KEYS) if by_key else pd.MultiIndex.from_arrays([[]] * 5, names=KEYS)
     return pd.DataFrame(records, index=index, columns=["value", "half_width", "least", "greatest", "n"])
 
@@ -225,11 +221,16 @@ class RunTables:
     def __init__(self, results: Sequence[CellResult], captures: Mapping[str, str] | None = None) -> None:
         self.all_rows = load(results, captures)
         self.rows = self.all_rows[self.all_rows["axis"] == ""]  # of unperturbed captures
-        self.images, self.outcomes = load_images(results), load_outcomes(results)
+        plain = [result for result in results if not result.config.axis]
+        self.images, self.outcomes = load_images(plain), load_outcomes(plain)
+        self.curves, self.snapshots = load_curves(plain), load_snapshots(plain)
         self.brought = frozenset(result.config.method for result in results if result.brought is not None)
-        self.curves, self.snapshots = load_curves(results), load_snapshots(results)
-        self.summary = summarise(self.rows)
         self.scenes = tuple(self.rows["scene"].unique())
+
+    @cached_property
+    def summary(self) -> pd.DataFrame:
+        """Of every quantity: see `summarise`."""
+        return summarise(self.rows)
 
     @cached_property
     def _by_scene(self) -> dict[str, pd.DataFrame]:

@@ -25,10 +25,9 @@ def steps(rows: pd.DataFrame) -> pd.DataFrame:
             for split in RANKED_SPLITS:
                 for severity, at in along.groupby("severity"):
                     for method, samples in samples_of(at, foreground(split)).items():
-                        each = mean_interval(independent(samples))
-                        records.append((scene, axis, split, method, severity, each.mean, each.low, each.high))
+                        records.append((scene, axis, split, method, severity, *mean_interval(independent(samples))))
     columns = ["scene", "axis", "split", "method", "severity", "psnr", "low", "high"]
-    table = pd.DataFrame(records, columns=columns).astype({"low": float, "high": float})
+    table = pd.DataFrame(records, columns=columns)
     groups = table.groupby(["scene", "axis", "split", "method"])["severity"]
     return table[(groups.transform("min") == 0) & (groups.transform("size") > 1) | (table["method"] == TRIVIAL)]
 

@@ -8,7 +8,7 @@ the image: images of one training share its random numbers, so that a test over 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.special import nctdtrinc, stdtr, stdtrit
@@ -20,13 +20,12 @@ LEVEL, ALPHA, POWER = 0.95, 0.05, 0.8
 ROUNDING = 1e-12  # as a share of the values: a smaller spread is none
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Interval:
-    """A mean with its confidence interval; None for a single value."""
+class Interval(NamedTuple):
+    """A mean with its 95 % confidence interval, which is NaN for a single value."""
 
     mean: float
-    low: float | None
-    high: float | None
+    low: float = math.nan
+    high: float = math.nan
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -114,24 +113,23 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return [float(p) for p in adjusted]
 
 
-def detectable(spread: float, pairs: int, *, level: float = LEVEL) -> float:
+def detectable(spread: float, pairs: int) -> float:
     """The smallest difference that so many pairs show with 80 % power; `spread`: deviation of their differences.
 
     Infinite for a single pair.
     """
     if pairs < 2:
         return math.inf
-    quantile = _quantile(level, pairs - 1)
-    return _noncentrality(float(pairs - 1), quantile) * spread / math.sqrt(pairs)
+    return _noncentrality(pairs - 1.0, _quantile(LEVEL, pairs - 1)) * spread / math.sqrt(pairs)
 
 
-def mean_interval(values: Sequence[float], *, level: float = LEVEL) -> Interval:
+def mean_interval(values: Sequence[float]) -> Interval:
     """Student's interval of a mean."""
     mean = float(np.mean(values))
     if len(values) < 2:
-        return Interval(mean=mean, low=None, high=None)
-    half = _quantile(level, len(values) - 1) * float(np.std(values, ddof=1)) / math.sqrt(len(values))
-    return Interval(mean=mean, low=mean - half, high=mean + half)
+        return Interval(mean)
+    half = _quantile(LEVEL, len(values) - 1) * float(np.std(values, ddof=1)) / math.sqrt(len(values))
+    return Interval(mean, mean - half, mean + half)
 
 
 def independent(samples: Samples) -> list[float]:
@@ -156,7 +154,7 @@ def intervals(samples: Mapping[str, Samples]) -> dict[str, Interval]:
     variances = (values - values.mean(0)).var(1, ddof=1) * len(samples) / len(others)
     halves = _quantile(LEVEL, len(shared) - 1) * np.sqrt(variances / len(shared))
     return {
-        method: Interval(mean=each.mean, low=each.mean - float(half), high=each.mean + float(half))
+        method: Interval(each.mean, each.mean - float(half), each.mean + float(half))
         for (method, each), half in zip(by_method.items(), halves, strict=True)
     }
 

@@ -3,8 +3,8 @@
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 from ash.files import hash_of
 from benchmarks.cell.registry import DECIDING_PACKAGES, methods
@@ -12,8 +12,7 @@ from benchmarks.cell.schema import CellConfig
 from benchmarks.suites.files import our_rows
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class MethodStyle:
+class MethodStyle(NamedTuple):
     """A method's title and its colour, readable on white and on dark pages."""
 
     title: str
@@ -21,8 +20,7 @@ class MethodStyle:
     reference: str = "ash"  # what it is compared with
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SplitName:
+class SplitName(NamedTuple):
     """The title of a split above a column, and its name in a sentence."""
 
     title: str
@@ -43,73 +41,73 @@ ADDED = (  # by `ash_plus`: name, title, colour
     ("narrow", "half the width, one frame", "#5b6b7a"),
 )
 STYLES = {
-    "ash": MethodStyle(title="ASH", colour="#2f6fde"),
-    "ash_plus": MethodStyle(title="ASH+", colour="#12b5cb"),
-    "ash_truth": MethodStyle(title="ASH, exact surface", colour="#2f6fde"),
-    "ddc": MethodStyle(title="DDC", colour="#dd6b20"),
-    "ddc_plus": MethodStyle(title="DDC+", colour="#e5a500", reference="ash_plus"),
-    "ddc_truth": MethodStyle(title="DDC, exact surface", colour="#dd6b20"),
-    "wo_disp": MethodStyle(title="w/o disp.", colour="#2a9d8f"),
-    "wo_mot": MethodStyle(title="w/o mot.", colour="#9b59b6"),
-    "wo_mot_plus": MethodStyle(title="ASH+ w/o mot.", colour="#c77dff", reference="ash_plus"),
-    "wo_mot_truncated": MethodStyle(title="w/o mot., 40 s of footage", colour="#7a869a"),
-    "res_128": MethodStyle(title="half texels", colour="#5b8c2a"),
-    "double_width": MethodStyle(title="ASH+, double width", colour="#9b59b6", reference="ash_plus"),
-    "half_width": MethodStyle(title="ASH+, half width", colour="#c2415c", reference="ash_plus"),
-    "half_texels": MethodStyle(title="ASH+, half texels", colour="#5b8c2a", reference="ash_plus"),
-    "half_texels_and_width": MethodStyle(title="ASH+, half texels and width", colour="#008fb3", reference="ash_plus"),
-    "double_texels": MethodStyle(title="ASH+, double texels", colour="#a0522d", reference="ash_plus"),
-    "res_512": MethodStyle(title="double texels", colour="#008fb3"),
-    "cams_12": MethodStyle(title="1/10 of cameras", colour="#a0522d"),
-    "cams_30": MethodStyle(title="1/4 of cameras", colour="#b8860b"),
-    "cams_60": MethodStyle(title="1/2 of cameras", colour="#7a869a"),
-    "window_1": MethodStyle(title="window 1", colour="#008fb3"),
-    "unlearned": MethodStyle(title="skinned template", colour="#b8860b"),
-    "wo_phi": MethodStyle(title="w/o Phi", colour="#c2415c"),
-    "plus_window_3": MethodStyle(title="ASH+, window 3", colour="#7a869a", reference="ash_plus"),
-    "wo_phi_and_light": MethodStyle(title="ASH+ w/o Phi and light", colour="#5b8c2a", reference="ash_plus"),
-    "sh_0": MethodStyle(title="SH 0", colour="#008fb3"),
-    "sh_1": MethodStyle(title="SH 1", colour="#a0522d"),
-    "sh_2": MethodStyle(title="SH 2", colour="#7a869a"),
-    "mlp": MethodStyle(title="w/ MLP", colour="#c2415c"),
-    "mlp_base": MethodStyle(title="w/ MLP on learned texels", colour="#a0522d"),
-    "smpl": MethodStyle(title="bare-body template", colour="#8d6e63"),
-    "tava": MethodStyle(title="TAVA", colour="#c2415c"),
-    "neural_actor": MethodStyle(title="Neural Actor", colour="#5b8c2a"),
-    "hdhumans": MethodStyle(title="HDHumans", colour="#9b59b6"),
-    "per_frame": MethodStyle(title="Gaussians per training frame", colour="#7a869a", reference="ash_plus"),
+    "ash": MethodStyle("ASH", "#2f6fde"),
+    "ash_plus": MethodStyle("ASH+", "#12b5cb"),
+    "ash_truth": MethodStyle("ASH, exact surface", "#2f6fde"),
+    "ddc": MethodStyle("DDC", "#dd6b20"),
+    "ddc_plus": MethodStyle("DDC+", "#e5a500", reference="ash_plus"),
+    "ddc_truth": MethodStyle("DDC, exact surface", "#dd6b20"),
+    "wo_disp": MethodStyle("w/o disp.", "#2a9d8f"),
+    "wo_mot": MethodStyle("w/o mot.", "#9b59b6"),
+    "wo_mot_plus": MethodStyle("ASH+ w/o mot.", "#c77dff", reference="ash_plus"),
+    "wo_mot_truncated": MethodStyle("w/o mot., 40 s of footage", "#7a869a"),
+    "res_128": MethodStyle("half texels", "#5b8c2a"),
+    "double_width": MethodStyle("ASH+, double width", "#9b59b6", reference="ash_plus"),
+    "half_width": MethodStyle("ASH+, half width", "#c2415c", reference="ash_plus"),
+    "half_texels": MethodStyle("ASH+, half texels", "#5b8c2a", reference="ash_plus"),
+    "half_texels_and_width": MethodStyle("ASH+, half texels and width", "#008fb3", reference="ash_plus"),
+    "double_texels": MethodStyle("ASH+, double texels", "#a0522d", reference="ash_plus"),
+    "res_512": MethodStyle("double texels", "#008fb3"),
+    "cams_12": MethodStyle("1/10 of cameras", "#a0522d"),
+    "cams_30": MethodStyle("1/4 of cameras", "#b8860b"),
+    "cams_60": MethodStyle("1/2 of cameras", "#7a869a"),
+    "window_1": MethodStyle("window 1", "#008fb3"),
+    "unlearned": MethodStyle("skinned template", "#b8860b"),
+    "wo_phi": MethodStyle("w/o Phi", "#c2415c"),
+    "plus_window_3": MethodStyle("ASH+, window 3", "#7a869a", reference="ash_plus"),
+    "wo_phi_and_light": MethodStyle("ASH+ w/o Phi and light", "#5b8c2a", reference="ash_plus"),
+    "sh_0": MethodStyle("SH 0", "#008fb3"),
+    "sh_1": MethodStyle("SH 1", "#a0522d"),
+    "sh_2": MethodStyle("SH 2", "#7a869a"),
+    "mlp": MethodStyle("w/ MLP", "#c2415c"),
+    "mlp_base": MethodStyle("w/ MLP on learned texels", "#a0522d"),
+    "smpl": MethodStyle("bare-body template", "#8d6e63"),
+    "tava": MethodStyle("TAVA", "#c2415c"),
+    "neural_actor": MethodStyle("Neural Actor", "#5b8c2a"),
+    "hdhumans": MethodStyle("HDHumans", "#9b59b6"),
+    "per_frame": MethodStyle("Gaussians per training frame", "#7a869a", reference="ash_plus"),
     # Suite `switches`.
-    "warm_up_released": MethodStyle(title="warm-up as released", colour="#7a869a"),
-    "warm_up_none": MethodStyle(title="no warm-up", colour="#b8860b"),
-    "loss_released": MethodStyle(title="loss as released", colour="#c2415c"),
-    "norm_released": MethodStyle(title="batch norm as released", colour="#5b8c2a"),
-    "norm_instance": MethodStyle(title="instance norm", colour="#b8860b"),
-    "world_rotations": MethodStyle(title="world-frame rotations", colour="#008fb3"),
-    "released_phi": MethodStyle(title="Phi as released", colour="#a0522d"),
-    "offset_in_metres": MethodStyle(title="offset in metres", colour="#9b59b6"),
-    "constant_rate": MethodStyle(title="constant learning rate", colour="#c2415c"),
-    "noisy_textures": MethodStyle(title="ASH+, noise on textures", colour="#7a869a", reference="ash_plus"),
-    "last_weights": MethodStyle(title="no weight averaging", colour="#a0522d"),
+    "warm_up_released": MethodStyle("warm-up as released", "#7a869a"),
+    "warm_up_none": MethodStyle("no warm-up", "#b8860b"),
+    "loss_released": MethodStyle("loss as released", "#c2415c"),
+    "norm_released": MethodStyle("batch norm as released", "#5b8c2a"),
+    "norm_instance": MethodStyle("instance norm", "#b8860b"),
+    "world_rotations": MethodStyle("world-frame rotations", "#008fb3"),
+    "released_phi": MethodStyle("Phi as released", "#a0522d"),
+    "offset_in_metres": MethodStyle("offset in metres", "#9b59b6"),
+    "constant_rate": MethodStyle("constant learning rate", "#c2415c"),
+    "noisy_textures": MethodStyle("ASH+, noise on textures", "#7a869a", reference="ash_plus"),
+    "last_weights": MethodStyle("no weight averaging", "#a0522d"),
     # Suite `plus`: one addition to `ash`, and all up to one.
-    **{f"plus_{name}": MethodStyle(title=f"+ {title}", colour=colour) for name, title, colour in ADDED},
-    **{f"to_{name}": MethodStyle(title=f"up to {title}", colour=colour) for name, title, colour in ADDED},
+    **{f"plus_{name}": MethodStyle(f"+ {title}", colour) for name, title, colour in ADDED},
+    **{f"to_{name}": MethodStyle(f"up to {title}", colour) for name, title, colour in ADDED},
     # Rows that differ in what the template is learned from.
-    "by_scans": MethodStyle(title="template from scans", colour="#2a9d8f"),
-    "ddc_by_scans": MethodStyle(title="DDC, template from scans", colour="#b8860b"),
-    "by_graph": MethodStyle(title="graph-network template", colour="#a0522d"),
-    "refined": MethodStyle(title="photometrically refined template", colour="#c2415c"),
-    "static": MethodStyle(title="static", colour="#7a869a"),
-    "nearest": MethodStyle(title="nearest image", colour="#7a869a"),
-    "oracle_texture": MethodStyle(title="best texture, exact mesh", colour="#b8860b"),
+    "by_scans": MethodStyle("template from scans", "#2a9d8f"),
+    "ddc_by_scans": MethodStyle("DDC, template from scans", "#b8860b"),
+    "by_graph": MethodStyle("graph-network template", "#a0522d"),
+    "refined": MethodStyle("photometrically refined template", "#c2415c"),
+    "static": MethodStyle("static", "#7a869a"),
+    "nearest": MethodStyle("nearest image", "#7a869a"),
+    "oracle_texture": MethodStyle("best texture, exact mesh", "#b8860b"),
 }
 SPLIT_NAMES = {
-    "novel_view": SplitName(title="Novel view", words="novel views"),
-    "near_pose": SplitName(title="Novel pose: near", words="near novel poses"),
-    "novel_pose": SplitName(title="Novel pose: new", words="novel poses"),
-    "far_pose": SplitName(title="Novel pose: far", words="far novel poses"),
-    "train_view": SplitName(title="Training view", words="training views"),
-    "speed": SplitName(title="Cost", words="cost"),
-    "memory": SplitName(title="Cost", words="cost"),
+    "novel_view": SplitName("Novel view", "novel views"),
+    "near_pose": SplitName("Novel pose: near", "near novel poses"),
+    "novel_pose": SplitName("Novel pose: new", "novel poses"),
+    "far_pose": SplitName("Novel pose: far", "far novel poses"),
+    "train_view": SplitName("Training view", "training views"),
+    "speed": SplitName("Cost", "cost"),
+    "memory": SplitName("Cost", "cost"),
 }
 SPARE_COLOURS = ("#b8860b", "#c2415c", "#5b8c2a", "#7a869a", "#008fb3", "#a0522d")
 # The two pairs that are compared: the paper's text, and both with what the paper does not have.
@@ -168,7 +166,7 @@ def style_of(method: str) -> MethodStyle:
         return STYLES[method]
     name = method.rpartition(":")[2]
     title = name.replace("_", " ") if name != method else method  # A factory's name, where it came by its path.
-    return MethodStyle(title=titles.get(method, title), colour=SPARE_COLOURS[sum(method.encode()) % len(SPARE_COLOURS)])
+    return MethodStyle(titles.get(method, title), SPARE_COLOURS[sum(method.encode()) % len(SPARE_COLOURS)])
 
 
 def reference_of(method: str, methods: Collection[str]) -> str | None:

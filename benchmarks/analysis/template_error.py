@@ -35,14 +35,10 @@ def margins(tables: RunTables) -> pd.DataFrame:
         records = [
             (scene, split, template, error, each.mean, each.low, each.high)
             for template, error, ash, ddc in pairs
-            if (each := _whole_comparison(tables, scene, split, ash, ddc)) is not None
+            if (each := compare(tables.of(scene), ash, ddc, foreground(split))) is not None
         ]
         rows += records if sum(row[2] == PLANTED for row in records) > 1 else []
     return pd.DataFrame(rows, columns=["scene", "split", "template", "error_mm", "mean", "low", "high"])
-
-
-def _whole_comparison(tables: RunTables, scene: str, split: str, a: str, b: str):
-    return compare(tables.of(scene), a, b, foreground(split)) if tables.whole(scene, a, b) else None
 
 
 def levels(tables: RunTables) -> pd.DataFrame:
@@ -54,10 +50,8 @@ def levels(tables: RunTables) -> pd.DataFrame:
             for mm, names in WRONG_BY_MM.items():
                 if samples.get(names[column]) and tables.whole(scene, names[column]):
                     interval = mean_interval(independent(samples[names[column]]))
-                    rows.append((scene, split, method, float(mm), interval.mean, interval.low, interval.high))
-    return pd.DataFrame(rows, columns=["scene", "split", "method", "error_mm", "psnr", "low", "high"]).astype(
-        {"low": float, "high": float}
-    )
+                    rows.append((scene, split, method, float(mm), *interval))
+    return pd.DataFrame(rows, columns=["scene", "split", "method", "error_mm", "psnr", "low", "high"])
 
 
 def interpolated(x: pd.Series, y: pd.Series, at: float) -> float | None:

@@ -67,7 +67,6 @@ class GateCommand:
         from benchmarks.gate.gate import judge
         from benchmarks.gate.history import append
         from benchmarks.gate.summary import junit, markdown, terminal, write_pictures
-        from benchmarks.provenance import changed_since
         from benchmarks.suites.files import read_suite
 
         baseline = read_baseline(self.baseline)
@@ -81,7 +80,7 @@ class GateCommand:
             revision = revision_of(self.against, drawn, self.out / "against")
         judged = judge(baseline, suite, self._options(), minutes=self.minutes, against=revision)
         pictures = write_pictures(judged, self.out)
-        print(terminal(baseline, judged, changed_since(baseline.commit)))
+        print(terminal(baseline, judged))
         for path in pictures:
             print(f"before, after, difference: {path}")
         if self.markdown:
@@ -89,7 +88,7 @@ class GateCommand:
         if self.junit:
             write_atomic(self.junit, junit(judged.checks).encode())
         if self.history:
-            print(f"history: {append(judged, judged.times, self.history)}")
+            print(f"history: {append(judged, self.history)}")
         verdict = outcome(judged.checks)
         return FAILED if verdict in FAILING or (self.strict and verdict != "unchanged") else DONE
 

@@ -9,14 +9,14 @@ import subprocess
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from ash.files import InputError
 from benchmarks.cell.registry import find_method, find_spec_of
+from benchmarks.cell.run import evaluate_cell
 from benchmarks.cell.sandbox import METHOD_PATH
-from benchmarks.cell.schema import Cell, CellResult, Timing, result_of
-from benchmarks.gate.baseline import Entry, drawn_again
+from benchmarks.cell.schema import Cell, Timing, result_of
+from benchmarks.gate.baseline import Entry, copied
 from benchmarks.gate.checks import Check
 from benchmarks.gate.statistical import SLOWER, SLOWER_STORED, least_times, rises, time_checks
 from benchmarks.provenance import commit
@@ -147,20 +147,20 @@ def interleaved(
 ) -> tuple[list[Check], dict[str, float]]:
     """Checks of the times of a baseline's avatar, drawn in turn by a revision and by today's code; today's least times.
 
-    What is drawn first alternates. `here`: see `drawn_again`.
+    What is drawn first alternates. `here`: see `copied`.
     """
     before: list[Timing] = []
     after: list[Timing] = []
     turns = [
-        (before, partial(drawn_again, entry, here, out / "against", partial(_drawn_by, revision))),
-        (after, partial(drawn_again, entry, here, out)),
+        lambda: before.append(_timed_by(revision, copied(entry, here, out / "against"))),
+        lambda: after.append(_timed_today(copied(entry, here, out))),
     ]
     for number in range(1, 2 * ROUNDS + 1):
         try:
-            for timings, draw in turns:
-                timings += [timing for timing in (draw().timing,) if timing is not None]
+            for draw in turns:
+                draw()
         except CannotDraw as error:
-            return [Check(row=row, layer="cost", name="times", verdict="not judged", detail=str(error))], {}
+            return [Check(row, "cost", "not judged", str(error), "times")], {}
         turns.reverse()
         least = least_times(before, beside=after), least_times(after, beside=before)
         unclear = any(SLOWER <= rise < SLOWER_STORED for rise in rises(*least).values())
@@ -169,8 +169,14 @@ def interleaved(
     return time_checks(row, *least, stored=False), least[1]
 
 
-def _drawn_by(revision: Revision, cell: Cell) -> CellResult:
-    """The result of a cell that a revision drew again.
+def _timed_today(cell: Cell) -> Timing:
+    timing = evaluate_cell(cell).timing
+    assert timing is not None
+    return timing
+
+
+def _timed_by(revision: Revision, cell: Cell) -> Timing:
+    """The times of a cell that a revision drew again.
 
     Raises:
         CannotDraw: it does not.
@@ -178,7 +184,7 @@ def _drawn_by(revision: Revision, cell: Cell) -> CellResult:
     command = [*revision.command, "eval", str(cell.folder.resolve())]
     done = subprocess.run(command, env=_environment(revision), capture_output=True, text=True, check=False)
     result = result_of(cell)
-    if done.returncode or result is None:
+    if done.returncode or result is None or result.timing is None:
         last = done.stderr.strip().rpartition("\n")[2]
         raise CannotDraw(f"--against: {revision.name} cannot draw {cell.config.title}: {last}")
-    return result
+    return result.timing

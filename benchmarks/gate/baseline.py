@@ -8,23 +8,21 @@
 """
 
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from ash.capture.typed import from_json
 from ash.files import InputError, open_regular, read_json, write_atomic, write_json
 from benchmarks.cell.evaluation import spread
 from benchmarks.cell.registry import is_oracle
-from benchmarks.cell.run import evaluate_cell, time_cell
 from benchmarks.cell.schema import (
     CHECKPOINT,
     Cell,
     CellConfig,
     CellResult,
-    Timing,
     ViewScore,
     is_trained,
     prediction_path,
@@ -61,7 +59,7 @@ class GateFile:
     accepted: tuple[Accepted, ...] = ()
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Entry:
     """One cell and its result."""
 
@@ -90,9 +88,7 @@ def rows_of(run: Run) -> dict[str, list[Entry]]:
     rows: dict[str, list[Entry]] = {}
     for cell in sorted(run.cells, key=lambda cell: cell.config.seed):
         if (result := result_of(cell)) is not None:
-            rows.setdefault(row_of(cell.config), []).append(
-                Entry(cell=cell, result=replace(result, config=cell.config))
-            )
+            rows.setdefault(row_of(cell.config), []).append(Entry(cell, replace(result, config=cell.config)))
     return rows
 
 
@@ -156,35 +152,18 @@ def write_baseline(folder: Path, suite: Path, run: Run, file: GateFile) -> None:
     require_replaceable(folder, rows)
     if folder.exists() and any(folder.iterdir()) and not (folder / FILE).exists():
         raise InputError(f"{folder}: expected a baseline, an empty folder or none")
-    with _replacing(folder) as made:
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as space:
+        made = Path(space) / "new"
         for name, content in numbers_of(run):
             write_atomic(made / name, content)
         for entries in rows.values():
             _write_first(entries[0], made / "cells" / entries[0].cell.config.key)
         write_atomic(made / f"{suite.stem}.toml", suite.read_bytes())
         write_json(made / FILE, asdict(file))
-
-
-@contextmanager
-def _replacing(folder: Path) -> Iterator[Path]:
-    """A new folder beside `folder`, which takes its place when the body is done."""
-    made, old = (folder.with_name(f".{folder.name}.{what}") for what in ("new", "old"))
-
-    def tidy() -> None:
-        if old.exists() and not folder.exists():  # Something ended this between the two renames.
-            old.rename(folder)
-        for path in (made, old):
-            shutil.rmtree(path, ignore_errors=True)
-
-    tidy()
-    made.mkdir(parents=True)
-    try:
-        yield made
         if folder.exists():
-            folder.rename(old)
+            folder.rename(Path(space) / "old")
         made.rename(folder)
-    finally:
-        tidy()
 
 
 def _write_first(first: Entry, folder: Path) -> None:
@@ -221,24 +200,11 @@ def stored_views(result: CellResult) -> list[ViewScore]:
     return [of_one[index] for of_one in by_split for index in spread(len(of_one), PICTURES)]
 
 
-def drawn_again(entry: Entry, here: Cell, out: Path, draw: Callable[[Cell], CellResult] = evaluate_cell) -> CellResult:
-    """The result of a baseline's avatar, copied to `out` and drawn by today's code, or by `draw`.
+def copied(entry: Entry, here: Cell, out: Path) -> Cell:
+    """The cell of a baseline's avatar in `out`, to be drawn again on the capture of this machine.
 
-    `here`: a cell of the same row on this machine, whose capture is drawn; it may be rounded by another processor.
-
-    Raises:
-        InputError: the avatar cannot be drawn.
+    `here`: a cell of the same row on this machine; its capture may be rounded by another processor.
     """
-    return draw(_copied(entry, here, out))
-
-
-def timed_again(entry: Entry, here: Cell, out: Path) -> Timing:
-    """The times alone of `drawn_again`, in half its time."""
-    return time_cell(_copied(entry, here, out))
-
-
-def _copied(entry: Entry, here: Cell, out: Path) -> Cell:
-    """The cell of a baseline's avatar in `out`, on the capture of this machine."""
     folder = out / entry.cell.config.key
     shutil.rmtree(folder, ignore_errors=True)
     config = replace(entry.cell.config, capture=here.config.capture)

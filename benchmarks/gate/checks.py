@@ -24,7 +24,7 @@ GATED = (  # (split, region, metric): few, so that Holm's correction leaves powe
 )
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Check:
     """A comparison and its outcome."""
 

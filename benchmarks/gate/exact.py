@@ -18,9 +18,9 @@ from ash.capture.dataset import Capture
 from ash.files import open_regular
 from benchmarks.cell.evaluation import agreement, image_summary, scored_views
 from benchmarks.cell.metrics import METRICS
-from benchmarks.cell.schema import Cell, CellResult, View, stored_prediction
+from benchmarks.cell.schema import CellResult, View, stored_prediction
 from benchmarks.gate.baseline import LARGEST_LOG, LOG_LINES, Entry, stored_views
-from benchmarks.gate.checks import GATED, Check, Verdict, of_exact_change
+from benchmarks.gate.checks import GATED, Check, of_exact_change
 
 SAME_SCORE = 1e-5  # as a share of a score: rounding of another instruction set
 SAME_DB = 50.0  # PSNR between two pictures that differ by rounding alone
@@ -46,12 +46,12 @@ def protocol_check(row: str, entry: Entry, capture: Capture) -> Check:
         if (old := result.value(split, region, metric)) is not None and not math.isclose(value, old, rel_tol=SAME_SCORE)
     ]
     if wrong:
-        detail = f"the protocol changed: {wrong[0]}" + (f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else "")
-        return Check(row=row, layer="protocol", verdict="worse", detail=detail)
-    return Check(row=row, layer="protocol", verdict="unchanged", detail=f"{len(now)} stored pictures have their scores")
+        more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
+        return Check(row, "protocol", "worse", f"the protocol changed: {wrong[0]}{more}")
+    return Check(row, "protocol", "unchanged", f"{len(now)} stored pictures have their scores")
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Worst:
     """The picture of a frozen avatar that changed most: both, uint8 RGBA on black, and the PSNR between them."""
 
@@ -61,34 +61,27 @@ class Worst:
     psnr: float
 
 
-def worst_picture(before: Cell, after: Cell, result: CellResult, capture: Capture) -> Worst | None:
-    """Of the stored pictures, the one that today's code draws most differently; None: all are equal."""
-    found = []
-    for view in stored_views(result):
-        old, new = (stored_prediction(cell, capture, view) for cell in (before, after))
-        if not np.array_equal(old, new):
-            found.append(Worst(view=view, before=old, after=new, psnr=agreement(new, old)))
-    return min(found, key=lambda each: each.psnr, default=None)
-
-
-def rendering_checks(row: str, before: CellResult, after: CellResult, worst: Worst | None) -> list[Check]:
+def rendering_checks(row: str, before: Entry, after: Entry, capture: Capture) -> tuple[list[Check], Worst | None]:
     """Whether a frozen avatar draws the same pictures; where not, by how much each gated score changed.
 
-    These changes are exact: the same weights were drawn twice.
+    These changes are exact: the same weights were drawn twice. Also returns the stored picture that changed most.
     """
-    old = {(v.split, v.camera, v.frame): v.prediction for v in before.views}
-    new = {(v.split, v.camera, v.frame): v.prediction for v in after.views}
+    old, new = ({(v.split, v.camera, v.frame): v.prediction for v in e.result.views} for e in (before, after))
     if old == new:
-        detail = f"the frozen avatar draws the same {len(old)} pictures"
-        return [Check(row=row, layer="rendering", verdict="unchanged", detail=detail)]
-    changed = sum(new.get(place) != digest for place, digest in old.items())
+        return [Check(row, "rendering", "unchanged", f"the frozen avatar draws the same {len(old)} pictures")], None
+    changed = []
+    for view in stored_views(before.result):
+        one, two = (stored_prediction(entry.cell, capture, view) for entry in (before, after))
+        if not np.array_equal(one, two):
+            changed.append(Worst(view, one, two, agreement(two, one)))
+    worst = min(changed, key=lambda each: each.psnr, default=None)
     far = "" if worst is None else f"; {worst.psnr:.1f} dB to before at the worst, {_place(worst.view)}"
-    told = f"rendering changed: {changed} of {len(old)} pictures{far}"
-    scores = [check for name in GATED if (check := _score_check(row, name, before, after)) is not None]
-    rounding = worst is not None and worst.psnr >= SAME_DB and all(s.verdict == "unchanged" for s in scores)
-    verdict: Verdict = "unchanged" if rounding else "not worse"
-    detail = f"equal within rounding: {told}" if rounding else told
-    return [Check(row=row, layer="rendering", verdict=verdict, detail=detail), *scores]
+    different = sum(new.get(place) != digest for place, digest in old.items())
+    detail = f"rendering changed: {different} of {len(old)} pictures{far}"
+    scores = [check for name in GATED if (check := _score_check(row, name, before.result, after.result)) is not None]
+    if worst is not None and worst.psnr >= SAME_DB and all(score.verdict == "unchanged" for score in scores):
+        return [Check(row, "rendering", "unchanged", f"equal within rounding: {detail}"), *scores], worst
+    return [Check(row, "rendering", "not worse", detail), *scores], worst
 
 
 def _score_check(row: str, name: tuple[str, str, str], before: CellResult, after: CellResult) -> Check | None:
@@ -99,33 +92,30 @@ def _score_check(row: str, name: tuple[str, str, str], before: CellResult, after
     metric = METRICS[name[2]]
     verdict = of_exact_change(new - old, metric.abs_tol, higher_is_better=metric.direction == "up")
     detail = f"{old:.4g} -> {new:.4g}{metric.unit and ' ' + metric.unit} ({new - old:+.3g}, exact)"
-    return Check(row=row, layer="rendering", name="/".join(name), verdict=verdict, detail=detail)
+    return Check(row, "rendering", verdict, detail, "/".join(name))
 
 
 def first_steps_check(row: str, before: Path, after: Path) -> Check | None:
     """Where the training log of `after` first differs from that of `before`; None where there is nothing to compare."""
     old, new = _steps(before), _steps(after)
-    count = min(len(old), len(new))
-    if not count:
+    if not (count := min(len(old), len(new))):
         return None
-    for index, (one, two) in enumerate(zip(old[:count], new[:count], strict=True)):
+    for one, two in zip(old[:count], new[:count], strict=True):
         for what in ("step", "loss", "gradient", "train_psnr"):
             if one.get(what) != two.get(what):
-                return _first_difference(row, old[index], new[index], what)
-    return Check(row=row, layer="training", verdict="unchanged", detail=f"the first {count} lines of its log are equal")
+                return _first_difference(row, one, two, what)
+    return Check(row, "training", "unchanged", f"the first {count} lines of its log are equal")
 
 
 def _first_difference(row: str, old: Mapping[str, Any], new: Mapping[str, Any], what: str) -> Check:
-    step = old.get("step", "?")
-    before, after = old.get(what), new.get(what)
-    told = f"{what} {before} -> {after}"
-    near = isinstance(before, float) and isinstance(after, float) and math.isclose(before, after, rel_tol=SAME_STEP)
+    step, before, after = old.get("step", "?"), old.get(what), new.get(what)
     where = {
         "loss": f"from the loss of step {step} on" + ("" if step == 1 else ", so in the update before it"),
         "gradient": f"from the gradient of step {step} on, whose loss is equal",
     }.get(what, f"from step {step} on")
-    detail = f"training changed {where} ({told}{'; it may be rounding' if near else ''})"
-    return Check(row=row, layer="training", verdict="not worse", detail=detail)
+    near = isinstance(before, float) and isinstance(after, float) and math.isclose(before, after, rel_tol=SAME_STEP)
+    told = f"{what} {before} -> {after}{'; it may be rounding' if near else ''}"
+    return Check(row, "training", "not worse", f"training changed {where} ({told})")
 
 
 def _steps(path: Path) -> list[dict[str, Any]]:
@@ -146,13 +136,16 @@ def _steps(path: Path) -> list[dict[str, Any]]:
     return lines
 
 
-def equal_seeds(row: str, entries: Sequence[Entry]) -> Check | None:
-    """Whether two seeds drew the same pictures, which a method with randomness does not."""
-    drawn = [tuple(view.prediction for view in entry.result.views) for entry in entries]
-    if len(drawn) < 2 or len(set(drawn)) == len(drawn):
+def seeds_check(row: str, before: Sequence[Entry], after: Sequence[Entry]) -> Check | None:
+    """A check that fails where two seeds drew the same pictures and those of the baseline did not; else None."""
+    if _has_equal_pictures(before) or not _has_equal_pictures(after):
         return None
     detail = "two seeds draw the same pictures, and those of the baseline do not: the seed is ignored"
-    return Check(row=row, layer="training", name="seeds", verdict="worse", detail=detail)
+    return Check(row, "training", "worse", detail, "seeds")
+
+
+def _has_equal_pictures(seeds: Sequence[Entry]) -> bool:
+    return len({tuple(view.prediction for view in entry.result.views) for entry in seeds}) < len(seeds)
 
 
 def _place(view: View) -> str:

@@ -11,25 +11,18 @@
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from ash.capture.formats import load_capture
 from ash.files import InputError
+from benchmarks.cell.run import evaluate_cell, time_cell
 from benchmarks.cell.schema import Cell, CellResult, Timing, result_of
 from benchmarks.gate.against import Revision, interleaved
-from benchmarks.gate.baseline import Baseline, Entry, drawn_again, keeps_avatar, row_of, timed_again
+from benchmarks.gate.baseline import Baseline, Entry, copied, keeps_avatar, row_of
 from benchmarks.gate.checks import Check
-from benchmarks.gate.exact import (
-    Worst,
-    equal_seeds,
-    first_steps_check,
-    protocol_check,
-    rendering_checks,
-    worst_picture,
-)
+from benchmarks.gate.exact import Worst, first_steps_check, protocol_check, rendering_checks, seeds_check
 from benchmarks.gate.statistical import (
     Pairs,
     count_checks,
@@ -47,6 +40,7 @@ from benchmarks.suites.suites import Suite
 TRAINED = 2  # seeds of every row, so that a seed that is ignored is seen
 TIMED = 5  # drawings of a frozen avatar for a baseline's times; of a run one, and more while a time fails
 FROZEN = "frozen"  # folder of avatars that were drawn again
+Times = dict[str, dict[str, float]]  # least times of frozen avatars and trainings by row; see `GateFile`
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -55,7 +49,7 @@ class Judgement:
 
     checks: tuple[Check, ...]
     run: Run
-    times: dict[str, dict[str, float]] = field(default_factory=dict)
+    times: Times = field(default_factory=dict)
     worst: dict[str, Worst] = field(default_factory=dict)
 
 
@@ -68,38 +62,35 @@ def judge(
     revision that draws in turn with today's code; its times take the place of those of the baseline.
 
     Raises:
-        InputError: the suite has no row in common with the baseline.
+        InputError: the suite has no row in common with the baseline, or the baseline has a row of a single seed.
     """
     seeds = max(len(entries) for entries in baseline.rows.values())
     if few := [row for row, entries in baseline.rows.items() if len(entries) < TRAINED]:
         raise InputError(f"{few[0]}: expected a baseline of {TRAINED} seeds or more; --update-baseline makes one")
     run, by_row = cells_of(suite.narrowed(seeds=seeds), options)
-    shared = [row for row in baseline.rows if row in by_row]
-    if not shared:
+    if not baseline.rows.keys() & by_row.keys():
         raise InputError(
             f"nothing was compared: the baseline has {', '.join(baseline.rows)}; the suite has {', '.join(by_row)}"
         )
-    checks = _row_checks(baseline, by_row)
-    same = [row for row in shared if by_row[row][0].config.truth == _first(baseline, row).result.config.truth]
-    for row in set(shared) - set(same):
-        detail = "the ground truth changed, so qualities cannot be compared; update the baseline"
-        checks.append(Check(row=row, layer="rows", name="capture", verdict="worse", detail=detail))
-    drawn, worst = _draw_frozen(baseline, by_row, same, options, checks)
-    after = _train(by_row, same, TRAINED, suite, options)
-    started = time.monotonic()
-    pairs: Pairs = {row: (baseline.rows[row], entries) for row, entries in after.items() if entries}
-    _judge_training(pairs, checks)
-    checks += _judge_quality(pairs, by_row, suite, options, until=started + 60 * minutes, seeds=seeds)
-    for row, (before, entries) in pairs.items():
-        checks += count_checks(row, before[0].result, entries[0].result)
-    times: dict[str, dict[str, float]] = {}
-    turns = {
-        row: partial(interleaved, row, _first(baseline, row), by_row[row][0], options.out / FROZEN, against)
-        for row in drawn
-        if against is not None and _first(baseline, row).cell.config.source in against.methods
-    }
-    checks += _cost_checks(baseline, pairs, drawn, turns, times)
-    return Judgement(checks=tuple(checks), run=run, times=times, worst=worst)
+    checks, by_row = _row_checks(baseline, by_row)
+    drawn: dict[str, CellResult] = {}
+    worst: dict[str, Worst] = {}
+    frozen = [row for row in by_row if keeps_avatar(baseline.rows[row][0].cell)]
+    progress = Progress("frozen avatars", len(frozen), expected_s=15.0, workers=1)
+    for row in frozen:
+        found, result, changed = _draw_frozen(row, baseline.rows[row][0], by_row[row][0], options.out / FROZEN)
+        checks += found
+        drawn |= {} if result is None else {row: result}
+        worst |= {} if changed is None else {row: changed}
+        progress.finish(row)
+    progress.close()
+    after = trained(by_row, suite, options, seeds=TRAINED)
+    until = time.monotonic() + 60 * minutes
+    pairs: Pairs = {row: (baseline.rows[row], entries) for row, entries in after.items()}
+    checks += _training_checks(pairs)
+    checks += _quality_checks(pairs, by_row, suite, options, until=until, seeds=seeds)
+    costs, times = _cost_checks(baseline, pairs, by_row, drawn, options.out / FROZEN, against)
+    return Judgement(checks=(*checks, *costs), run=run, times=times, worst=worst)
 
 
 def cells_of(suite: Suite, options: RunOptions) -> tuple[Run, dict[str, list[Cell]]]:
@@ -112,12 +103,21 @@ def cells_of(suite: Suite, options: RunOptions) -> tuple[Run, dict[str, list[Cel
     return run, by_row
 
 
-def trained(by_row: Mapping[str, Sequence[Cell]], suite: Suite, options: RunOptions) -> dict[str, list[Entry]]:
-    """All seeds of all rows, for a baseline."""
-    return _train(by_row, tuple(by_row), max(len(cells) for cells in by_row.values()), suite, options)
+def trained(
+    by_row: Mapping[str, Sequence[Cell]], suite: Suite, options: RunOptions, *, seeds: int | None = None
+) -> dict[str, list[Entry]]:
+    """Run the first seeds of all rows, by default every seed; what is there is not run again."""
+    run_missing([cell for cells in by_row.values() for cell in cells[:seeds]], suite, options)
+    found: dict[str, list[Entry]] = {}
+    for row, cells in by_row.items():
+        for cell in cells[:seeds]:
+            if (result := result_of(cell)) is None:
+                raise KeyboardInterrupt("some trainings were interrupted")
+            found.setdefault(row, []).append(Entry(cell, result))
+    return found
 
 
-def times_of(entries: Mapping[str, Sequence[Entry]], out: Path) -> dict[str, dict[str, float]]:
+def times_of(entries: Mapping[str, Sequence[Entry]], out: Path) -> Times:
     """Least times of each row's first avatar, drawn `TIMED` times, and of its trainings, for a baseline."""
     progress = Progress("avatars timed", len(entries), expected_s=10.0 * TIMED, workers=1)
     times = {}
@@ -125,89 +125,50 @@ def times_of(entries: Mapping[str, Sequence[Entry]], out: Path) -> dict[str, dic
         first = seeds[0]
         times[row] = training_time(seeds)
         if keeps_avatar(first.cell):
-            times[row] |= least_times(timed_again(first, first.cell, out / FROZEN) for _ in range(TIMED))
+            copies = (copied(first, first.cell, out / FROZEN) for _ in range(TIMED))
+            times[row] |= least_times(time_cell(copy) for copy in copies)
         progress.finish(row)
     progress.close()
     return times
 
 
-def _first(baseline: Baseline, row: str) -> Entry:
-    return baseline.rows[row][0]
-
-
-def _row_checks(baseline: Baseline, by_row: Mapping[str, Sequence[Cell]]) -> list[Check]:
-    """What the run lacks or adds."""
-    missing = "the baseline has this row and the suite lacks it"
-    added = "the baseline has no results of this row; --update-baseline adds it"
-    return [
-        *(Check(row=row, layer="rows", verdict="worse", detail=missing) for row in baseline.rows if row not in by_row),
-        *(
-            Check(row=row, layer="rows", verdict="not judged", detail=added)
-            for row in by_row
-            if row not in baseline.rows
-        ),
-    ]
-
-
-def _draw_frozen(
-    baseline: Baseline,
-    by_row: Mapping[str, Sequence[Cell]],
-    rows: Sequence[str],
-    options: RunOptions,
-    checks: list[Check],
-) -> tuple[dict[str, Iterator[Timing]], dict[str, Worst]]:
-    """Draw the baseline's avatars by today's code, and judge protocol and rendering.
-
-    Returns times of each: of the pictures that were judged, then ever new ones; and the worst pictures.
-    """
-    frozen, out = [row for row in rows if keeps_avatar(_first(baseline, row).cell)], options.out / FROZEN
-    drawn: dict[str, Iterator[Timing]] = {}
-    worst: dict[str, Worst] = {}
-    progress = Progress("frozen avatars", len(frozen), expected_s=15.0, workers=1)
-    for row in frozen:
-        entry, here = _first(baseline, row), by_row[row][0]
-        capture = load_capture(here.capture_folder)
-        if capture.identity == entry.cell.config.capture:
-            checks.append(protocol_check(row, entry, capture))
+def _row_checks(baseline: Baseline, by_row: Mapping[str, list[Cell]]) -> tuple[list[Check], dict[str, list[Cell]]]:
+    """What the run lacks or adds, and the cells of the rows that can be compared."""
+    checks: list[Check] = []
+    comparable: dict[str, list[Cell]] = {}
+    for row in dict.fromkeys((*baseline.rows, *by_row)):
+        if row not in by_row:
+            checks.append(Check(row, "rows", "worse", "the baseline has this row and the suite lacks it"))
+        elif row not in baseline.rows:
+            detail = "the baseline has no results of this row; --update-baseline adds it"
+            checks.append(Check(row, "rows", "not judged", detail))
+        elif by_row[row][0].config.truth != baseline.rows[row][0].result.config.truth:
+            detail = "the ground truth changed, so qualities cannot be compared; update the baseline"
+            checks.append(Check(row, "rows", "worse", detail, "capture"))
         else:
-            told = "the truth has other bytes here, rounded by another processor"
-            checks.append(Check(row=row, layer="protocol", verdict="not judged", detail=told))
-        try:
-            result = drawn_again(entry, here, out)
-        except InputError as error:
-            told = f"the frozen avatar cannot be drawn any more: {error}"
-            checks.append(Check(row=row, layer="rendering", verdict="worse", detail=told))
-            continue
-        after = replace(entry.cell, folder=out / entry.cell.config.key)
-        found = worst_picture(entry.cell, after, entry.result, capture)
-        if found is not None:
-            worst[row] = found
-        checks += rendering_checks(row, entry.result, result, found)
-        drawn[row] = _timings(result, entry, here, out)
-        progress.finish(row)
-    progress.close()
-    return drawn, worst
+            comparable[row] = by_row[row]
+    return checks, comparable
 
 
-def _timings(first: CellResult, entry: Entry, here: Cell, out: Path) -> Iterator[Timing]:
-    if first.timing is not None:
-        yield first.timing
-    while True:
-        yield timed_again(entry, here, out)
+def _draw_frozen(row: str, entry: Entry, here: Cell, out: Path) -> tuple[list[Check], CellResult | None, Worst | None]:
+    """Draw a baseline's avatar by today's code, and judge protocol and rendering.
 
-
-def _train(
-    by_row: Mapping[str, Sequence[Cell]], rows: Sequence[str], seeds: int, suite: Suite, options: RunOptions
-) -> dict[str, list[Entry]]:
-    """Run the first seeds of some rows; what is there is not run again."""
-    run_missing([cell for row in rows for cell in by_row[row][:seeds]], suite, options)
-    found = {}
-    for row in rows:
-        results = [(cell, result_of(cell)) for cell in by_row[row][:seeds]]
-        if any(result is None for _, result in results):
-            raise KeyboardInterrupt("some trainings were interrupted")
-        found[row] = [Entry(cell=cell, result=result) for cell, result in results if result is not None]
-    return found
+    Returns the checks, its result (None: it cannot be drawn), and its worst picture where rendering changed.
+    """
+    capture = load_capture(here.capture_folder)
+    if capture.identity == entry.cell.config.capture:
+        protocol = protocol_check(row, entry, capture)
+    else:
+        detail = "the truth has other bytes here, rounded by another processor"
+        protocol = Check(row, "protocol", "not judged", detail)
+    cell = copied(entry, here, out)
+    try:
+        result = evaluate_cell(cell)
+    except InputError as error:
+        detail = f"the frozen avatar cannot be drawn any more: {error}"
+        return [protocol, Check(row, "rendering", "worse", detail)], None, None
+    checks, worst = rendering_checks(row, entry, Entry(cell, result), capture)
+    return [protocol, *checks], result, worst
 
 
 def _drop_failed(pairs: Pairs) -> list[Check]:
@@ -215,23 +176,22 @@ def _drop_failed(pairs: Pairs) -> list[Check]:
     checks = []
     for row, (_, entries) in list(pairs.items()):
         if failed := [entry.result for entry in entries if entry.result.status != "done"]:
-            told = f"{len(failed)} of {len(entries)} trainings failed: {failed[0].status}: {failed[0].reason}"
-            checks.append(Check(row=row, layer="rows", verdict="worse", detail=told))
+            detail = f"{len(failed)} of {len(entries)} trainings failed: {failed[0].status}: {failed[0].reason}"
+            checks.append(Check(row, "rows", "worse", detail))
             del pairs[row]
     return checks
 
 
-def _judge_training(pairs: Pairs, checks: list[Check]) -> None:
+def _training_checks(pairs: Pairs) -> list[Check]:
     """Failed cells, first steps and seeds."""
-    checks += _drop_failed(pairs)
-    for row, (before, entries) in pairs.items():
-        logs = (each.cell.folder / "log.jsonl" for each in (before[0], entries[0]))
-        checks += [check for check in (first_steps_check(row, *logs),) if check is not None]
-        if equal_seeds(row, before) is None:
-            checks += [check for check in (equal_seeds(row, entries),) if check is not None]
+    checks = _drop_failed(pairs)
+    for row, (before, after) in pairs.items():
+        logs = (entries[0].cell.folder / "log.jsonl" for entries in (before, after))
+        checks += filter(None, (first_steps_check(row, *logs), seeds_check(row, before, after)))
+    return checks
 
 
-def _judge_quality(
+def _quality_checks(
     pairs: Pairs,
     by_row: Mapping[str, Sequence[Cell]],
     suite: Suite,
@@ -244,12 +204,12 @@ def _judge_quality(
     count = TRAINED
     failed: list[Check] = []
     while True:
-        quality = judge_quality(pairs, looks=max(1, seeds - 1))
-        undecided = [row for row in quality.undecided if count < min(len(by_row[row]), len(pairs[row][0]))]
-        if not undecided or time.monotonic() >= until:
-            return [*failed, *quality.checks]
+        checks, undecided = judge_quality(pairs, looks=seeds - 1)
+        more = {row: by_row[row] for row in undecided if count < min(len(by_row[row]), len(pairs[row][0]))}
+        if not more or time.monotonic() >= until:
+            return [*failed, *checks]
         count += 1
-        for row, entries in _train(by_row, undecided, count, suite, options).items():
+        for row, entries in trained(more, suite, options, seeds=count).items():
             pairs[row] = pairs[row][0], entries
         failed += _drop_failed(pairs)
 
@@ -257,30 +217,45 @@ def _judge_quality(
 def _cost_checks(
     baseline: Baseline,
     pairs: Pairs,
-    drawn: Mapping[str, Iterator[Timing]],
-    turns: Mapping[str, Callable[[], tuple[list[Check], dict[str, float]]]],
-    times: dict[str, dict[str, float]],
-) -> list[Check]:
-    """Times in turn with a revision, by `turns`; on a processor like the baseline's, memory and stored times as well.
+    by_row: Mapping[str, Sequence[Cell]],
+    drawn: Mapping[str, CellResult],
+    out: Path,
+    against: Revision | None,
+) -> tuple[list[Check], Times]:
+    """Counts; times in turn with a revision; on a processor like the baseline's, memory and stored times as well.
 
-    A stored time that fails is measured again. `times`: receives the least times of each row.
+    `drawn`: results of the frozen avatars. Also returns the least times of each row that was timed.
     """
-    checks = []
-    for row, turn in turns.items():
-        timed, times[row] = turn()
-        checks += timed
-    if (here := processor_name()) != baseline.file.machine:
-        told = f"memory and stored times: the baseline was made on {baseline.file.machine}, this run on {here}"
-        return [*checks, Check(row="", layer="cost", verdict="not judged", detail=told)]
+    checks: list[Check] = []
+    times: Times = {}
+    machine = processor_name()
     for row, (before, after) in pairs.items():
-        checks.append(memory_check(row, before, after))
-        old, training = baseline.file.times.get(row, {}), training_time(after)
-        if row in drawn and row not in turns:
-            timed, times[row] = _times_again(row, old, training, drawn[row])
+        first, here = before[0], by_row[row][0]
+        checks += count_checks(row, first.result, after[0].result)
+        in_turn = row in drawn and against is not None and first.cell.config.source in against.methods
+        if in_turn and against is not None:
+            timed, times[row] = interleaved(row, first, here, out, against)
             checks += timed
-        else:
-            checks += time_checks(row, old, training, stored=True)
-    return checks
+        if machine == baseline.file.machine:
+            checks.append(memory_check(row, before, after))
+            old, training = baseline.file.times.get(row, {}), training_time(after)
+            if row in drawn and not in_turn:
+                timed, times[row] = _times_again(row, old, training, _timings(drawn[row], first, here, out))
+                checks += timed
+            else:
+                checks += time_checks(row, old, training, stored=True)
+    if machine != baseline.file.machine:
+        detail = f"memory and stored times: the baseline was made on {baseline.file.machine}, this run on {machine}"
+        checks.append(Check("", "cost", "not judged", detail))
+    return checks, times
+
+
+def _timings(drawn: CellResult, entry: Entry, here: Cell, out: Path) -> Iterator[Timing]:
+    """Times of the frozen avatar: of the pictures that were judged, then ever new ones."""
+    assert drawn.timing is not None
+    yield drawn.timing
+    while True:
+        yield time_cell(copied(entry, here, out))
 
 
 def _times_again(

@@ -17,7 +17,7 @@ from benchmarks.gate.baseline import row_of
 from benchmarks.gate.checks import outcome
 from benchmarks.gate.gate import Judgement
 from benchmarks.report import escaping
-from benchmarks.report.vega import BLUE, Figure, Series
+from benchmarks.report.vega import BLUE, Figure
 
 FILE, PAGE = "history.jsonl", "index.html"
 LARGEST = 1 << 26  # bytes of the file
@@ -26,7 +26,7 @@ FRAME = "frame, times the reference workload"
 STEP = 4.0  # A change of so many standard deviations of earlier changes is marked with its commit.
 
 
-def append(judged: Judgement, times: dict[str, dict[str, float]], folder: Path) -> Path:
+def append(judged: Judgement, folder: Path) -> Path:
     """Add a run to the history in `folder`, and write the page; returns the page.
 
     Raises:
@@ -35,12 +35,11 @@ def append(judged: Judgement, times: dict[str, dict[str, float]], folder: Path) 
     lines = read(folder / FILE)
     rows: dict[str, dict[str, float]] = {}
     for cell in judged.run.cells:
-        result = result_of(cell)
-        if result is None or result.status != "done" or row_of(cell.config) in rows:
-            continue
-        values = {"/".join(name): value for name in SHOWN if (value := result.value(*name)) is not None}
-        frame = times.get(row_of(cell.config), {}).get("frame")
-        rows[row_of(cell.config)] = values | ({} if frame is None else {FRAME: frame})
+        result, row = result_of(cell), row_of(cell.config)
+        if result is not None and result.status == "done" and row not in rows:
+            values = {"/".join(name): result.value(*name) for name in SHOWN}
+            values[FRAME] = judged.times.get(row, {}).get("frame")
+            rows[row] = {what: value for what, value in values.items() if value is not None}
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     commit = commit_of({cell.config.source for cell in judged.run.cells})
     lines.append({"commit": commit, "when": now, "outcome": outcome(judged.checks), "rows": rows})
@@ -97,11 +96,11 @@ def table(lines: list[dict[str, Any]]) -> pd.DataFrame:
 
 def page(lines: list[dict[str, Any]]) -> str:
     """The page: a chart per row and quantity."""
-    found = table(lines)
-    figures = []
-    for index, ((row, what), values) in enumerate(found.groupby(["row", "what"], sort=False)):
-        figures.append((f"{row}: {_words(what)}", _figure(index, f"{row}: {_words(what)}", values)))
-    charts = "".join(f"<h2>{escaping.xml(title)}</h2>{figure.svg()}" for title, figure in figures)
+    charts = []
+    for index, ((row, what), values) in enumerate(table(lines).groupby(["row", "what"], sort=False)):
+        title = f"{row}: {_words(what)}"
+        figure = Figure(name=f"history_{index}", title=title, caption="", panels=(_panel(values),))
+        charts.append(f"<h2>{escaping.xml(title)}</h2>{figure.svg()}")
     last = lines[-1]
     head = f"{len(lines)} runs; the last: commit {last['commit']}, {last['when']}: {last['outcome']}"
     return (
@@ -109,31 +108,27 @@ def page(lines: list[dict[str, Any]]) -> str:
         '<meta name="viewport" content="width=device-width"><style>body{font-family:system-ui,sans-serif;margin:2em;'
         "max-width:60em}svg{max-width:100%;height:auto}</style></head><body><h1>History of the gate</h1>"
         f"<p>{escaping.xml(head)}. A named point is a step, a change far above the usual one, with its commit.</p>"
-        f"{charts}</body></html>\n"
+        f"{''.join(charts)}</body></html>\n"
     )
 
 
 def _words(what: str) -> str:
-    split, _, rest = what.partition("/")
-    metric = METRICS.get(rest.rpartition("/")[2])
-    return (
-        what if metric is None else f"{metric.title} of {split.replace('_', ' ')}s{metric.unit and ', ' + metric.unit}"
-    )
+    """The title of a quantity."""
+    if (metric := METRICS.get(what.rpartition("/")[2])) is None:
+        return what
+    return f"{metric.title} of {what.partition('/')[0].replace('_', ' ')}s{metric.unit and ', ' + metric.unit}"
 
 
-def _figure(index: int, title: str, values: pd.DataFrame) -> Figure:
+def _panel(values: pd.DataFrame) -> Any:
     where = alt.Chart(values).encode(
         x=alt.X("run:Q", title="run", axis=alt.Axis(tickMinStep=1)),
         y=alt.Y("value:Q", title=None, scale=alt.Scale(zero=False)),
     )
-    named = where.transform_filter("datum.step")
+    steps = where.transform_filter("datum.step")
     layers = alt.layer(
         where.mark_line(color=BLUE),
         where.mark_point(color=BLUE, filled=True),
-        named.mark_point(color=BLUE, size=120),
-        named.mark_text(dy=-12).encode(text="commit:N"),
+        steps.mark_point(color=BLUE, size=120),
+        steps.mark_text(dy=-12).encode(text="commit:N"),
     )
-    panel: Any = layers.properties(width=620, height=160)
-    return Figure(
-        name=f"history_{index}", title=title, caption="", panels=(panel,), series=(Series(title=title, colour=BLUE),)
-    )
+    return layers.properties(width=620, height=160)

@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+
+import numpy as np
 
 from benchmarks.analysis.statistics import Comparison, compare_samples, corrected
 from benchmarks.cell.metrics import METRICS
@@ -27,89 +29,56 @@ MORE_MEMORY = 1.10
 Pairs = dict[str, tuple[Sequence[Entry], Sequence[Entry]]]  # by row: before and after, seeds in order
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Quality:
-    """Checks of scores, and the rows of which more seeds would tell more."""
-
-    checks: tuple[Check, ...]
-    undecided: tuple[str, ...]
-
-
-def judge_quality(pairs: Pairs, *, looks: int) -> Quality:
+def judge_quality(pairs: Pairs, *, looks: int) -> tuple[list[Check], list[str]]:
     """Compare scores in pairs: the same seed before and after, which share their random numbers.
 
     `looks`: how often this run is judged at most, once after each further seed; p values are multiplied by it
-    (Bonferroni), then corrected over all comparisons (Holm).
+    (Bonferroni), then corrected over all comparisons (Holm). Also returns the rows of which more seeds would tell more.
     """
     checks: list[Check] = []
-    tests: list[tuple[str, tuple[str, str, str], Comparison, float, float]] = []
-    undecided = []
+    asked: list[tuple[str, str, str]] = []  # row, name, change
+    tests: list[Comparison] = []
+    undecided: list[str] = []
     for row, (before, after) in pairs.items():
-        seeds = _common(before, after)
-        if all(_drawn(old) == _drawn(new) for old, new in seeds):
-            detail = f"identical predictions of {len(seeds)} seeds"
-            checks.append(Check(row=row, layer="quality", verdict="unchanged", detail=detail))
+        old_of_seed = {entry.result.config.seed: entry.result for entry in before}
+        known = [entry.result for entry in after if entry.result.config.seed in old_of_seed]
+        seeds = [(old_of_seed[new.config.seed], new) for new in known]
+        if all([v.prediction for v in old.views] == [v.prediction for v in new.views] for old, new in seeds):
+            checks.append(Check(row, "quality", "unchanged", f"identical predictions of {len(seeds)} seeds"))
         elif len(seeds) < 2:
-            told = "another picture with the only seed that both have: expected a second"
-            checks.append(Check(row=row, layer="quality", verdict="not judged", detail=told))
+            detail = "another picture with the only seed that both have: expected a second"
+            checks.append(Check(row, "quality", "not judged", detail))
             undecided.append(row)
         else:
             for name in GATED:
-                tests += _tests(row, name, seeds)
-                checks += _missing(row, name, seeds)
-    adjusted = corrected([replace(test, p=min(1.0, looks * test.p)) for _, _, test, _, _ in tests])
-    for (row, name, _, old, new), test in zip(tests, adjusted, strict=True):
-        checks.append(_quality_check(row, name, test, old, new))
+                values = [(old.value(*name), new.value(*name)) for old, new in seeds]
+                if any(old is not None and new is None for old, new in values):
+                    checks.append(_missing(row, name))
+                elif all(old is not None for old, _ in values):
+                    metric, (old, new) = METRICS[name[2]], np.array(values, dtype=float).T
+                    up = metric.direction == "up"
+                    by_seed = ({str(seed): [value] for seed, value in enumerate(side)} for side in (new, old))
+                    test = compare_samples(*by_seed, margin=metric.abs_tol, higher_is_better=up)
+                    assert test is not None, "the seeds are common"
+                    tests.append(replace(test, p=min(1.0, looks * test.p)))
+                    change = f"{old.mean():.4g} -> {new.mean():.4g}{metric.unit and ' ' + metric.unit}"
+                    asked.append((row, "/".join(name), change))
+    for (row, name, change), test in zip(asked, corrected(tests), strict=True):
+        detail = (
+            f"{change} ({test.mean:+.4g} [{test.low:+.4g}, {test.high:+.4g}], p {test.p:.2g}, {test.verdict}; "
+            f"a change of {max(test.margin, test.detectable):.2g} would have been seen)"
+        )
+        checks.append(Check(row, "quality", OF_VERDICT[test.verdict], detail, name))
         if test.verdict == "unclear" and row not in undecided:
             undecided.append(row)
-    return Quality(checks=tuple(checks), undecided=tuple(undecided))
+    return checks, undecided
 
 
-def _common(before: Sequence[Entry], after: Sequence[Entry]) -> list[tuple[CellResult, CellResult]]:
-    """Results of the seeds that both have."""
-    by_seed = {entry.result.config.seed: entry.result for entry in before}
-    found = [(by_seed.get(entry.result.config.seed), entry.result) for entry in after]
-    return [(old, new) for old, new in found if old is not None]
-
-
-def _drawn(result: CellResult) -> list[str]:
-    return [view.prediction for view in result.views]
-
-
-def _tests(
-    row: str, name: tuple[str, str, str], seeds: Sequence[tuple[CellResult, CellResult]]
-) -> list[tuple[str, tuple[str, str, str], Comparison, float, float]]:
-    """The comparison of one score, if both have it."""
-    values = [(old.value(*name), new.value(*name)) for old, new in seeds]
-    known = [(old, new) for old, new in values if old is not None and new is not None]
-    if len(known) < 2 or len(known) < len(values):
-        return []
-    metric = METRICS[name[2]]
-    before, after = ({str(seed): [pair[side]] for seed, pair in enumerate(known)} for side in (0, 1))
-    test = compare_samples(after, before, margin=metric.abs_tol, higher_is_better=metric.direction == "up")
-    assert test is not None
-    old, new = (sum(pair[side] for pair in known) / len(known) for side in (0, 1))
-    return [(row, name, test, old, new)]
-
-
-def _missing(row: str, name: tuple[str, str, str], seeds: Sequence[tuple[CellResult, CellResult]]) -> list[Check]:
+def _missing(row: str, name: tuple[str, str, str]) -> Check:
     """A score that was measured and is not any more; LPIPS where its weights are absent is not judged."""
-    if all(new.value(*name) is not None for old, new in seeds if old.value(*name) is not None):
-        return []
-    absent = name[2] == "lpips"
-    detail = "n/a: no weights for LPIPS here" if absent else "not measured"
-    verdict: Verdict = "not judged" if absent else "worse"
-    return [Check(row=row, layer="quality", name="/".join(name), verdict=verdict, detail=detail)]
-
-
-def _quality_check(row: str, name: tuple[str, str, str], test: Comparison, old: float, new: float) -> Check:
-    unit = METRICS[name[2]].unit
-    seen = max(test.margin, test.detectable)
-    detail = (
-        f"{old:.4g} -> {new:.4g}{unit and ' ' + unit} ({test.mean:+.4g} [{test.low:+.4g}, {test.high:+.4g}], "
-        f"p {test.p:.2g}, {test.verdict}; a change of {seen:.2g} would have been seen)"
-    )
-    return Check(row=row, layer="quality", name="/".join(name), verdict=OF_VERDICT[test.verdict], detail=detail)
+    if name[2] == "lpips":
+        return Check(row, "quality", "not judged", "n/a: no weights for LPIPS here", "/".join(name))
+    return Check(row, "quality", "worse", "not measured", "/".join(name))
 
 
 def count_checks(row: str, before: CellResult, after: CellResult) -> list[Check]:
@@ -120,7 +89,7 @@ def count_checks(row: str, before: CellResult, after: CellResult) -> list[Check]
         if old is None or new is None:
             continue
         verdict: Verdict = "unchanged" if new == old else "worse" if new > old else "not worse"
-        checks.append(Check(row=row, layer="cost", name=name, verdict=verdict, detail=f"{old:g} -> {new:g}"))
+        checks.append(Check(row, "cost", verdict, f"{old:g} -> {new:g}", name))
     return checks
 
 
@@ -129,7 +98,7 @@ def memory_check(row: str, before: Sequence[Entry], after: Sequence[Entry]) -> C
     old, new = (max((e.result.value("memory", "", "peak_rss_mb") or 0.0) for e in each) for each in (before, after))
     verdict: Verdict = "worse" if new > MORE_MEMORY * old else "unchanged"
     detail = f"{old:.0f} -> {new:.0f} MB (a rise from {MORE_MEMORY - 1:.0%} on fails)"
-    return Check(row=row, layer="cost", name="peak memory", verdict=verdict, detail=detail)
+    return Check(row, "cost", verdict, detail, "peak memory")
 
 
 def least_times(timings: Iterable[Timing], *, beside: Iterable[Timing] = ()) -> dict[str, float]:
@@ -176,5 +145,5 @@ def time_checks(row: str, before: Mapping[str, float], after: Mapping[str, float
             told = f"stored times cannot decide a rise below {fails - 1:.0%}"
             told += "" if name == "training" else "; --against REV does"
         detail = f"{before[name]:.4g} -> {after[name]:.4g} times the reference workload ({rise - 1:+.0%}; {told})"
-        checks.append(Check(row=row, layer="cost", name=f"time of {name}", verdict=verdict, detail=detail))
+        checks.append(Check(row, "cost", verdict, detail, f"time of {name}"))
     return checks

@@ -2,16 +2,16 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 
-from ash.files import InputError, write_atomic
-from benchmarks import provenance
-from benchmarks.cell.registry import DECIDING_PACKAGES, find_method, named_method
+from ash.files import write_atomic
 from benchmarks.gate.baseline import Baseline
 from benchmarks.gate.checks import FAILING, LAYERS, Check, Verdict, outcome
 from benchmarks.gate.exact import Worst
 from benchmarks.gate.gate import Judgement
+from benchmarks.provenance import commit, processor_name
 from benchmarks.report import escaping
 from benchmarks.report.pictures import Frame, Frames, crop_of, on_paper, sheet
 
@@ -22,19 +22,6 @@ WORDS: dict[Verdict, str] = {
     "better than explained": "better than explained: a leak looks like progress",
     "not judged": "incomplete: nothing could be judged",
 }
-# Sources that decide a time, by its name, and what is shared by all methods.
-STAGES = {
-    "stg1": ("ash/template/",),
-    "stg2": ("ash/textures.py", "ash/native/"),
-    "stg3": ("ash/decoders.py", "ash/native/"),
-    "stg4": ("ash/gaussians/", "ash/native/"),
-    "training": ("ash/training/",),
-    "frame": ("ash/",),
-}
-TEMPLATE = ("ash/template/", "ash/template_learning/")
-SHARED = ("ash/", "synth/", "benchmarks/cell/")
-SOURCES = ("ash/", "baselines/", "synth/", "benchmarks/cell/", "pyproject.toml", "constraints.txt")
-SHOWN_FILES = 20
 BRIGHTER = 4  # The difference of two pictures is shown so many times as large.
 
 
@@ -47,24 +34,20 @@ def verdict(checks: Sequence[Check]) -> str:
     return f"gate: {'FAILED' if found in FAILING else 'passed'}, {WORDS[found]} ({count})"
 
 
-def terminal(baseline: Baseline, judged: Judgement, changed: Sequence[str] | None) -> str:
-    """The verdict, what changed and by how much, likely sources, and the verdict again."""
+def terminal(baseline: Baseline, judged: Judgement) -> str:
+    """The verdict, what changed and by how much, and the verdict again."""
     checks = judged.checks
     shown = [check for check in checks if check.verdict != "unchanged"] or checks
-    here = provenance.commit()
-    lines = [verdict(checks), f"suite {judged.run.suite}, commit {here} against baseline {baseline.commit}"]
+    lines = [verdict(checks), f"suite {judged.run.suite}, commit {commit()} against baseline {baseline.commit}"]
     lines += [f"  {check.verdict:22} {check.title}: {check.detail}" for check in _in_order(shown)]
-    if bad := [check for check in checks if check.verdict in FAILING]:
-        lines += ["", *likely_sources(bad, changed)]
     lines += [f"Accepted at {a.commit}: {a.row}: {a.because}" for a in baseline.file.accepted]
-    lines.append(verdict(checks))
-    return "\n".join(escaping.CONTROLS.sub(" ", line) for line in lines)
+    return "\n".join(escaping.CONTROLS.sub(" ", line) for line in [*lines, verdict(checks)])
 
 
 def markdown(baseline: Baseline, judged: Judgement) -> str:
     """A summary for a pull request: the verdict, what changed, and all checks folded away."""
     checks = judged.checks
-    texts = (judged.run.suite, provenance.commit(), baseline.commit, provenance.processor_name())
+    texts = (judged.run.suite, commit(), baseline.commit, processor_name())
     suite, here, before, machine = map(escaping.markdown, texts)
     lines = [f"## {escaping.markdown(verdict(checks))}", ""]
     lines.append(f"Suite {suite}, commit {here} against baseline {before}, on {machine}.")
@@ -79,22 +62,19 @@ def markdown(baseline: Baseline, judged: Judgement) -> str:
 
 def junit(checks: Sequence[Check]) -> str:
     """The checks as a JUnit file."""
-    bad = sum(check.verdict in FAILING for check in checks)
-    skipped = sum(check.verdict == "not judged" for check in checks)
-    lines = ['<?xml version="1.0" encoding="UTF-8"?>']
-    numbers = f'tests="{len(checks)}" failures="{bad}" errors="0" skipped="{skipped}"'
-    lines.append(f'<testsuite name="ash-bench gate" {numbers}>')
+    failing, skipped = (sum(c.verdict in kinds for c in checks) for kinds in (FAILING, ("not judged",)))
+    counts = {"tests": len(checks), "failures": failing, "errors": 0, "skipped": skipped}
+    texts = {name: str(count) for name, count in counts.items()}
+    suite = ElementTree.Element("testsuite", {"name": "ash-bench gate", **texts})
     for check in checks:
-        name = ": ".join(part for part in (check.layer, check.name) if part)
-        head = f'  <testcase classname="{escaping.xml(check.row)}" name="{escaping.xml(name)}"'
-        detail = escaping.xml(check.detail)
+        row, layer, name, detail = map(escaping.one_line, (check.row, check.layer, check.name, check.detail))
+        case = ElementTree.SubElement(suite, "testcase", classname=row, name=": ".join(filter(None, (layer, name))))
         if check.verdict == "not judged":
-            lines.append(f'{head}><skipped message="{detail}"/></testcase>')
+            ElementTree.SubElement(case, "skipped", message=detail)
         elif check.verdict in FAILING:
-            lines.append(f'{head}><failure message="{escaping.xml(check.verdict)}">{detail}</failure></testcase>')
-        else:
-            lines.append(f"{head}/>")
-    return "\n".join([*lines, "</testsuite>", ""])
+            ElementTree.SubElement(case, "failure", message=check.verdict).text = detail
+    ElementTree.indent(suite)
+    return ElementTree.tostring(suite, encoding="UTF-8", xml_declaration=True).decode() + "\n"
 
 
 def write_pictures(judged: Judgement, out: Path) -> list[Path]:
@@ -117,57 +97,6 @@ def _frames(row: str, worst: Worst) -> Frames:
         Frame(caption=f"difference x {BRIGHTER}", score="", pixels=difference),
     )
     return Frames(title=f"{row}, {worst.view.split}, {worst.view.camera}, frame {worst.view.frame}", images=images)
-
-
-def likely_sources(bad: Sequence[Check], changed: Sequence[str] | None) -> list[str]:
-    """Likely sources, and which of them changed since the baseline."""
-    places = _places(bad)
-    lines = [f"Look at: {', '.join(places)}."]
-    if changed is None:
-        return [*lines, "Which files changed since the baseline is not known here (no git, or not its commit)."]
-    deciding = [name for name in changed if name.startswith(SOURCES)]
-    near = [name for name in deciding if name.startswith(places)]
-    other = [name for name in deciding if name not in near]
-    if not deciding:
-        told = "No source of ash-bench that decides a result changed since the baseline"
-        return [*lines, f"{told}: look at methods of your own, the machine and versions."]
-    lines.append(f"{len(deciding)} sources changed since the baseline, {len(near)} of them there:")
-    shown = [f"  * {name}" for name in near] + [f"    {name}" for name in other]
-    more = [f"    and {len(shown) - SHOWN_FILES} more"] if len(shown) > SHOWN_FILES else []
-    return [*lines, *shown[:SHOWN_FILES], *more]
-
-
-def _places(bad: Sequence[Check]) -> tuple[str, ...]:
-    """Folders and files that can change these numbers."""
-    places: list[str] = []
-    methods = {check.row.rpartition(" · ")[2] for check in bad if check.row}
-    for check in bad:
-        stage = check.name.removeprefix("time of ")
-        if stage in STAGES:
-            places += STAGES[stage]
-        elif check.name.endswith("template_mm"):
-            places += TEMPLATE
-        elif check.layer == "protocol":
-            places.append("benchmarks/cell/")
-        elif check.layer == "rendering":
-            places += ("ash/gaussians/", "ash/model.py", *_sources_of(check.row))
-        elif len(methods) > 1:
-            places += SHARED
-        else:
-            places += _sources_of(check.row)
-    return tuple(dict.fromkeys(places))
-
-
-def _sources_of(row: str) -> tuple[str, ...]:
-    """The module of a row's factory, and the package that all methods of ours are made of."""
-    try:
-        module = find_method(named_method(row.rpartition(" · ")[2])).target.partition(":")[0]
-    except InputError:  # A suite gave the row a name of its own.
-        return ("the method's own sources",)
-    package = module.split(".")[0]
-    if package not in DECIDING_PACKAGES:
-        return (f"{package}, the method's own package",)
-    return tuple(dict.fromkeys(("ash/" if package == "ash" else f"{module.replace('.', '/')}.py", "ash/")))
 
 
 def _in_order(checks: Sequence[Check]) -> list[Check]:

@@ -12,33 +12,32 @@ import numpy as np
 import pytest
 import torch
 
-import ash.avatar
-import ash.decoders
-import ash.model
-import ash.native.texels
-import ash.plus
-import ash.template.template
-import ash.textures
-import ash.training.batches
-import ash.training.loop
-from ash.capture.dataset import Camera, Pose
+from ash import model as ash_model
+from ash import plus
+from ash.avatar import AshAvatar
+from ash.capture.dataset import Pose
 from ash.config import AshConfig
+from ash.decoders import GlobalFeatures
+from ash.model import AshModel
+from ash.native import texels
 from ash.rotations import RigidTransforms
-from ash.template.skinning import SkinWeights
+from ash.template import template
+from ash.template.template import Template
+from ash.textures import TextureDrawer
+from ash.training import batches, loop
 from benchmarks.cell import evaluation, metrics
 from benchmarks.gate.checks import Layer
 
-Patch = pytest.MonkeyPatch
+Plant = Callable[[pytest.MonkeyPatch], None]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Defect:
-    """A change of code or configuration, and the layer that must tell it first; None: it is harmless."""
+    """A change of code (`plant`) or configuration, and the layer that must tell it first."""
 
-    about: str
-    layer: Layer | None
+    layer: Layer
+    plant: Plant = lambda _: None
     reason: str = ""  # in what the gate says
-    plant: Callable[[Patch], None] = lambda _: None
     config: Callable[[AshConfig], AshConfig] = lambda config: config
     sound: Callable[[AshConfig], AshConfig] = lambda config: config  # what it is compared with
 
@@ -51,368 +50,201 @@ def training(**changes: Any) -> Callable[[AshConfig], AshConfig]:
     return lambda config: replace(config, training=replace(config.training, **changes))
 
 
-def linear_skinning(patch: Patch) -> None:
-    def blend(joints: RigidTransforms, skin: SkinWeights) -> RigidTransforms:
-        quats = (joints.quats[skin.joints] * skin.weights[..., None]).sum(1)
-        translations = (joints.translations[skin.joints] * skin.weights[..., None]).sum(1)
-        return RigidTransforms(quats=quats / quats.norm(dim=-1, keepdim=True), translations=translations)
-
-    patch.setattr(ash.template.template, "dual_quaternion_skinning", blend)
+def replaced(owner: Any, name: str, make: Callable[[Any], Any]) -> Plant:
+    """A name of `owner` stands for what `make` makes of what it stood for."""
+    return lambda patch: patch.setattr(owner, name, make(getattr(owner, name)))
 
 
-def normals_flipped(patch: Patch) -> None:
-    sound = ash.template.template.Template.pose
-
-    def pose(*arguments: Any, **more: Any) -> ash.template.template.PosedTemplate:
-        posed = sound(*arguments, **more)
-        return replace(posed, normals=-posed.normals)
-
-    patch.setattr(ash.template.template.Template, "pose", pose)
+def result(owner: Any, name: str, change: Callable[[Any], Any]) -> Plant:
+    """The result of a function or method is changed."""
+    return replaced(owner, name, lambda sound: lambda *values, **more: change(sound(*values, **more)))
 
 
-def first_pose_kept(patch: Patch) -> None:
-    sound, kept = ash.template.template.Template.pose, []
+def gaussians(change: Callable[[Any], Any]) -> Plant:
+    """What is posed is changed on its way to the splatter."""
+    return together(result(ash_model, "pose", change), result(plus, "pose", change))
 
-    def pose(self: Any, pose: Pose) -> ash.template.template.PosedTemplate:
+
+def together(*plants: Plant) -> Plant:
+    def plant(patch: pytest.MonkeyPatch) -> None:
+        for each in plants:
+            each(patch)
+
+    return plant
+
+
+def linear_skinning(joints: RigidTransforms, skin: Any) -> RigidTransforms:
+    quats = (joints.quats[skin.joints] * skin.weights[..., None]).sum(1)
+    translations = (joints.translations[skin.joints] * skin.weights[..., None]).sum(1)
+    return RigidTransforms(quats=quats / quats.norm(dim=-1, keepdim=True), translations=translations)
+
+
+def first_pose_kept(sound: Any) -> Any:
+    kept: list[Any] = []
+
+    def pose(self: Template, pose: Pose) -> Any:
         if not kept:
             kept.append(sound(self, pose))
         return kept[0]
 
-    patch.setattr(ash.template.template.Template, "pose", pose)
+    return pose
 
 
-def sh_not_turned(patch: Patch) -> None:
-    patch.setattr(ash.native.texels, "turn_sh", lambda quats, sh, *, threads: sh)
-
-
-def gaussians_changed(change: Callable[[Any], Any]) -> Callable[[Patch], None]:
-    """What is posed is changed on its way to the splatter."""
-
-    def plant(patch: Patch) -> None:
-        for module in (ash.model, ash.plus):
-            sound = module.pose
-            patch.setattr(module, "pose", lambda *a, sound=sound, **more: change(sound(*a, **more)))
-
-    return plant
-
-
-def with_holes(gaussians: Any) -> Any:
-    shown = torch.ones_like(gaussians.opacities)
+def with_holes(posed: Any) -> Any:
+    shown = torch.ones_like(posed.opacities)
     shown[::4] = 0
-    return replace(gaussians, opacities=gaussians.opacities * shown)
+    return replace(posed, opacities=posed.opacities * shown)
 
 
-def in_linear_light(patch: Patch) -> None:
-    sound = ash.model.splat
-
-    def splat(gaussians: Any, **more: Any) -> Any:
-        drawn = sound(replace(gaussians, sh=gaussians.sh * gaussians.sh.abs()), **more)
+def in_linear_light(sound: Any) -> Any:
+    def splat(posed: Any, **more: Any) -> Any:
+        drawn = sound(replace(posed, sh=posed.sh * posed.sh.abs()), **more)
         return replace(drawn, rgb=drawn.rgb.clamp(min=1e-8).sqrt())
 
-    patch.setattr(ash.model, "splat", splat)
+    return splat
 
 
-def camera_moved(pixels: float) -> Callable[[Patch], None]:
-    def plant(patch: Patch) -> None:
-        sound = ash.avatar.AshAvatar.render
+def camera_moved(pixels: float) -> Plant:
+    shift = np.array([[0, 0, pixels], [0, 0, 0], [0, 0, 0]])
 
-        def render(self: Any, pose: Pose, camera: Camera, *, clock: Any) -> np.ndarray:
-            K = camera.K + np.array([[0, 0, pixels], [0, 0, 0], [0, 0, 0]])
-            return sound(self, pose, replace(camera, K=K), clock=clock)
+    def moved(sound: Any) -> Any:
+        return lambda self, pose, camera, *, clock: sound(self, pose, replace(camera, K=camera.K + shift), clock=clock)
 
-        patch.setattr(ash.avatar.AshAvatar, "render", render)
-
-    return plant
+    return replaced(AshAvatar, "render", moved)
 
 
-def textures_of_the_frame_before(patch: Patch) -> None:
-    sound = ash.textures.TextureDrawer.forward
-
-    def forward(self: Any, template: Any, pose: Pose) -> torch.Tensor:
-        return sound(self, template, Pose(pose.motion, max(0, pose.frame - 1)))
-
-    patch.setattr(ash.textures.TextureDrawer, "forward", forward)
+def one_camera_off(sound: Any) -> Any:
+    return lambda camera, left, *more: sound(camera, left + 2 * (camera.name == "cam1"), *more)
 
 
-def residual_weakened(patch: Patch) -> None:
-    sound = ash.model.AshModel.residual
-    patch.setattr(ash.model.AshModel, "residual", lambda self, inputs: 0.9 * sound(self, inputs))
+def alpha_changed(change: Callable[[torch.Tensor], torch.Tensor]) -> Plant:
+    """Training images have other masks, uint8 `[h, w]`."""
+
+    def changed(sound: Any) -> Any:
+        return lambda rgba, *more: sound(torch.cat([rgba[..., :3], change(rgba[..., 3])[..., None]], -1), *more)
+
+    return replaced(batches, "composite", changed)
 
 
-def phi_dropped(patch: Patch) -> None:
-    sound = ash.decoders.GlobalFeatures.forward
-    patch.setattr(ash.decoders.GlobalFeatures, "forward", lambda self, where: 0 * sound(self, where))
+def eroded(alpha: torch.Tensor) -> torch.Tensor:
+    return -torch.nn.functional.max_pool2d(-alpha[None, None].float(), 3, 1, 1)[0, 0].to(torch.uint8)
 
 
-def one_camera_off(patch: Patch) -> None:
-    sound = ash.training.batches.crop_camera
-
-    def crop(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
-        return sound(camera, left + 2 * (camera.name == "cam1"), top, width, height)
-
-    patch.setattr(ash.training.batches, "crop_camera", crop)
-
-
-def masks_eroded(patch: Patch) -> None:
-    sound = ash.training.batches.composite
-
-    def composite(rgba: torch.Tensor, background: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        alpha = -torch.nn.functional.max_pool2d(-rgba[None, None, ..., 3].float(), 3, 1, 1)[0, 0]
-        return sound(torch.cat([rgba[..., :3], alpha.to(torch.uint8)[..., None]], -1), background)
-
-    patch.setattr(ash.training.batches, "composite", composite)
-
-
-def frames_in_another_order(patch: Patch) -> None:
-    sound = ash.training.batches._order
-    patch.setattr(ash.training.batches, "_order", lambda seed, epoch, frames: sound(seed, epoch + 1, frames))
-
-
-def adam_with(other: float) -> Callable[[Patch], None]:
+def adam_with(eps: float) -> Plant:
     """Another constant below the root of the second moment."""
-
-    def plant(patch: Patch) -> None:
-        sound = ash.training.loop.Adam
-        patch.setattr(ash.training.loop, "Adam", lambda groups, *, eps: sound(groups, eps=other))
-
-    return plant
+    return replaced(loop, "Adam", lambda sound: lambda groups, **_: sound(groups, eps=eps))
 
 
-def gradient_halved(patch: Patch) -> None:
-    sound = ash.avatar.AshAvatar.loss
-
-    def loss(self: Any, batches: Any, step: int) -> torch.Tensor:
-        whole = sound(self, batches, step)
-        return 0.5 * whole + 0.5 * whole.detach()
-
-    patch.setattr(ash.avatar.AshAvatar, "loss", loss)
-
-
-def psnr_of_the_whole_frame(patch: Patch) -> None:
-    sound = metrics.psnr
-    patch.setattr(metrics, "psnr", lambda a, b, region=None: sound(a, b, None))
-
-
-def means_by(mean: Callable[[Any], float]) -> Callable[[Patch], None]:
+def means_by(mean: Callable[[Any], float]) -> Plant:
     """Means over images are taken by something else."""
 
     class Numbers:
         def __getattr__(self, name: str) -> Any:
             return mean if name == "mean" else getattr(np, name)
 
-    return lambda patch: patch.setattr(evaluation, "np", Numbers())
+    return replaced(evaluation, "np", lambda _: Numbers())
 
 
-def seed_ignored(patch: Patch) -> None:
-    sound = ash.avatar.AshAvatar.from_capture.__func__
-
-    def made(cls: Any, config: AshConfig, capture: Any) -> Any:
-        return sound(cls, replace(config, seed=0), capture)
-
-    patch.setattr(ash.avatar.AshAvatar, "from_capture", classmethod(made))
-
-
-def moved_by_rounding(gaussians: Any) -> Any:
-    return replace(gaussians, means=gaussians.means * (1 + 2e-7))
-
-
-def in_another_order(gaussians: Any) -> Any:
-    order = torch.randperm(len(gaussians.means), generator=torch.Generator().manual_seed(0))
-    return replace(gaussians, **{field.name: getattr(gaussians, field.name)[order] for field in fields(gaussians)})
-
-
-def other_signs_of_quaternions(patch: Patch) -> None:
-    sound = ash.template.template.dual_quaternion_skinning
-    patch.setattr(
-        ash.template.template,
-        "dual_quaternion_skinning",
-        lambda joints, skin: sound(RigidTransforms(quats=-joints.quats, translations=joints.translations), skin),
+def made(change: Callable[[AshConfig], AshConfig]) -> Plant:
+    """Avatars are made of another configuration."""
+    return replaced(
+        AshAvatar, "from_capture", lambda sound: staticmethod(lambda config, capture: sound(change(config), capture))
     )
 
 
-def normals_normalised_again(patch: Patch) -> None:
-    sound = ash.template.template.Template.pose
-
-    def pose(*arguments: Any, **more: Any) -> ash.template.template.PosedTemplate:
-        posed = sound(*arguments, **more)
-        return replace(posed, normals=posed.normals / posed.normals.norm(dim=-1, keepdim=True))
-
-    patch.setattr(ash.template.template.Template, "pose", pose)
+def in_another_order(posed: Any) -> Any:
+    order = torch.randperm(len(posed.means), generator=torch.Generator().manual_seed(0))
+    return replace(posed, **{field.name: getattr(posed, field.name)[order] for field in fields(posed)})
 
 
-def no_pose_kept(patch: Patch) -> None:
-    sound = ash.template.template.Template.pose
-
-    def pose(self: Any, pose: Pose) -> ash.template.template.PosedTemplate:
-        self.clear_cache()
-        return sound(self, pose)
-
-    patch.setattr(ash.template.template.Template, "pose", pose)
+def other_signs(sound: Any) -> Any:
+    return lambda joints, skin: sound(replace(joints, quats=-joints.quats), skin)
 
 
-def textures_rounded(patch: Patch) -> None:
-    sound = ash.textures.TextureDrawer.forward
-    patch.setattr(ash.textures.TextureDrawer, "forward", lambda *a, **more: sound(*a, **more) * (1 + 1e-7))
+def global_generators_used(config: AshConfig) -> AshConfig:
+    torch.rand(7)
+    np.random.default_rng().random()
+    return config
 
 
-def residual_in_halves(patch: Patch) -> None:
-    sound = ash.model.AshModel.residual
-
-    def residual(self: Any, inputs: Any) -> torch.Tensor:
-        whole = sound(self, inputs)
-        return 0.3 * whole + 0.7 * whole
-
-    patch.setattr(ash.model.AshModel, "residual", residual)
-
-
-def loss_in_halves(patch: Patch) -> None:
-    sound = ash.avatar.AshAvatar.loss
-
-    def loss(self: Any, batches: Any, step: int) -> torch.Tensor:
-        whole = sound(self, batches, step)
-        return 0.3 * whole + 0.7 * whole
-
-    patch.setattr(ash.avatar.AshAvatar, "loss", loss)
-
-
-def masks_by_another_way(patch: Patch) -> None:
-    sound = ash.training.batches.composite
-
-    def composite(rgba: torch.Tensor, background: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        alpha = (255 * (rgba[..., 3:].double() / 255)).round().to(torch.uint8)
-        return sound(torch.cat([rgba[..., :3], alpha], -1), background)
-
-    patch.setattr(ash.training.batches, "composite", composite)
-
-
-def psnr_by_root(patch: Patch) -> None:
-    sound = metrics.psnr
-
-    def psnr(a: Any, b: Any, region: Any = None) -> Any:
-        value = sound(a, b, region)
-        return 20 * math.log10(1 / math.sqrt(10 ** (-value / 10)))
-
-    patch.setattr(metrics, "psnr", psnr)
-
-
-def global_generators_used(patch: Patch) -> None:
-    sound = ash.avatar.AshAvatar.from_capture.__func__
-
-    def made(cls: Any, config: AshConfig, capture: Any) -> Any:
-        torch.rand(7)
-        np.random.default_rng().random()
-        return sound(cls, config, capture)
-
-    patch.setattr(ash.avatar.AshAvatar, "from_capture", classmethod(made))
-
-
+LARGE_OFFSETS = model(offset_unit_m=0.05, sh_degree=1)
 DEFECTS: dict[str, Defect] = {
-    "linear skinning": Defect(about="quaternions are blended linearly", layer="rendering", plant=linear_skinning),
-    "normals flipped": Defect(about="normals point inwards", layer="rendering", plant=normals_flipped),
-    "stale pose": Defect(about="a cache keeps the first pose", layer="rendering", plant=first_pose_kept),
-    "half offset": Defect(
-        about="offsets are halved",
-        layer="rendering",
-        sound=model(offset_unit_m=0.05),
-        config=model(offset_unit_m=0.025),
+    "quaternions are blended linearly": Defect(
+        "rendering", replaced(template, "dual_quaternion_skinning", lambda _: linear_skinning)
     ),
-    "sh frame": Defect(
-        about="harmonics do not turn with their Gaussian",
-        layer="rendering",
-        plant=sh_not_turned,
-        sound=model(sh_degree=1),
-        config=model(sh_degree=1),
+    "normals point inwards": Defect("rendering", result(Template, "pose", lambda p: replace(p, normals=-p.normals))),
+    "a cache keeps the first pose": Defect("rendering", replaced(Template, "pose", first_pose_kept)),
+    "offsets are halved": Defect("rendering", sound=LARGE_OFFSETS, config=model(offset_unit_m=0.025)),
+    "harmonics do not turn with their Gaussian": Defect(
+        "rendering", replaced(texels, "turn_sh", lambda _: lambda quats, sh, **_: sh), sound=LARGE_OFFSETS
     ),
-    "holes": Defect(about="every fourth Gaussian is missing", layer="rendering", plant=gaussians_changed(with_holes)),
-    "opacity": Defect(
-        about="opacities times 0.9",
-        layer="rendering",
-        plant=gaussians_changed(lambda g: replace(g, opacities=0.9 * g.opacities)),
+    "every fourth Gaussian is missing": Defect("rendering", gaussians(with_holes)),
+    "opacities times 0.9": Defect("rendering", gaussians(lambda g: replace(g, opacities=0.9 * g.opacities))),
+    "Gaussians are 10 % larger": Defect("rendering", gaussians(lambda g: replace(g, scales=1.1 * g.scales))),
+    "colours are blended in linear light": Defect("rendering", replaced(ash_model, "splat", in_linear_light)),
+    "pictures move by half a pixel": Defect("rendering", camera_moved(0.5)),
+    "another low-pass filter": Defect("rendering", config=model(dilation=0.3)),
+    "decoders see the frame before": Defect(
+        "rendering",
+        replaced(
+            TextureDrawer,
+            "forward",
+            lambda sound: lambda self, mesh, pose: sound(self, mesh, Pose(pose.motion, max(0, pose.frame - 1))),
+        ),
     ),
-    "scales": Defect(
-        about="Gaussians are 10 % larger",
-        layer="rendering",
-        plant=gaussians_changed(lambda g: replace(g, scales=1.1 * g.scales)),
+    "residual times 0.9": Defect("rendering", result(AshModel, "residual", lambda residual: 0.9 * residual)),
+    "Phi is zero": Defect("rendering", result(GlobalFeatures, "forward", lambda phi: 0 * phi)),
+    "the loss is L1 alone": Defect("training", reason="loss of step 1 ", config=training(ssim_weight=0.0)),
+    "half of the gradient is lost": Defect(
+        "training", result(AshAvatar, "loss", lambda loss: 0.5 * loss + 0.5 * loss.detach()), "gradient of step 1 "
     ),
-    "linear light": Defect(about="colours are blended in linear light", layer="rendering", plant=in_linear_light),
-    "half a pixel": Defect(about="pictures move by half a pixel", layer="rendering", plant=camera_moved(0.5)),
-    "dilation": Defect(about="another low-pass filter", layer="rendering", config=model(dilation=0.3)),
-    "late textures": Defect(
-        about="decoders see the frame before", layer="rendering", plant=textures_of_the_frame_before
-    ),
-    "weak decoders": Defect(about="residual times 0.9", layer="rendering", plant=residual_weakened),
-    "no phi": Defect(about="Phi is zero", layer="rendering", plant=phi_dropped),
-    "no ssim": Defect(
-        about="the loss is L1 alone", layer="training", reason="loss of step 1 ", config=training(ssim_weight=0.0)
-    ),
-    "halved gradient": Defect(
-        about="half of the gradient is lost", layer="training", reason="gradient of step 1 ", plant=gradient_halved
-    ),
-    "triple rate": Defect(
-        about="learning rates times three",
-        layer="training",
+    "learning rates times three": Defect(
+        "training",
         reason="in the update before it",
         config=lambda c: training(
             learning_rate=3 * c.training.learning_rate, base_learning_rate=3 * c.training.base_learning_rate
         )(c),
     ),
-    "adam's eps": Defect(
-        about="another constant in Adam",
-        layer="training",
-        reason="in the update before it",
-        plant=adam_with(0.1),
+    "another constant in Adam": Defect("training", adam_with(0.1), "in the update before it"),
+    "a training camera is off by 2 px": Defect(
+        "training", replaced(batches, "crop_camera", one_camera_off), "from the loss"
     ),
-    "one camera off": Defect(
-        about="a training camera is off by 2 px", layer="training", reason="from the loss", plant=one_camera_off
+    "masks lose a pixel": Defect("training", alpha_changed(eroded), "loss of step 1 "),
+    "frames come in another order": Defect(
+        "training",
+        replaced(batches, "_order", lambda sound: lambda seed, epoch, frames: sound(seed, epoch + 1, frames)),
+        "from the loss",
     ),
-    "eroded masks": Defect(about="masks lose a pixel", layer="training", reason="loss of step 1 ", plant=masks_eroded),
-    "another order": Defect(
-        about="frames come in another order", layer="training", reason="from the loss", plant=frames_in_another_order
+    "no warm-up": Defect("training", config=training(warmup="none", warmup_steps=0)),
+    "all seeds are 0": Defect("training", made(lambda config: replace(config, seed=0)), "seed is ignored"),
+    "training ends after three quarters": Defect(
+        "training", reason="from step 16 on (step 16 -> 12)", config=training(steps=12)
     ),
-    "no warm-up": Defect(
-        about="everything is learned from the first step on",
-        layer="training",
-        config=training(warmup="none", warmup_steps=0),
+    "weights are not averaged": Defect("training", reason="step 16 on (train_psnr", config=training(ema=0.0)),
+    "PSNR is of the whole frame": Defect(
+        "protocol", replaced(metrics, "psnr", lambda sound: lambda a, b, region=None: sound(a, b)), "foreground psnr"
     ),
-    "seed ignored": Defect(about="all seeds are 0", layer="training", reason="seed is ignored", plant=seed_ignored),
-    "fewer steps": Defect(
-        about="training ends after three quarters",
-        layer="training",
-        reason="from step 16 on (step 16 -> 12)",
-        config=training(steps=12),
-    ),
-    "no averaging": Defect(
-        about="weights are not averaged", layer="training", reason="step 16 on (train_psnr", config=training(ema=0.0)
-    ),
-    "whole frame": Defect(
-        about="PSNR is of the whole frame", layer="protocol", reason="foreground psnr", plant=psnr_of_the_whole_frame
-    ),
-    "median": Defect(about="means are medians", layer="protocol", reason="mean ", plant=means_by(np.median)),
+    "means are medians": Defect("protocol", means_by(np.median), "mean "),
 }
-HARMLESS: dict[str, Defect] = {
-    "nothing": Defect(about="the same code", layer=None),
-    "rounding": Defect(
-        about="another order of summation moves Gaussians by rounding",
-        layer=None,
-        plant=gaussians_changed(moved_by_rounding),
+HARMLESS: dict[str, Plant] = {  # several at once, for together they move numbers further
+    "the same bits": together(
+        replaced(Template, "pose", lambda sound: lambda self, pose: self.clear_cache() or sound(self, pose)),
+        alpha_changed(lambda alpha: (255 * (alpha.double() / 255)).round().to(torch.uint8)),
+        made(global_generators_used),
     ),
-    "same picture another way": Defect(
-        about="a pixel is moved there and back", layer=None, plant=lambda patch: camera_moved(math.ulp(1.0))(patch)
+    "Gaussians by rounding": together(
+        gaussians(lambda g: replace(g, means=g.means * (1 + 2e-7))),
+        gaussians(in_another_order),
+        camera_moved(math.ulp(1.0)),
+        replaced(template, "dual_quaternion_skinning", other_signs),
+        result(Template, "pose", lambda p: replace(p, normals=p.normals / p.normals.norm(dim=-1, keepdim=True))),
+        result(TextureDrawer, "forward", lambda textures: textures * (1 + 1e-7)),
     ),
-    "same score another way": Defect(
-        about="means are summed in another order",
-        layer=None,
-        plant=means_by(lambda values: math.fsum(values) / len(values)),
+    "training and scores by rounding": together(
+        result(AshModel, "residual", lambda residual: 0.3 * residual + 0.7 * residual),
+        result(AshAvatar, "loss", lambda loss: 0.3 * loss + 0.7 * loss),
+        adam_with(1e-16),
+        result(metrics, "psnr", lambda db: 20 * math.log10(1 / math.sqrt(10 ** (-db / 10)))),
+        means_by(lambda values: math.fsum(values) / len(values)),
     ),
-    "signs": Defect(about="quaternions have the other sign", layer=None, plant=other_signs_of_quaternions),
-    "normals": Defect(about="normals are normalised twice", layer=None, plant=normals_normalised_again),
-    "no cache": Defect(about="no posed template is kept", layer=None, plant=no_pose_kept),
-    "textures": Defect(about="textures differ by rounding", layer=None, plant=textures_rounded),
-    "residual": Defect(about="the residual is a sum", layer=None, plant=residual_in_halves),
-    "order": Defect(about="Gaussians in another order", layer=None, plant=gaussians_changed(in_another_order)),
-    "loss": Defect(about="the loss is a sum", layer=None, plant=loss_in_halves),
-    "eps": Defect(about="a constant in Adam that is never seen", layer=None, plant=adam_with(1e-16)),
-    "masks": Defect(about="masks are rounded anew", layer=None, plant=masks_by_another_way),
-    "psnr": Defect(about="PSNR by the root of the error", layer=None, plant=psnr_by_root),
-    "generators": Defect(about="global generators were used before", layer=None, plant=global_generators_used),
 }

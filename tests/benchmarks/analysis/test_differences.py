@@ -32,18 +32,14 @@ def null_rows(rng: np.random.Generator, *, captures: int, seeds: int, methods: t
     return pd.DataFrame(rows, columns=list(COLUMNS)).assign(axis="", severity=0.0, status="done")
 
 
-@pytest.mark.parametrize(("captures", "seeds"), [(8, 1), (4, 2), (1, 3)])
+@pytest.mark.parametrize(("captures", "seeds"), [(8, 1), (4, 2)])
 def test_false_alarms_are_at_most_five_percent(captures: int, seeds: int) -> None:
-    """On one capture a method's luck there is part of the truth: only seeds may differ."""
     rng = np.random.default_rng(captures)
     runs = (null_rows(rng, captures=captures, seeds=seeds, methods=("ash", "ddc")) for _ in range(ROUNDS))
     tests = [compare(rows, "ash", "ddc", foreground()) for rows in runs]
     alarms = sum(test is not None and test.significant for test in tests)
-    if captures == 1:
-        assert alarms / ROUNDS > 0.2, "seeds of one capture say nothing about the next: the reason for several"
-    else:
-        assert stats.binomtest(alarms, ROUNDS, 0.05, alternative="greater").pvalue > 0.01, alarms / ROUNDS
-        assert alarms / ROUNDS > 0.02, "a test that never alarms is none"
+    assert stats.binomtest(alarms, ROUNDS, 0.05, alternative="greater").pvalue > 0.01, alarms / ROUNDS
+    assert alarms / ROUNDS > 0.02, "a test that never alarms is none"
 
 
 def test_a_table_of_differences_keeps_the_level_over_all_its_rows() -> None:

@@ -7,44 +7,29 @@ import pytest
 
 from ash.capture.formats import load_capture
 from benchmarks.analysis import error_attribution
-from benchmarks.analysis.error_attribution import REGIONS, ErrorAttribution, Share, region_map, shares
+from benchmarks.analysis.error_attribution import REGIONS, explanation, region_map
 from benchmarks.cell import metrics
-from benchmarks.cell.schema import ViewScore
-
-VIEW = ViewScore(split="novel_pose", camera="a", frame=0, prediction="d" * 64, scores={})
 
 
-def cause(error: dict[str, float], pixels: dict[str, float], rank: float = 0.0) -> ErrorAttribution:
-    found = tuple(Share(region=name, pixels=pixels.get(name, 0.0), error=error.get(name, 0.0)) for name in REGIONS)
-    nothing = np.zeros((1, 1, 4), np.uint8)
-    return ErrorAttribution(
-        view=VIEW,
-        shares=found,
-        novelty_deg=21.4,
-        novelty_rank=rank,
-        map=np.zeros((1, 1)),
-        truth=nothing,
-        predicted=nothing,
-    )
-
-
-def test_shares_are_of_covered_pixels_and_their_error() -> None:
-    regions = np.array([[0, 0, 4, 4], [4, 4, -1, -1]])
-    error = np.array([[3.0, 3.0, 1.0, 1.0], [0.0, 0.0, 99.0, 99.0]])
-    found = {share.region: (share.pixels, share.error) for share in shares(regions, error)}
-    assert found["silhouette"] == (pytest.approx(2 / 6), 0.75)
-    assert found["interior"] == (pytest.approx(4 / 6), 0.25)
-    assert found["grazing view"] == (0.0, 0.0)
-
-
-def test_a_region_explains_a_frame_if_its_error_is_dense_and_the_largest() -> None:
-    dense = cause({"silhouette": 0.6, "interior": 0.4}, {"silhouette": 0.2, "interior": 0.8})
-    assert dense.explanation.startswith("silhouette: 60 % of the squared error on 20 % of the pixels; pose 21 degrees")
-    spread = cause({"silhouette": 0.3, "interior": 0.7}, {"silhouette": 0.2, "interior": 0.8}, rank=0.9)
-    assert spread.explanation.startswith("interior: 70 %")
-    assert spread.explanation.endswith("among the most novel quarter")
-    thin = cause({"silhouette": 0.55, "interior": 0.45}, {"silhouette": 0.5, "interior": 0.5})
-    assert thin.explanation.startswith("interior")  # not denser than elsewhere
+@pytest.mark.parametrize(
+    ("edge", "novelty", "text"),
+    [
+        # pixels and squared error of the silhouette, of 10 pixels and an error of 100 that truth or prediction cover
+        ((2, 60.0), (21.4, 0.0), "silhouette: 60 % of the squared error on 20 % of the pixels; pose 21 degrees"),
+        ((2, 30.0), (21.4, 0.9), "interior: 70 % of the squared error on 80 % of the pixels; pose 21 degrees"),
+        ((5, 55.0), (3.0, 0.0), "interior: 45 % of the squared error on 50 % of the pixels; pose 3 degrees"),
+    ],
+    ids=["dense and the largest", "dense and smaller", "not denser than elsewhere"],
+)
+def test_a_region_explains_a_frame_if_its_error_is_dense_and_the_largest(
+    edge: tuple[int, float], novelty: tuple[float, float], text: str
+) -> None:
+    pixels, share = edge
+    regions = np.array([[0] * pixels + [4] * (10 - pixels) + [-1] * 2])
+    error = np.where(regions == 0, share / pixels, np.where(regions == 4, (100 - share) / (10 - pixels), 99.0))
+    said = explanation(regions, error, *novelty)
+    assert said.startswith(text)
+    assert said.endswith("among the most novel quarter") == (novelty[1] == 0.9)
 
 
 def test_depth_bends_at_edges_and_not_on_slopes() -> None:

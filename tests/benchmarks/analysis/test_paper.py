@@ -1,7 +1,7 @@
 """Our rows beside the paper's, and the agreement of the two orders."""
 
 import math
-from functools import cache
+import tomllib
 
 import pytest
 from helpers.cells import cell, config
@@ -11,18 +11,18 @@ from benchmarks.analysis.results import RunTables
 from benchmarks.cell.registry import offered
 from benchmarks.cell.schema import CellResult, Summary
 from benchmarks.report.content import Table, Text
-from benchmarks.report.sections import beside_the_paper
-from benchmarks.suites.files import find_suite, read_tables, suite_file
-from benchmarks.suites.tables import TableSpec
+from benchmarks.report.sections import PAPER_SUITES, beside_the_paper
+from benchmarks.suites.files import find_suite, suite_file
+from benchmarks.suites.tables import TableSpec, tables_of
 
 
 def run(levels: dict[str, float], seeds: int = 3) -> RunTables:
     return RunTables([cell(m, level + 0.1 * seed, seed=seed) for m, level in levels.items() for seed in range(seeds)])
 
 
-@cache  # Reading our suites takes seconds.
 def specs() -> list[TableSpec]:
-    return [spec for name in ("paper", "cameras") for spec in read_tables(suite_file(name))[0]]
+    files = [suite_file(name) for name in PAPER_SUITES]
+    return [spec for path in files for spec in tables_of(tomllib.loads(path.read_text())["table"], place=path.name)]
 
 
 def test_the_papers_numbers_are_the_papers() -> None:

@@ -32,14 +32,13 @@ from benchmarks.suites.suites import CaptureSpec
 MASKS = Path(__file__).parents[2] / "data" / "masks.toml"
 
 
-@cache  # Reading our suites takes seconds.
-def our_stresses() -> tuple[Stress, ...]:
-    return (*find_suite("stability").stresses, *find_suite("motions").stresses)
+our_suite = cache(find_suite)  # Reading one takes seconds.
 
 
 def severities_of(axis: str) -> list[float]:
     """The steps that our suites take along an axis."""
-    return [stress.severity for stress in our_stresses() if stress.axis == axis]
+    stresses = (*our_suite("stability").stresses, *our_suite("motions").stresses)
+    return [stress.severity for stress in stresses if stress.axis == axis]
 
 
 def course(levels: tuple[float, ...]) -> list[CellResult]:
@@ -180,7 +179,7 @@ def test_every_axis_changes_what_a_method_learns_from_more_and_more(capture: Pat
 
 
 def test_a_stressed_suite_has_its_clean_captures_first_and_one_per_stress() -> None:
-    suite = find_suite("stability")
+    suite = our_suite("stability")
     steps = 3 * (len(AXES) - 1)  # All but `footage`, which the suite `motions` goes along.
     assert [spec.stress for spec in suite.captures] == [None, *suite.stresses] and len(suite.stresses) == steps
     assert len(list(suite.cells)) == suite.seeds * len(suite.methods) * (1 + steps)

@@ -124,15 +124,6 @@ def test_false_alarms_and_power_on_our_design() -> None:
     assert 0.65 < found / rounds < 0.88
 
 
-def test_a_test_over_images_alone_raises_false_alarms() -> None:
-    rng = np.random.default_rng(2)
-    alarms = 0
-    for _ in range(500):
-        a, b = (rng.normal(0, 0.15) + rng.normal(0, 0.3, 40) for _ in range(2))
-        alarms += compared(seeds(*a), seeds(*b)).significant
-    assert alarms / 500 > 0.2
-
-
 def test_what_is_detectable_falls_with_the_number_of_captures() -> None:
     found = [detectable(0.3, count) for count in (1, 2, 4, 8, 16)]
     assert found[0] == np.inf and found == sorted(found, reverse=True)
@@ -148,7 +139,7 @@ def test_mean_interval_and_wilson_agree_with_scipy() -> None:
     a = np.random.default_rng(0).normal(27.3, 0.2, 5).tolist()
     found = mean_interval(a)
     assert (found.low, found.high) == pytest.approx(stats.t.interval(0.95, 4, loc=np.mean(a), scale=stats.sem(a)))
-    assert mean_interval([3.0]).low is None
+    assert np.isnan(mean_interval([3.0])[1:]).all()
     for failures, trials in ((0, 5), (3, 7), (10, 10)):
         expected = stats.binomtest(failures, trials).proportion_ci(method="wilson")
         assert wilson(failures, trials) == pytest.approx((expected.low, expected.high), abs=1e-6)
