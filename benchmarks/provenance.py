@@ -1,5 +1,6 @@
 """What must be known about a run so that someone else can repeat it: commit, machine, versions."""
 
+import contextlib
 import math
 import os
 import platform
@@ -36,7 +37,7 @@ def commit(root: Path | None = None) -> str:
 
 def machine() -> dict[str, str]:
     """Processor, cores, memory, operating system, GPU."""
-    facts = {
+    return {
         "processor": processor_name(),
         "cores": str(cores()),
         "memory_gb": f"{psutil.virtual_memory().total / 2**30:.0f}",
@@ -44,17 +45,14 @@ def machine() -> dict[str, str]:
         "python": platform.python_version(),
         "gpu": gpu_name() or "none",
     }
-    return facts
 
 
 def versions() -> dict[str, str]:
     """Versions of the packages that numbers depend on."""
     facts = {}
     for package in PACKAGES:
-        try:
+        with contextlib.suppress(PackageNotFoundError):
             facts[package] = version(package)
-        except PackageNotFoundError:
-            continue
     return facts
 
 

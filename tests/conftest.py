@@ -24,16 +24,14 @@ def pytest_sessionstart() -> None:
 
 
 LONG = (
-    "test_tutorials", "test_kill", "test_isolation", "test_cli", "test_in_a_browser", "test_launcher", "test_captures",
+    "test_ci_suite",
+    "test_tutorials", "test_isolation", "test_kill", "test_cli", "test_in_a_browser", "test_launcher", "test_captures",
     "test_gate", "test_field", "test_readers", "test_cli_faults", "test_page", "test_defects", "test_files",
     "test_conformance", "test_factors", "test_player", "test_switch_parts", "test_capture", "test_plugin",
-    "test_engine", "test_predictions", "test_cli_help", "test_outsiders", "test_ci_suite",
+    "test_engine", "test_predictions", "test_cli_help", "test_outsiders",
 )  # fmt: skip
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files that take long come first, so that no worker is left alone with one at the end.
-
-    The suite `ci` comes late among them: its run is made for the kills, and a worker would wait for the other.
-    """
+    """Files that take long come first, so that no worker is left alone with one at the end."""
     items.sort(key=lambda item: LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG))

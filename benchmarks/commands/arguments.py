@@ -12,7 +12,7 @@ import shlex
 import sys
 import types
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
@@ -83,7 +83,6 @@ Repeated = Annotated[T, Argument(repeated=True)]
 Natural = Annotated[int, whole(0)]
 Seed = Annotated[int, whole(0, 2**31 - 1)]
 Count = Annotated[int, whole(1)]
-CountIfAny = Annotated[int | None, whole(1)]
 Names = Annotated[tuple[str, ...], Argument(metavar="A,B", read=_names)]
 Folder = Annotated[Path, Argument(metavar="DIR")]
 File = Annotated[Path, Argument(metavar="FILE")]
@@ -250,26 +249,27 @@ def _made(command: type[Any], values: dict[str, Any]) -> Any:
 
 def _flags_of(command: type[Any]) -> Iterator[_Flag]:
     """The command's own arguments."""
-    comments = field_comments(command)
-    for name, hint in get_type_hints(command, include_extras=True).items():
-        kind, argument, several = _described(hint)
+    comments, hints = field_comments(command), get_type_hints(command, include_extras=True)
+    for field in fields(command):
+        kind, argument, several = _described(hints[field.name])
         if is_dataclass(kind):
             yield from _flags_of(cast(type[Any], kind))
-        elif name != "changes":
-            default = next(field.default for field in fields(command) if field.name == name)
-            switch = kind is bool
-            yield _Flag(name, kind, comments.get(name, ""), default, argument, several, switch)
+        elif field.name != "changes":
+            about = comments.get(field.name, "")
+            yield _Flag(field.name, kind, about, field.default, argument, several, switch=kind is bool)
 
 
 def _flags_of_config(config: Any, taken: set[str]) -> list[_Flag]:
     """The fields of a configuration; those that the command has itself stay its own."""
+    wanted = [leaf for leaf in leaves(config) if leaf.key not in taken]
+    # Once for each class: Python parses the whole file to find its source.
+    comments = {owner: field_comments(owner) for owner in {leaf.owner for leaf in wanted}}
 
     def flag(leaf: Leaf) -> _Flag:
         kind, argument, several = _described(leaf.kind)
-        about = field_comments(leaf.owner).get(leaf.name, "")
-        return _Flag(leaf.key, kind, about, leaf.value, argument, several)
+        return _Flag(leaf.key, kind, comments[leaf.owner].get(leaf.name, ""), leaf.value, argument, several)
 
-    flags = [flag(leaf) for leaf in leaves(config) if leaf.key not in taken]
+    flags = [flag(leaf) for leaf in wanted]
     return [flag for flag in flags if flag.kind in READ or get_origin(flag.kind) is Literal]
 
 
@@ -278,20 +278,12 @@ def _described(hint: Any) -> tuple[Any, Argument, bool]:
     argument = Argument()
     while get_origin(hint) in (Annotated, Union, types.UnionType):
         if get_origin(hint) is Annotated:
-            hint, *marks = get_args(hint)
-            for mark in marks:
-                argument = _both(argument, mark)
+            hint, argument = get_args(hint)
         else:
             hint = next(kind for kind in get_args(hint) if kind is not type(None))
     if get_origin(hint) is not tuple or argument.read is not None:
         return hint, argument, False
     return get_args(hint)[0], argument, not argument.repeated
-
-
-def _both(one: Argument, other: Argument) -> Argument:
-    plain = Argument()
-    given = {f.name: getattr(other, f.name) for f in fields(other) if getattr(other, f.name) != getattr(plain, f.name)}
-    return replace(one, **given)
 
 
 def _metavar(kind: Any) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from ash.capture.dataset import Pose
 from ash.files import InputError, write_atomic
-from benchmarks.commands.arguments import DONE, Argument, Count, CountIfAny, File, Names, Natural, Positional, Repeated
+from benchmarks.commands.arguments import DONE, Argument, Count, File, Names, Natural, Positional, Repeated
 from benchmarks.commands.devices import CPU, DeviceName, chosen_device
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ class ExportCommand:
     camera: str = "spiral"  # mp4: spiral, rig, or a camera of the capture
     truth: bool = False  # mp4: the truth beside them; rendered where it never was
     height: Count = 256  # mp4: of a picture, pixels
-    fps: CountIfAny = None  # mp4: frames per second; default: the motion's
+    fps: Count | None = None  # mp4: frames per second; default: the motion's
 
     def __call__(self) -> int:
         """Write it."""
@@ -145,52 +145,43 @@ class ExportCommand:
         from benchmarks.play.avatars import open_avatars
         from benchmarks.play.motions import frames_in, motion_clip
 
-        one_file = {"bvh": self._write_bvh, "mp4": self._write_video, "html": self._write_page}
         with open_avatars(self.source, scene=self.scene, methods=self.methods, trust=self.trust) as avatars:
             clip = motion_clip(avatars.capture, self.motion)
             frames = frames_in(clip, self.frames or ("0" if self.form in FRAMES else None))
             out = self.out or Path(self.source.resolve().name)
             if self.form in FRAMES and len(frames) > 1:
                 out = out if self.out else Path(f"{out}-{self.form}")
-                self._write_frames(avatars, clip, frames, out, suffix)
+                if out.suffix:
+                    raise InputError(f"{out}: expected a folder for {len(frames)} frames, got a name with a suffix")
+                for frame in frames:  # Named by its number in the capture or in the motion's file.
+                    self._write(avatars, clip, (frame,), out / f"{frame:06d}{suffix}")
                 print(f"{out}: {len(frames)} files")
                 return DONE
             out = out if out.suffix else out.with_name(f"{out.name}{suffix}")
-            one_file.get(self.form, self._write_frame)(avatars, clip, frames, out)
+            self._write(avatars, clip, frames, out)
         print(f"{out}: {len(frames)} frame{'s' if len(frames) > 1 else ''}, {out.stat().st_size / 1e6:.1f} MB")
         return DONE
 
-    def _write_frame(self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], out: Path) -> None:
-        from benchmarks.export.formats import frame_bytes
-
-        loaded = avatars.only()
-        pose = Pose(clip.motion, frames[0])
-        write_atomic(out, frame_bytes(loaded.avatar, pose, suffix=out.suffix, title=loaded.title))
-
-    def _write_frames(
-        self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], folder: Path, suffix: str
-    ) -> None:
-        """A file for each frame, named by the frame's number in the capture or in the motion's file."""
-        if folder.suffix:
-            raise InputError(f"{folder}: expected a folder for {len(frames)} frames, got a name with a suffix")
-        for frame in frames:
-            self._write_frame(avatars, clip, (frame,), folder / f"{frame:06d}{suffix}")
-
-    def _write_bvh(self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], out: Path) -> None:
+    def _write(self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], out: Path) -> None:
+        """One file; of the formats of one frame it shows the first."""
         from benchmarks.export.bvh import bvh_bytes
-
-        motion, chosen = clip.motion, list(frames)
-        played = replace(motion, dofs=motion.dofs[chosen], sequence=motion.sequence[chosen])
-        write_atomic(out, bvh_bytes(avatars.capture.skeleton, played))
-
-    def _write_video(self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], out: Path) -> None:
+        from benchmarks.export.formats import frame_bytes
+        from benchmarks.play.share import shared_page
         from benchmarks.play.video import VideoSpec, render_video, write_video
 
-        spec = VideoSpec(clip=clip, frames=frames, camera=self.camera, height=self.height, truth=self.truth)
-        pictures = render_video(avatars, spec, lambda text: print(text, file=sys.stderr))
-        write_video(out, pictures, fps=float(self.fps or clip.motion.fps))
-
-    def _write_page(self, avatars: "AvatarSet", clip: "MotionClip", frames: tuple[int, ...], out: Path) -> None:
-        from benchmarks.play.share import shared_page
-
-        write_atomic(out, shared_page(avatars.only(), clip, frames))
+        if self.form == "mp4":
+            spec = VideoSpec(clip=clip, frames=frames, camera=self.camera, height=self.height, truth=self.truth)
+            pictures = render_video(avatars, spec, lambda text: print(text, file=sys.stderr))
+            write_video(out, pictures, fps=float(self.fps or clip.motion.fps))
+            return
+        if self.form == "bvh":
+            motion, chosen = clip.motion, list(frames)
+            played = replace(motion, dofs=motion.dofs[chosen], sequence=motion.sequence[chosen])
+            content = bvh_bytes(avatars.capture.skeleton, played)
+        elif self.form == "html":
+            content = shared_page(avatars.only(), clip, frames)
+        else:
+            loaded = avatars.only()
+            pose = Pose(clip.motion, frames[0])
+            content = frame_bytes(loaded.avatar, pose, suffix=out.suffix, title=loaded.title)
+        write_atomic(out, content)

@@ -14,7 +14,6 @@ from benchmarks.commands.arguments import (
     WRONG_INPUT,
     Argument,
     Count,
-    CountIfAny,
     File,
     Folder,
     Names,
@@ -80,7 +79,7 @@ class SynthCommand:
     test_motion: File | None = None  # test on this motion
     excerpt: Excerpt = Excerpt()
     rig_file: Annotated[Path | None, Argument(name="rig", metavar="FILE")] = None  # see the scene by its cameras
-    workers: CountIfAny = None  # processes; default: all cores
+    workers: Count | None = None  # processes; default: all cores
     executor: str = "local"  # or dask://HOST:PORT, for a cluster
     shard: Annotated[str | None, Argument(metavar="i/n")] = None  # every n-th frame only, from the i-th; for job arrays
 
@@ -96,31 +95,19 @@ class SynthCommand:
 
     def __call__(self) -> int:
         """Render what is missing of it."""
+        from ash.capture.manifest import read_manifest
         from benchmarks.provenance import cores
-        from benchmarks.suites.engine import make_executor
-        from benchmarks.suites.progress import Progress
-        from benchmarks.suites.scenes import SPLATS, draw_scene
-        from synth.capture import is_finished, make_capture
-        from synth.cost import estimate
+        from benchmarks.suites.engine import make_executor, read_shard
+        from benchmarks.suites.scenes import draw_scene
 
         scene, name = self._described()
         folder = self.out or Path("data") / name
-        workers = self.workers or cores()
-        if self.scene == SPLATS:
-            draw_scene(self.scene, scene, folder, title=name, workers=workers)
-            print(folder)
-            return DONE
-        progress = Progress(f"images of {name}", 0, expected_s=0.0, workers=workers)
-        if not is_finished(scene, folder):
-            progress.say(f"{name}: {estimate(scene).text}; first body, motion, clothes and texture (up to two minutes)")
-        shard, local = _shard(self.shard), self.executor == "local"
+        workers, shard, local = self.workers or cores(), read_shard(self.shard or "1/1"), self.executor == "local"
         with contextlib.nullcontext() if local else make_executor(self.executor, workers=workers) as executor:
-            make_capture(scene, folder, workers=workers, progress=progress.advance, executor=executor, shard=shard)
-        progress.close()
-        if not is_finished(scene, folder):
-            print(
-                f"{folder}: this shard is done; the capture is finished by the shard that comes last", file=sys.stderr
-            )
+            draw_scene(self.scene, scene, folder, title=name, workers=workers, executor=executor, shard=shard)
+        if not read_manifest(folder).complete:
+            told = "this shard is done; the capture is finished by the shard that comes last"
+            print(f"{folder}: {told}", file=sys.stderr)
         print(folder)
         return DONE
 
@@ -163,16 +150,6 @@ class SynthCommand:
         far = sum(each) / len(each)
         print(f"test poses lie {far:.1f} degrees from the nearest training pose (mean over joints)", file=sys.stderr)
         return moved
-
-
-def _shard(text: str | None) -> tuple[int, int]:
-    from benchmarks.suites.engine import shard_of
-
-    if text is None:
-        return 1, 1
-    shard_of([], text)
-    index, count = (int(part) for part in text.split("/"))
-    return index, count
 
 
 @dataclass(frozen=True, kw_only=True)

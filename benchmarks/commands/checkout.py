@@ -1,4 +1,4 @@
-"""Commands about this checkout and machine: speed, doctor, test, suites, docs."""
+"""Commands about this checkout and machine: speed, doctor, test."""
 
 import os
 import subprocess

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
 
 CPU = "cpu"
 DeviceName = Annotated[str, Argument(metavar="DEVICE")]
-DeviceNameIfAny = Annotated[str | None, Argument(metavar="DEVICE")]
 
 
 def chosen_device(wanted: str, *, here: bool = True) -> str:

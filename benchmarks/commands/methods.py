@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ash.files import InputError
-from benchmarks.commands.arguments import DONE, FAILED, Count, CountIfAny, Folder, Positional
+from benchmarks.commands.arguments import DONE, FAILED, Count, Folder, Positional
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,7 +17,7 @@ class CheckMethodCommand:
     preset: str = "ci"  # budget of the method
     minutes: Count = 10  # limit of each of the four trials
     memory_mb: Count = 4096  # likewise
-    workers: CountIfAny = None  # trials side by side; default: all cores
+    workers: Count | None = None  # trials side by side; default: all cores
     data: Folder = Path("data")  # where captures are kept
     out: Folder | None = None  # keep the trials there; default: they are removed
 

@@ -16,7 +16,6 @@ from benchmarks.commands.arguments import (
     INTERRUPTED,
     Argument,
     Count,
-    CountIfAny,
     File,
     Folder,
     Names,
@@ -26,10 +25,11 @@ from benchmarks.commands.arguments import (
     refuse_all,
     typed,
 )
-from benchmarks.commands.devices import CPU, DeviceName, DeviceNameIfAny, chosen_device, gpus_for, on_device
+from benchmarks.commands.devices import CPU, DeviceName, chosen_device, gpus_for, on_device
 from benchmarks.problems import Problems
 
 if TYPE_CHECKING:
+    from benchmarks.cell.schema import Cell
     from benchmarks.suites.runs import Run as RunOnDisk
     from benchmarks.suites.runs import RunOptions
     from benchmarks.suites.suites import MethodSpec, SceneSpec, Suite
@@ -59,12 +59,12 @@ class RunCommand:
     size: str | None = None  # of scenes: ci, factor, quick, long, table or paper
     preset: str | None = None  # budget of the methods
     device: DeviceName = CPU  # where methods learn and draw that can choose: cpu, cuda, cuda:1, or auto
-    seeds: CountIfAny = None  # train every method with so many seeds
-    subjects: CountIfAny = None  # on captures of so many people, from subject 0 on
+    seeds: Count | None = None  # train every method with so many seeds
+    subjects: Count | None = None  # on captures of so many people, from subject 0 on
     validation: bool = False  # on the people from 100 on: to choose by, not to report
     out: Folder | None = None  # where results go; default: runs/SUITE
     data: Folder = Path("data")  # where captures are kept
-    workers: CountIfAny = None  # cells side by side; default: all cores, on CUDA all GPUs
+    workers: Count | None = None  # cells side by side; default: all cores, on CUDA all GPUs
     executor: str = LOCAL  # or dask://HOST:PORT, for a cluster
     shard: Annotated[str | None, Argument(metavar="i/n")] = None  # every n-th cell only, from the i-th; for job arrays
     # AlexNet's, of torchvision; default: torch's cache, or those that set-up installed
@@ -299,37 +299,24 @@ class TrainCommand:
 
     def __call__(self) -> int:
         """One cell by hand."""
-        from ash.capture.formats import load_capture
         from benchmarks.cell.registry import configured
         from benchmarks.cell.run import run_cell
         from benchmarks.cell.schema import read_result, write_config
-        from benchmarks.suites.captures import require_intact
         from benchmarks.suites.engine import plan_cells
-        from benchmarks.suites.runs import cell_for
-        from benchmarks.suites.suites import AS_GIVEN, CaptureSpec, CellSpec, varied_name
+        from benchmarks.suites.suites import varied_name
 
         changes, device = self.changes, chosen_device(self.device)
         if device != CPU:
             changes = tuple(sorted({**dict(changes), "device": device}.items()))
         if changes:
             configured(self.method, self.preset, changes)
-        capture = load_capture(self.capture)
-        require_intact(self.capture)
-        row = _row_named(self.row or varied_name(self.method, changes), of=self.method, flag="--row").name
-        spec = CellSpec(
-            capture=CaptureSpec(scene=capture.scene, size=AS_GIVEN, seed=capture.manifest.seed),
-            method=row,
-            factory="" if row == self.method else self.method,
-            preset=self.preset,
-            seed=self.seed,
-            changes=changes,
-        )
-        cell = cell_for(spec, self.capture, self.out)
+        given: dict[str, Any] = {"of": self.method, "preset": self.preset, "changes": changes}
+        row = _row_named(self.row or varied_name(self.method, changes), flag="--row", **given)
+        cell = _cell_on(self.capture, row, self.out, seed=self.seed)
         plan_cells([cell], retry_failed=True)
         if read_result(cell.folder) is not None:
-            print(
-                f"{cell.config.title} was trained before, from the same inputs: nothing is done again", file=sys.stderr
-            )
+            told = "was trained before, from the same inputs: nothing is done again"
+            print(f"{cell.config.title} {told}", file=sys.stderr)
         else:
             write_config(cell)
             print(f"training {cell.config.title} in {cell.folder}", file=sys.stderr)
@@ -352,26 +339,14 @@ class ScoreCommand:
 
     def __call__(self) -> int:
         """One cell of brought pictures."""
-        from ash.capture.formats import load_capture
         from benchmarks.cell.registry import BROUGHT
         from benchmarks.cell.run import run_cell
         from benchmarks.cell.schema import write_config
-        from benchmarks.suites.captures import require_intact
-        from benchmarks.suites.runs import cell_for
-        from benchmarks.suites.suites import AS_GIVEN, CaptureSpec, CellSpec
+        from benchmarks.suites.suites import AS_GIVEN
 
-        row = _row_named(self.name, of=f"{BROUGHT}:{self.pictures}", flag="--name")
-        capture = load_capture(self.capture)
-        require_intact(self.capture)
-        spec = CellSpec(
-            capture=CaptureSpec(scene=capture.scene, size=AS_GIVEN, seed=capture.manifest.seed),
-            method=row.name,
-            factory=row.of,
-            preset=AS_GIVEN,
-            seed=0,
-        )
+        row = _row_named(self.name, flag="--name", of=f"{BROUGHT}:{self.pictures}", preset=AS_GIVEN)
         try:
-            cell = cell_for(spec, self.capture, self.out, info=self.info)
+            cell = _cell_on(self.capture, row, self.out, info=self.info)
         except Problems as problems:
             return refuse_all(problems)
         write_config(cell)
@@ -388,11 +363,11 @@ class EvalCommand:
 
     run: Positional[Path]  # a run's folder or a cell's
     scores_only: bool = False  # score the stored predictions: nothing is loaded or rendered
-    device: DeviceNameIfAny = None  # where avatars draw that have a choice: cpu, cuda, ...; default: as they learned
+    device: DeviceName | None = None  # where avatars draw that have a choice: cpu, cuda, ...; default: as they learned
     motion: File | None = None  # BVH or AMASS .npz: drive the avatars by it
     frames: Count = 12  # of that motion
     out: Folder | None = None  # of the results on that motion; default: RUN/motion-FILE
-    workers: CountIfAny = None  # processes that render that motion; default: all cores
+    workers: Count | None = None  # processes that render that motion; default: all cores
     # AlexNet's, of torchvision; default: torch's cache, or those that set-up installed
     lpips_weights: LpipsWeights = None
 
@@ -429,14 +404,29 @@ class EvalCommand:
         return DONE
 
 
-def _row_named(name: str, *, of: str, flag: str) -> "MethodSpec":
+def _row_named(name: str, *, flag: str, **row: Any) -> "MethodSpec":
     """The row that a flag names; refused as in a suite."""
     from benchmarks.suites.suites import MethodSpec
 
     try:
-        return MethodSpec(name=require_plain(name, what="row"), of=of)
+        return MethodSpec(name=require_plain(name, what="row"), **row)
     except ValueError as error:
         raise InputError(f"{flag}: {error}") from error
+
+
+def _cell_on(folder: Path, row: "MethodSpec", out: Path, *, seed: int = 0, info: Path | None = None) -> "Cell":
+    """The cell of a row on a finished capture, whose files are hashed again."""
+    from ash.capture.formats import load_capture
+    from benchmarks.suites.captures import require_intact
+    from benchmarks.suites.runs import cell_for
+    from benchmarks.suites.suites import AS_GIVEN, CaptureSpec, CellSpec
+
+    capture = load_capture(folder)
+    require_intact(folder)
+    given = CaptureSpec(scene=capture.scene, size=AS_GIVEN, seed=capture.manifest.seed)
+    factory = "" if row.of == row.name else row.of
+    spec = CellSpec(capture=given, method=row.name, factory=factory, preset=row.preset, seed=seed, changes=row.changes)
+    return cell_for(spec, folder, out, info=info)
 
 
 def _use_lpips(weights: Path | None) -> None:

@@ -47,14 +47,8 @@ def require_space_for(missing: Sequence[CaptureSpec], data: Path) -> None:
 
 def described(spec: CaptureSpec) -> Scene:
     """The scene of a capture that is to be made."""
-    return scene_of(
-        spec.of or spec.scene,
-        size=spec.size,
-        seed=spec.seed,
-        subject=spec.subject,
-        name=spec.scene,
-        changes=spec.changes,
-    )
+    of, who = spec.of or spec.scene, spec.subject
+    return scene_of(of, size=spec.size, seed=spec.seed, subject=who, name=spec.scene, changes=spec.changes)
 
 
 def _spoilt_capture(spec: CaptureSpec, stress: Stress, clean: Path, data: Path) -> Path:

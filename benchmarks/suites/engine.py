@@ -13,8 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import psutil
 
@@ -43,7 +42,6 @@ ATTEMPTS = 2  # at a cell that is killed from outside, or whose result others ch
 TAIL = 1 << 16  # bytes of a log that are looked at
 WRONG_INPUT = 2
 GPU = "GPU"  # a resource of Dask's workers
-NOTHING: Mapping[str, str] = MappingProxyType({})
 INTERRUPTIONS = (130, -signal.SIGINT, -signal.SIGTERM)  # A scheduler's wish: no result, resumed later.
 
 _children: set[subprocess.Popen[bytes]] = set()
@@ -60,8 +58,7 @@ class Limits:
     disk_mb: int = 4096  # of the cell's folder
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Failure:
+class Failure(NamedTuple):
     """Why a cell was ended."""
 
     status: Status
@@ -99,7 +96,7 @@ def plan_cells(cells: Sequence[Cell], *, retry_failed: bool = False) -> CellPlan
             result = result_of(cell)
         except InputError as error:
             reasons.append(f"{cell.config.title}: run again, its result is damaged ({error})")
-            set_aside(cell)
+            _set_aside(cell)
             result = None
         if result is not None and retry_failed and result.status != "done":
             shutil.rmtree(cell.folder)
@@ -111,7 +108,7 @@ def plan_cells(cells: Sequence[Cell], *, retry_failed: bool = False) -> CellPlan
     return CellPlan(todo=tuple(todo), done=tuple(done), reasons=tuple(reasons))
 
 
-def set_aside(cell: Cell) -> None:
+def _set_aside(cell: Cell) -> None:
     """Move a cell's folder out of the way, so that the cell is run from nothing."""
     aside = cell.folder.with_name(f"{cell.folder.name}.damaged")
     shutil.rmtree(aside, ignore_errors=True)
@@ -119,14 +116,24 @@ def set_aside(cell: Cell) -> None:
 
 
 def shard_of(cells: Sequence[AnyCell], shard: str) -> tuple[AnyCell, ...]:
-    """Shard `i/n` (1-based) of the cells: every n-th, so that shards are of about equal work."""
+    """Shard `i/n` of the cells: every n-th, so that shards are of about equal work."""
+    index, count = read_shard(shard)
+    return tuple(cells[index - 1 :: count])
+
+
+def read_shard(shard: str) -> tuple[int, int]:
+    """The numbers of a shard `i/n`, from 1 on.
+
+    Raises:
+        InputError: it is none.
+    """
     try:
         index, count = (int(part) for part in shard.split("/"))
         if not 1 <= index <= count:
             raise ValueError
     except ValueError:
         raise InputError(f"expected a shard i/n with 1 <= i <= n, got {shard!r}") from None
-    return tuple(cells[index - 1 :: count])
+    return index, count
 
 
 def run_cells(
@@ -171,7 +178,7 @@ def run_cells(
                     progress.say(f"{cell.config.title}: run again, its result was changed while another cell ran")
                     progress.total += 1
                     del known[cell.folder]
-                    set_aside(cell)
+                    _set_aside(cell)
                     pending.add(submit(cell))
             progress.tick(running=[futures[f].config.title for f in pending if f.running()])
     except BaseException:
@@ -207,7 +214,7 @@ def watched_process(
     command: Sequence[str],
     log: Path,
     limits: Limits,
-    environment: Mapping[str, str] = NOTHING,
+    environment: Mapping[str, str] | None = None,
     *,
     disk: Path | None = None,
 ) -> Ending:
@@ -224,7 +231,7 @@ def watched_process(
             stdin=subprocess.PIPE,
             stdout=output,
             stderr=output,
-            env={**_environment(), **environment},
+            env={**_environment(), **(environment or {})},
             start_new_session=True,
         )
         _children.add(child)
@@ -254,11 +261,8 @@ def make_executor(spec: str, *, workers: int, gpu: bool = False) -> Iterator[Exe
     """
     require_executor(spec)
     if spec == "local":
-        executor = ThreadPoolExecutor(workers)
-        try:
+        with ThreadPoolExecutor(workers) as executor:
             yield executor
-        finally:
-            executor.shutdown(wait=True, cancel_futures=True)
         return
     try:
         from distributed import Client
@@ -306,7 +310,7 @@ def _watch(child: subprocess.Popen[bytes], limits: Limits, start: float, disk: P
         except subprocess.TimeoutExpired:
             pass
         if time.monotonic() - start > limits.seconds:
-            return Failure(status="timeout", reason=f"not finished after the limit of {limits.seconds / 60:.0f} min")
+            return Failure("timeout", f"not finished after the limit of {limits.seconds / 60:.0f} min")
         with contextlib.suppress(psutil.Error):
             family = [process, *process.children(recursive=True)]
             if (used := sum(member.memory_info().rss for member in family) / 2**20) > limits.memory_mb:
@@ -314,11 +318,11 @@ def _watch(child: subprocess.Popen[bytes], limits: Limits, start: float, disk: P
         if disk is None or time.monotonic() - looked < DISK_POLL_S:
             continue
         looked = time.monotonic()
-        if (used := folder_mb(disk)) > limits.disk_mb:
-            return Failure(status="crashed", reason=f"its folder takes {used:.0f} MB, the limit is {limits.disk_mb} MB")
+        if (used := _folder_mb(disk)) > limits.disk_mb:
+            return Failure("crashed", f"its folder takes {used:.0f} MB, the limit is {limits.disk_mb} MB")
 
 
-def folder_mb(folder: Path) -> float:
+def _folder_mb(folder: Path) -> float:
     """MiB of disk that the files below a folder take; links are not followed."""
     used = 0
     for place, _, names in os.walk(folder):  # Folders and files come and go.
@@ -329,7 +333,7 @@ def folder_mb(folder: Path) -> float:
 
 
 def _too_large(used_mb: float, limits: Limits) -> Failure:
-    return Failure(status="out of memory", reason=f"{used_mb:.0f} MB, the limit is {limits.memory_mb} MB")
+    return Failure("out of memory", f"{used_mb:.0f} MB, the limit is {limits.memory_mb} MB")
 
 
 def _outcome(cell: Cell, ending: Ending, limits: Limits) -> CellResult:
@@ -348,7 +352,7 @@ def _outcome(cell: Cell, ending: Ending, limits: Limits) -> CellResult:
             failure = _too_large(peak, limits)
     if failure is None and _was_killed(ending):
         reason = f"killed from outside in each of {ATTEMPTS} attempts; the kernel does that when memory runs out"
-        failure = Failure(status="crashed", reason=f"{reason}; --retry-failed tries again")
+        failure = Failure("crashed", f"{reason}; --retry-failed tries again")
     if failure is None:  # No code of the method runs in that process: this is no failure of the method.
         log = cell.folder / "output.log"
         ended = f"the process of {cell.config.title} ended with {_exit_name(ending.exit_code)}"
@@ -391,29 +395,17 @@ def _digest(cell: Cell) -> str:
 
 def _why_stale(cell: Cell) -> str | None:
     """Which input changed since this method and seed were last run in this folder, if they were."""
-    fresh = asdict(cell.config)
-    same = (
-        "scene",
-        "size",
-        "method",
-        "preset",
-        "seed",
-        "capture_seed",
-        "subject",
-        "axis",
-        "severity",
-        "factory",
-        "changes",
-    )
+    inputs = ("code", "capture", "protocol")
     for path in cell.folder.parent.glob("*/config.json"):
         content = read_json(path)
         old = content.get("config", {}) if isinstance(content, dict) else {}
-        if not isinstance(old, dict):  # Other versions of this program knew other fields.
+        if path.parent == cell.folder or not isinstance(old, dict) or not (path.parent / "result.json").exists():
             continue
-        if path.parent != cell.folder and all((old.get(name) or 0) == (fresh[name] or 0) for name in same):
-            changed = [name for name in ("code", "capture", "protocol") if old.get(name) != fresh[name]]
-            if (path.parent / "result.json").exists() and changed:
-                return f"the {' and the '.join(changed)} changed since its last result"
+        # Other versions of this program knew other fields, so one that is absent counts as empty.
+        differ = {name for name, value in asdict(cell.config).items() if (old.get(name) or 0) != (value or 0)}
+        changed = [name for name in inputs if name in differ]
+        if changed and differ <= {*inputs, "truth"}:
+            return f"the {' and the '.join(changed)} changed since its last result"
     return None
 
 

@@ -189,7 +189,9 @@ class _Reader:
         from benchmarks.suites.scenes import scene_of
 
         place: Place = ("scenes", index)
-        methods = self.names(row.get("methods", []), (*place, "methods"))
+        methods = row.get("methods", [])
+        if not isinstance(methods, list) or not all(isinstance(name, str) for name in methods):
+            raise self.error((*place, "methods"), f"methods: expected a list of names, got {methods!r}")
         known, changes = self.split({key: row[key] for key in row if key != "methods"}, place, SCENE_KEYS)
         if "capture" in known:
             if changes or set(known) - {"capture", "name"}:
@@ -197,43 +199,31 @@ class _Reader:
                     place, "a finished capture is taken as it is: expected no key but capture, name and methods"
                 )
             spec = self.located(place, lambda: given_capture(Path(known["capture"]), name=known.get("name", "")))
-            return replace(spec, methods=methods)
-        of = self.required(known, place)
-        name, size_of_it = known.get("name") or varied_name(of, changes), known.get("size", "")
-        spec = SceneSpec(name=name, of=of, size=size_of_it, changes=changes, methods=methods)
-        self.located(place, lambda: scene_of(of, size=spec.size or size))
-        self.each(place, changes, lambda some: scene_of(of, size=spec.size or size, changes=some))
-        return spec
+            return replace(spec, methods=tuple(methods))
+        of, own = known["of"], known.get("size", "")
+        self.located(place, lambda: scene_of(of, size=own or size))
+        self.each(place, changes, lambda some: scene_of(of, size=own or size, changes=some))
+        name = known.get("name") or varied_name(of, changes)
+        return SceneSpec(name=name, of=of, size=own, changes=changes, methods=tuple(methods))
 
     def method(self, index: int, row: dict[str, Any], preset: str) -> MethodSpec:
         """One row of methods; its configuration is made once, so that it is refused here and not in its cells."""
         place: Place = ("methods", index)
         known, changes = self.split(row, place, METHOD_KEYS)
-        of = self.required(known, place)
-        if brought_folder(of) is not None:
-            return self.brought(known, changes, place)
-        self.located((*place, "of"), lambda: find_method(of))
-        own = known.get("preset", "")
-        self.each(place, changes, lambda some: configured(of, own or preset, some))
-        varied = changes + ((("preset", own),) if own else ())
-        name, title = known.get("name") or varied_name(of, varied), known.get("title", "")
-        self.check_title(title, place)
-        if title and name == of and find_method(of).is_ours:
-            raise self.error((*place, "title"), f"title: {of} has one; expected it beside a name of the row's own")
-        return self.located(place, lambda: MethodSpec(name=name, of=of, preset=own, changes=changes, title=title))  # type: ignore[no-any-return]
-
-    def brought(self, known: dict[str, str], changes: Changes, place: Place) -> MethodSpec:
-        """A row of pictures that were rendered elsewhere: nothing of it can be changed."""
-        if changes or "preset" in known or "name" not in known:
-            raise self.error(place, "pictures are taken as they are: expected the keys of, name and perhaps title")
-        name, of, title = known["name"], known["of"], known.get("title", "")
-        self.check_title(title, place)
-        return self.located(place, lambda: MethodSpec(name=name, of=of, preset=AS_GIVEN, title=title))  # type: ignore[no-any-return]
-
-    def check_title(self, title: str, place: Place) -> None:
-        """Refuse a title that no table can hold."""
+        of, own, name, title = known["of"], known.get("preset", ""), known.get("name", ""), known.get("title", "")
         if not title.isprintable() or len(title) > LONGEST_TITLE:
             raise self.error((*place, "title"), f"title: expected at most {LONGEST_TITLE} printable characters")
+        if brought_folder(of) is not None:  # Pictures that were rendered elsewhere.
+            if changes or own or not name:
+                raise self.error(place, "pictures are taken as they are: expected the keys of, name and perhaps title")
+            own = AS_GIVEN
+        else:
+            self.located((*place, "of"), lambda: find_method(of))
+            self.each(place, changes, lambda some: configured(of, own or preset, some))
+            name = name or varied_name(of, changes + ((("preset", own),) if own else ()))
+            if title and name == of and find_method(of).is_ours:
+                raise self.error((*place, "title"), f"title: {of} has one; expected it beside a name of the row's own")
+        return self.located(place, lambda: MethodSpec(name=name, of=of, preset=own, changes=changes, title=title))  # type: ignore[no-any-return]
 
     def stresses(self, table: Any) -> Iterator[Stress]:
         """Every step of every axis."""
@@ -247,7 +237,7 @@ class _Reader:
                 yield self.located(place, lambda axis=axis, s=severity: Stress(axis=axis, severity=float(s)))
 
     def split(self, row: dict[str, Any], place: Place, own: tuple[str, ...]) -> tuple[dict[str, str], Changes]:
-        """What says which row it is, and what is replaced in it."""
+        """What says which row it is (`of`, or `capture` of a scene, is among it), and what is replaced in it."""
         known = {key: value for key, value in row.items() if key in own}
         for key, value in known.items():
             if not isinstance(value, str) or not value:
@@ -255,19 +245,9 @@ class _Reader:
         for key in ("seed", "subject"):
             if key in row:
                 raise self.error((*place, key), f"{key}: a row has none of its own, the suite's `{key}s` counts them")
-        return known, _dotted({key: value for key, value in row.items() if key not in own})
-
-    def names(self, value: Any, place: Place) -> tuple[str, ...]:
-        """A list of names."""
-        if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
-            raise self.error(place, f"{place[-1]}: expected a list of names, got {value!r}")
-        return tuple(value)
-
-    def required(self, known: dict[str, str], place: Place) -> str:
-        """The name of what a row is a variant of."""
-        if "of" not in known:
+        if not known.keys() & {"of", "capture"}:
             raise self.error(place, f"{place[0]}: expected the key 'of', what this row is or is a variant of")
-        return known["of"]
+        return known, _dotted({key: value for key, value in row.items() if key not in own})
 
     def each(self, place: Place, changes: Changes, make: Callable[[Changes], Any]) -> None:
         """Try the changes of a row; where they are refused, name the line of the first that is refused by itself."""

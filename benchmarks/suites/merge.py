@@ -4,7 +4,6 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from ash.files import InputError, read_json, write_json
 from benchmarks.cell.schema import read_result, result_of
@@ -14,12 +13,8 @@ from benchmarks.suites.runs import RUN_FILE, read_run
 def are_shards(folders: Sequence[Path]) -> bool:
     """Whether several folders hold parts of one run: the same suite and the same cells."""
     descriptions = [read_json(path) if (path := folder / RUN_FILE).is_file() else None for folder in folders]
-    first = descriptions[0]
-    return len(folders) > 1 and isinstance(first, dict) and all(_same_cells(first, other) for other in descriptions)
-
-
-def _same_cells(one: dict[str, Any], other: Any) -> bool:
-    return isinstance(other, dict) and all(one.get(name) == other.get(name) for name in ("suite", "cells"))
+    asked = [(each.get("suite"), each.get("cells")) if isinstance(each, dict) else None for each in descriptions]
+    return len(folders) > 1 and None not in asked and all(each == asked[0] for each in asked)
 
 
 def merge_runs(shards: Sequence[Path], out: Path) -> None:

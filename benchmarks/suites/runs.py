@@ -17,7 +17,6 @@ from benchmarks.cell import sandbox
 from benchmarks.cell.metrics import PROTOCOL
 from benchmarks.cell.predictions import open_predictions
 from benchmarks.cell.registry import BROUGHT, ORACLES, brought_folder, code_version, configured, find_method, offered
-from benchmarks.cell.sandbox import clean_environment
 from benchmarks.cell.schema import Cell, CellConfig, CellResult, printable, read_cell, result_of
 from benchmarks.suites.captures import (
     make_capture,
@@ -27,7 +26,15 @@ from benchmarks.suites.captures import (
     subject_of,
     truth_of,
 )
-from benchmarks.suites.engine import Limits, make_executor, plan_cells, require_executor, run_cells, shard_of
+from benchmarks.suites.engine import (
+    Limits,
+    make_executor,
+    plan_cells,
+    read_shard,
+    require_executor,
+    run_cells,
+    shard_of,
+)
 from benchmarks.suites.progress import Progress
 from benchmarks.suites.suites import CellSpec, Suite
 from benchmarks.suites.tables import TableSpec
@@ -94,7 +101,9 @@ def run_suite(suite: Suite, options: RunOptions) -> Run:
         print(note, file=sys.stderr)
     options.out.mkdir(parents=True, exist_ok=True)
     with contextlib.nullcontext() if options.shard else run_lock(options.out):
-        return _run_suite(suite, options)
+        run = prepared(suite, options)
+        run_missing(shard_of(run.cells, options.shard) if options.shard else run.cells, suite, options)
+    return run
 
 
 def require_utf8(folder: Path) -> None:
@@ -117,7 +126,7 @@ def require_runnable(suite: Suite, options: RunOptions) -> list[str]:
         InputError: a shard, an executor, a method, a preset or a changed field is wrong, or the disk is too small.
     """
     if options.shard:
-        shard_of((), options.shard)
+        read_shard(options.shard)
     require_executor(options.executor)
     missing = missing_captures(suite, options.data)
     notes = []
@@ -147,19 +156,13 @@ def _require_importable(method: str, preset: str) -> None:
         "from benchmarks.cell.registry import offered; add_method_paths()\n"
         "try: offered(*sys.argv[1:])\nexcept InputError as error: sys.exit(f'refused: {error}')"
     )
+    command = [sys.executable, "-P", "-c", code, method, preset]
+    settings: dict[str, Any] = {"env": sandbox.clean_environment(), "stdin": subprocess.DEVNULL, "capture_output": True}
     with contextlib.suppress(subprocess.TimeoutExpired):
-        command = [sys.executable, "-P", "-c", code, method, preset]
-        settings: dict[str, Any] = {"env": clean_environment(), "stdin": subprocess.DEVNULL, "capture_output": True}
         ended = subprocess.run(command, timeout=IMPORT_S, check=False, **settings)
         last = ended.stderr.decode(errors="replace").strip().rpartition("\n")[2]
         if last.startswith("refused: "):
             raise InputError(last.removeprefix("refused: "))
-
-
-def _run_suite(suite: Suite, options: RunOptions) -> Run:
-    run = prepared(suite, options)
-    run_missing(shard_of(run.cells, options.shard) if options.shard else run.cells, suite, options)
-    return run
 
 
 def prepared(suite: Suite, options: RunOptions) -> Run:
@@ -247,16 +250,17 @@ def write_run(run: Run) -> None:
 
 def description_of(run: Run) -> dict[str, Any]:
     """What `run.json` says of a run."""
-    return {
-        "protocol": PROTOCOL,
-        "suite": run.suite,
-        "about": run.about,
-        "command": run.command,
-        "cells": [cell.config.key for cell in run.cells],
-        **({"titles": run.titles} if run.titles else {}),
-        **({"table": [asdict(table) for table in run.table]} if run.table else {}),
-        "cell_titles": {cell.config.key: cell.config.title for cell in run.cells},
-    }
+    file = RunFile(
+        protocol=PROTOCOL,
+        suite=run.suite,
+        about=run.about,
+        command=run.command,
+        cells=tuple(cell.config.key for cell in run.cells),
+        titles=run.titles,
+        table=run.table,
+        cell_titles={cell.config.key: cell.config.title for cell in run.cells},
+    )
+    return {name: value for name, value in asdict(file).items() if value or name not in ("titles", "table")}
 
 
 def read_run(folder: Path) -> Run:
@@ -305,23 +309,20 @@ def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
         raise InputError(
             f"{out}: people from {VALIDATION} on are there to choose by, expected a report without the others"
         )
-    named = [_told_apart(cell) if cell.config.place in mixed else cell for cell in cells]
+    named = [
+        replace(cell, config=replace(cell.config, scene=cell.capture_folder.resolve().name))
+        if cell.config.place in mixed
+        else cell
+        for cell in cells
+    ]
     require_one_of_each(named)
     about = f"cells of {', '.join(map(str, folders))}"
     titles = {name: title for run in reversed(runs) for name, title in run.titles.items()}  # The first run's first.
     table = next((run.table for run in runs if run.table), ())
     there = {cell.config.key for cell in cells}
     absent = tuple(dict.fromkeys(key for run in runs for key in run.absent if key not in there))
-    return Run(
-        folder=out,
-        suite=out.name,
-        about=about,
-        command=command,
-        cells=tuple(named),
-        absent=absent,
-        titles=titles,
-        table=table,
-    )
+    given: dict[str, Any] = {"suite": out.name, "about": about, "command": command, "titles": titles, "table": table}
+    return Run(folder=out, cells=tuple(named), absent=absent, **given)
 
 
 def require_one_of_each(cells: Iterable[Cell]) -> None:
@@ -365,11 +366,6 @@ def require_for_choosing(run: Run) -> Run:
     if any(cell.config.subject < VALIDATION for cell in run.cells):
         raise InputError(f"{run.folder}: expected a run of `--validation`, on people from {VALIDATION} on alone")
     return run
-
-
-def _told_apart(cell: Cell) -> Cell:
-    """The cell on a scene that is called as its capture's folder is."""
-    return replace(cell, config=replace(cell.config, scene=cell.capture_folder.resolve().name))
 
 
 def results_of(run: Run) -> list[CellResult]:

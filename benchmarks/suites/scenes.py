@@ -1,8 +1,8 @@
 """Every scene by its name, those of the generator and `splats`, and how each becomes a capture."""
 
+from concurrent.futures import Executor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from ash.fields import Changes, apply_overrides, suggest
@@ -28,14 +28,12 @@ def scene_of(of: str, *, size: str, seed: int = 0, subject: int = 0, name: str =
     """
     if of not in scene_names():
         raise InputError(f"unknown scene {of!r}, {suggest(of, scene_names())}")
-    plain = replace(_plain(of, size, seed), subject=subject, name=name or of)
-    return apply_overrides(plain, current_fields(plain, changes), of=of)
-
-
-def _plain(of: str, size: str, seed: int) -> Scene:
     if of == SPLATS:  # The poses and cameras of `skinned`; what it looks like is the splatter's.
-        return replace(skinned(size=size, seed=seed), body="mannequin")
-    return scene(of, size=size, seed=seed)
+        plain = replace(skinned(size=size, seed=seed), body="mannequin")
+    else:
+        plain = scene(of, size=size, seed=seed)
+    plain = replace(plain, subject=subject, name=name or of)
+    return apply_overrides(plain, current_fields(plain, changes), of=of)
 
 
 def identity_of(of: str, wanted: Scene) -> str:
@@ -47,8 +45,19 @@ def identity_of(of: str, wanted: Scene) -> str:
     return wanted.identity
 
 
-def draw_scene(of: str, wanted: Scene, folder: Path, *, title: str, workers: int) -> None:
+def draw_scene(
+    of: str,
+    wanted: Scene,
+    folder: Path,
+    *,
+    title: str,
+    workers: int,
+    executor: Executor | None = None,
+    shard: tuple[int, int] = (1, 1),
+) -> None:
     """Render into `folder` what is missing of the capture of a scene that is a variant of `of`.
+
+    `executor`, `shard`: as of `synth.capture.make_capture`.
 
     Raises:
         InputError: processes that render were killed from outside, in each of two attempts.
@@ -59,20 +68,21 @@ def draw_scene(of: str, wanted: Scene, folder: Path, *, title: str, workers: int
         splats.draw_capture(wanted, folder)
         return
     from synth.capture import make_capture as render
+    from synth.cost import estimate
 
     progress = Progress(f"images of {title}", 0, expected_s=0.0, workers=workers)
     if not (folder / "cameras.json").exists():  # Written last before the images.
-        progress.say(f"preparing {title}: body, motion, clothes, texture (up to two minutes)")
-    draw = partial(render, wanted, folder, workers=workers, progress=progress.advance)
-    try:
-        draw()
-    except BrokenProcessPool:  # The kernel kills when memory runs out; what was drawn is kept.
-        progress.say(f"{title}: a process that renders was killed from outside, tried again")
+        cost = estimate(wanted).text
+        progress.say(f"{title}: {cost}; first body, motion, clothes and texture (up to two minutes)")
+    for attempt in (1, 2):  # The kernel kills when memory runs out; what was drawn is kept.
         try:
-            draw()
+            render(wanted, folder, workers=workers, progress=progress.advance, executor=executor, shard=shard)
+            break
         except BrokenProcessPool:
-            raise InputError(
-                f"{folder}: processes that render were killed from outside in each of 2 attempts; the kernel does that"
-                " when memory runs out, and fewer --workers need less"
-            ) from None
+            if attempt == 2:
+                raise InputError(
+                    f"{folder}: processes that render were killed from outside in each of 2 attempts; the kernel does"
+                    " that when memory runs out, and fewer --workers need less"
+                ) from None
+            progress.say(f"{title}: a process that renders was killed from outside, tried again")
     progress.close()

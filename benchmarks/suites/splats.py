@@ -4,14 +4,14 @@ They are none of ASH's: more than it has texels, at other places, of other shape
 It is drawn here and not in `synth`, which makes the truth that the splatter is judged by and so must not know it.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ash.capture.dataset import Camera, Motion, Pose, Skeleton, TemplateMesh, image_path, surface_path
+from ash.capture.dataset import Camera, Pose, TemplateMesh, image_path, surface_path
 from ash.capture.formats import write_cameras, write_motion, write_skeleton, write_template
 from ash.capture.manifest import Manifest, hash_files, is_capture
 from ash.config import ModelConfig
@@ -19,8 +19,10 @@ from ash.files import hash_of, write_arrays, write_image
 from ash.model import AshModel
 from ash.template.template import RestDeformation, Template
 from ash.textures import TexelLattice
+from synth.camera.rig import make_cameras
 from synth.capture import make_body
-from synth.scene import Scene
+from synth.motion.clips import make_motion
+from synth.scene import Scene, stream
 from synth.views import splits
 
 CI_COUNT, COUNT = 5_000, 60_000  # About twice as many as the presets' lattices have texels at these sizes.
@@ -40,19 +42,25 @@ def draw_capture(scene: Scene, folder: Path) -> None:
     """
     if is_capture(folder):
         return
-    made = _person(scene)
-    write_skeleton(folder / "skeleton.json", made.skeleton)
-    write_motion(folder / "motion.npz", made.motion)
-    write_template(folder / "template.npz", made.mesh)
-    write_arrays(folder / "truth" / "template.npz", vertices=made.posed.astype(np.float64))
-    write_arrays(folder / "truth" / "surface.npz", faces=made.mesh.faces.astype(np.int32))
-    for frame, vertices in enumerate(made.posed):
+    body = make_body(scene)
+    mesh = body.template()
+    motion = make_motion(body.skeleton, scene.clips, fps=scene.fps, seed=stream(scene, "motion"))
+    template = Template(mesh, body.skeleton, RestDeformation(mesh))
+    seed = stream(scene, "splats") if scene.subject else scene.seed
+    model = known_avatar(template, count=CI_COUNT if scene.size == "ci" else COUNT, seed=seed)
+    posed = np.stack([template.pose(Pose(motion, frame)).vertices.numpy() for frame in range(len(motion.dofs))])
+    cameras = {camera.name: camera for camera in make_cameras(scene.rig, posed.reshape(-1, 3).astype(np.float64))}
+    write_skeleton(folder / "skeleton.json", body.skeleton)
+    write_motion(folder / "motion.npz", motion)
+    write_template(folder / "template.npz", mesh)
+    write_arrays(folder / "truth" / "template.npz", vertices=posed.astype(np.float64))
+    write_arrays(folder / "truth" / "surface.npz", faces=mesh.faces.astype(np.int32))
+    for frame, vertices in enumerate(posed):
         write_arrays(surface_path(folder, frame), vertices=vertices)
-    write_cameras(folder / "cameras.json", list(made.cameras.values()))
+    write_cameras(folder / "cameras.json", list(cameras.values()))
     parts = splits(scene)
     for name, frame in sorted({view for split in parts.values() for view in split.views}):
-        image = draw_view(made.model, Pose(made.motion, frame), made.cameras[name])
-        write_image(image_path(folder, name, frame), image)
+        write_image(image_path(folder, name, frame), draw_view(model, Pose(motion, frame), cameras[name]))
     Manifest(
         scene=scene.name,
         size=scene.size,
@@ -64,58 +72,14 @@ def draw_capture(scene: Scene, folder: Path) -> None:
     ).write(folder)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Person:
-    """The scene's body made of Gaussians, and what it does."""
-
-    skeleton: Skeleton
-    mesh: TemplateMesh
-    motion: Motion
-    model: AshModel
-    posed: np.ndarray  # [t, v, 3] metres
-    cameras: dict[str, Camera]
-
-
-def _person(scene: Scene) -> Person:
-    from synth.camera.rig import make_cameras
-    from synth.motion.clips import make_motion
-    from synth.scene import stream
-
-    body = make_body(scene)
-    mesh = body.template()
-    motion = make_motion(body.skeleton, scene.clips, fps=scene.fps, seed=stream(scene, "motion"))
-    template = Template(mesh, body.skeleton, RestDeformation(mesh))
-    seed = stream(scene, "splats") if scene.subject else scene.seed
-    model = known_avatar(template, count=CI_COUNT if scene.size == "ci" else COUNT, seed=seed)
-    posed = np.stack([template.pose(Pose(motion, frame)).vertices.numpy() for frame in range(len(motion.dofs))])
-    cameras = make_cameras(scene.rig, posed.reshape(-1, 3).astype(np.float64))
-    return Person(
-        skeleton=body.skeleton,
-        mesh=mesh,
-        motion=motion,
-        model=model,
-        posed=posed,
-        cameras={camera.name: camera for camera in cameras},
-    )
-
-
 def known_avatar(template: Template, *, count: int, seed: int) -> AshModel:
     """`count` Gaussians at random places of a template, of random sizes, shapes, directions, opacities and colours.
 
     No texel lattice and no initialiser of the method has a part in it: what is trained must approximate them.
     """
-    config = ModelConfig(
-        texels=4,
-        window=1,
-        yaw_normalise=True,
-        levels=0,
-        motion=False,
-        base=True,
-        sh_degree=0,
-        dilation=0.05,
-        anchor="surface",
-        offset_unit_m=1.0,
-    )
+    size: dict[str, Any] = {"texels": 4, "window": 1, "levels": 0, "sh_degree": 0, "dilation": 0.05}
+    kind: dict[str, Any] = {"yaw_normalise": True, "motion": False, "base": True, "anchor": "surface"}
+    config = ModelConfig(**size, **kind, offset_unit_m=1.0)
     rng = np.random.default_rng([seed, 7])
     places = scattered(template.mesh, count, rng)
     return AshModel(config, template, places, _known_gaussians(template, places, rng), None)

@@ -2,15 +2,17 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from ash.capture.dataset import Capture
 from ash.fields import suggest
 from ash.files import InputError
 from synth.perturbation.perturb import Perturbation
 
+FOOTAGE_FRAMES = 320  # Training frames of size `long`, whose motion the axis `footage` cuts short.
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class StressAxis:
+
+class StressAxis(NamedTuple):
     """One defect of a capture, by a severity in `unit`."""
 
     title: str
@@ -18,7 +20,16 @@ class StressAxis:
     perturbation: Callable[[Capture, float], Perturbation]
 
 
-FOOTAGE_FRAMES = 320  # Training frames of size `long`, whose motion the axis `footage` cuts short.
+def _fewer_cameras(capture: Capture, missing_percent: float) -> Perturbation:
+    return Perturbation(cameras=_left(len(capture.splits["train"].cameras), missing_percent))
+
+
+def _fewer_frames(capture: Capture, missing_percent: float) -> Perturbation:
+    return Perturbation(frames=_left(len(capture.splits["train"].frames), missing_percent))
+
+
+def _shorter_motion(capture: Capture, missing_frames: float) -> Perturbation:
+    return Perturbation(first_frames=len(capture.splits["train"].frames) - round(missing_frames))
 
 
 def _left(count: int, missing_percent: float) -> int:
@@ -26,60 +37,18 @@ def _left(count: int, missing_percent: float) -> int:
 
 
 AXES = {
-    "cameras": StressAxis(
-        title="training cameras missing",
-        unit="%",
-        perturbation=lambda capture, s: Perturbation(cameras=_left(len(capture.splits["train"].cameras), s)),
-    ),
-    "frames": StressAxis(
-        title="training frames missing",
-        unit="%",
-        perturbation=lambda capture, s: Perturbation(frames=_left(len(capture.splits["train"].frames), s)),
-    ),
-    "footage": StressAxis(
-        title="end of the training motion missing",
-        unit="frames",
-        perturbation=lambda capture, s: Perturbation(first_frames=len(capture.splits["train"].frames) - round(s)),
-    ),
-    "tracking": StressAxis(
-        title="wrong joint angles",
-        unit="deg",
-        perturbation=lambda _, s: Perturbation(tracking_deg=s),
-    ),
-    "root": StressAxis(
-        title="wrong root position",
-        unit="mm",
-        perturbation=lambda _, s: Perturbation(tracking_mm=s),
-    ),
-    "calibration": StressAxis(
-        title="wrong calibration",
-        unit="px",
-        perturbation=lambda _, s: Perturbation(calibration_px=s),
-    ),
-    "lens": StressAxis(
-        title="lens distortion that the calibration lacks",
-        unit="px",
-        perturbation=lambda _, s: Perturbation(lens_px=s),
-    ),
-    "mask_grown": StressAxis(
-        title="masks too large",
-        unit="px",
-        perturbation=lambda _, s: Perturbation(mask_px=round(s)),
-    ),
-    "mask_shrunk": StressAxis(
-        title="masks too small",
-        unit="px",
-        perturbation=lambda _, s: Perturbation(mask_px=-round(s)),
-    ),
-    "exposure": StressAxis(
-        title="exposure drift between cameras",
-        unit="stops",
-        perturbation=lambda _, s: Perturbation(exposure_stops=s),
-    ),
+    "cameras": StressAxis("training cameras missing", "%", _fewer_cameras),
+    "frames": StressAxis("training frames missing", "%", _fewer_frames),
+    "footage": StressAxis("end of the training motion missing", "frames", _shorter_motion),
+    "tracking": StressAxis("wrong joint angles", "deg", lambda _, s: Perturbation(tracking_deg=s)),
+    "root": StressAxis("wrong root position", "mm", lambda _, s: Perturbation(tracking_mm=s)),
+    "calibration": StressAxis("wrong calibration", "px", lambda _, s: Perturbation(calibration_px=s)),
+    "lens": StressAxis("lens distortion that the calibration lacks", "px", lambda _, s: Perturbation(lens_px=s)),
+    "mask_grown": StressAxis("masks too large", "px", lambda _, s: Perturbation(mask_px=round(s))),
+    "mask_shrunk": StressAxis("masks too small", "px", lambda _, s: Perturbation(mask_px=-round(s))),
+    "exposure": StressAxis("exposure drift between cameras", "stops", lambda _, s: Perturbation(exposure_stops=s)),
     "noise": StressAxis(
-        title="more noise in the training images",
-        unit="dB",
-        perturbation=lambda _, s: Perturbation(noise_factor=10 ** (s / 10)),
+        "more noise in the training images", "dB", lambda _, s: Perturbation(noise_factor=10 ** (s / 10))
     ),
 }
 
@@ -96,11 +65,6 @@ class Stress:
             raise InputError(f"unknown stress axis {self.axis!r}, {suggest(self.axis, tuple(AXES))}")
         if not 0 < self.severity < float("inf"):
             raise InputError(f"stress {self.axis}: expected a severity above zero, got {self.severity}")
-
-    @property
-    def title(self) -> str:
-        """For progress lines and tables."""
-        return f"{AXES[self.axis].title} {self.severity:g} {AXES[self.axis].unit}"
 
     def perturbation(self, capture: Capture) -> Perturbation:
         """What it does to a capture."""

@@ -131,23 +131,26 @@ class Suite:
                 raise InputError(f"{name}: expected more than 0, got {getattr(self, name)}")
 
     @property
-    def people(self) -> range:
-        """The subjects."""
-        first = VALIDATION if self.validation else 0
-        return range(first, first + self.subjects)
-
-    @property
     def captures(self) -> tuple[CaptureSpec, ...]:
         """One capture per subject and scene, and one per stress of it, shared by all methods and seeds.
 
         Subjects outermost; a finished capture has the one that it has.
         """
+        first = VALIDATION if self.validation else 0
         return tuple(
-            _capture(scene, self.size, stress, subject)
-            for subject in self.people
+            CaptureSpec(
+                scene=scene.name,
+                size=scene.size or self.size,
+                subject=subject,
+                stress=stress,
+                of="" if scene.of == scene.name else scene.of,
+                changes=scene.changes,
+                folder=scene.folder,
+            )
+            for subject in range(first, first + self.subjects)
             for stress in (None, *self.stresses)
             for scene in self.scenes
-            if not scene.folder or subject == self.people[0]
+            if not scene.folder or subject == first
         )
 
     @property
@@ -201,15 +204,3 @@ def varied_name(of: str, changes: Changes) -> str:
 def capture_name(scene: str, size: str, seed: int, subject: int = 0) -> str:
     """What the folder of a capture is called."""
     return f"{scene}-{size}-{seed}-subject{subject}" if subject else f"{scene}-{size}-{seed}"
-
-
-def _capture(scene: SceneSpec, size: str, stress: Stress | None, subject: int) -> CaptureSpec:
-    return CaptureSpec(
-        scene=scene.name,
-        size=scene.size or size,
-        subject=subject,
-        stress=stress,
-        of="" if scene.of == scene.name else scene.of,
-        changes=scene.changes,
-        folder=scene.folder,
-    )

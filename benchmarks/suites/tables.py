@@ -8,14 +8,14 @@
     form = "difference"            # mean and difference to the reference; or "half-width", "interval", "mean"
     marks = ["bold", "underline"]  # also "colour"
 
-Without `rows` the table has every method of the run. `scene` names the scene, of a table or of a column; without it
-there is a table for each scene of the run. A column `{ given = "paper", title = "PSNR" }` prints what rows bring along:
-`{ title = "NA", given.paper = 30.33 }`.
+Without `rows` the table has every method of the run, without `columns` those of the table above it. `scene` names the
+scene, of a table or of a column; without it there is a table for each scene of the run. A column
+`{ given = "paper", title = "PSNR" }` prints what rows bring along: `{ title = "NA", given.paper = 30.33 }`.
 """
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 from ash.capture.typed import from_json
@@ -137,25 +137,28 @@ def tables_of(content: Any, *, place: str) -> tuple[TableSpec, ...]:
     Raises:
         InputError: names `place` and the key.
     """
+    tables = content if isinstance(content, list) else [content]
+    plain = [_spelt_out(table) if isinstance(table, dict) else table for table in tables]
+    for above, table in pairwise(plain):
+        if isinstance(table, dict) and isinstance(above, dict) and "columns" in above:
+            table.setdefault("columns", above["columns"])
     try:
-        tables = content if isinstance(content, list) else [content]
-        plain = [_spelt_out(table) if isinstance(table, dict) else table for table in tables]
         return tuple(from_json(tuple[TableSpec, ...], plain, place="table"))
     except ValueError as error:
         raise InputError(f"{place}: {error}") from error
 
 
 def _spelt_out(table: dict[str, Any]) -> dict[str, Any]:
+    """A copy in which rows lie in groups, and a name is a table with the key that it stands for."""
     columns, rows = table.get("columns"), table.get("rows")
     plain = dict(table)
     if isinstance(columns, list):
-        plain["columns"] = [{"metric": each} if isinstance(each, str) else each for each in columns]
+        plain["columns"] = _named("metric", columns)
     if isinstance(rows, list):
         groups = rows if any(isinstance(each, list) for each in rows) else [rows]
-        plain["rows"] = [list(_rows(group)) if isinstance(group, list) else group for group in groups]
+        plain["rows"] = [_named("method", group) if isinstance(group, list) else group for group in groups]
     return plain
 
 
-def _rows(group: list[Any]) -> Iterator[Any]:
-    for row in group:
-        yield {"method": row} if isinstance(row, str) else row
+def _named(key: str, entries: list[Any]) -> list[Any]:
+    return [{key: entry} if isinstance(entry, str) else entry for entry in entries]

@@ -58,7 +58,8 @@ def verify_pack(folder: Path, captures: Sequence[Path] = ()) -> tuple[list[CellC
         if result is None:
             raise InputError(f"{cell.folder}: has no result")
         _require_pictures(cell, result)
-        checks.append(_check(cell, result, find_capture(cell, captures), intact))
+        kind, text = _check(cell, result, find_capture(cell, captures), intact)
+        checks.append(CellCheck(cell=cell, kind=kind, text=text))
     return checks, len(pack.files)
 
 
@@ -84,45 +85,40 @@ def _require_pictures(cell: Cell, result: CellResult) -> None:
         raise InputError(f"{cell.folder}: {len(images)} pictures, and the result is of {len(named)} others")
 
 
-def _check(cell: Cell, result: CellResult, folder: Path | None, intact: set[Path]) -> CellCheck:
-    def ended(kind: Kind, text: str) -> CellCheck:
-        return CellCheck(cell=cell, kind=kind, text=text)
-
+def _check(cell: Cell, result: CellResult, folder: Path | None, intact: set[Path]) -> tuple[Kind, str]:
     if result.status != "done":
         worst = not result.views and all(row.value == METRICS[row.metric].worst for row in result.summary)
         text = f"no pictures, for it failed ({result.status}: {result.reason})"
-        return ended("failed", text) if worst else ended("differs", "says that it failed, and has scores")
+        return ("failed", text) if worst else ("differs", "says that it failed, and has scores")
     if folder is None:
         named = f"{cell.capture_folder.name}, whose manifest has SHA-256 {cell.config.capture:.12}..."
-        return ended("unchecked", f"NOT CHECKED: the capture is not at hand ({named}); give it with --capture DIR")
+        return "unchecked", f"NOT CHECKED: the capture is not at hand ({named}); give it with --capture DIR"
     if folder not in intact:
         require_intact(folder)
         intact.add(folder)
     capture = load_capture(folder)
     views = evaluated_views(capture)
     if views != tuple(View(split=v.split, camera=v.camera, frame=v.frame) for v in result.views):
-        return ended("differs", f"its pictures are not the {len(views)} views that {folder} is scored on")
+        return "differs", f"its pictures are not the {len(views)} views that {folder} is scored on"
     on_cpu = replace(cell, config=replace(cell.config, changes={}))  # The device that a pack names may not be here.
     scored = scored_views(on_cpu, capture, views, alpha=result.has_alpha)
     for before, view in zip(result.views, scored, strict=True):
         if before.prediction != view.prediction:
-            return ended("differs", f"the picture {view.split}/{view.camera}/{view.frame} is not the one that it names")
+            return "differs", f"the picture {view.split}/{view.camera}/{view.frame} is not the one that it names"
     same = capture.identity == cell.config.capture
     told, measured = _scores(result.summary, result.views), _scores(quality_summary(on_cpu, capture, scored), scored)
     values, given = dict(measured), dict(told)
     if left_out := [place for place in values if place not in given and place[-1] != "lpips"]:
-        return ended("differs", f"{len(left_out)} scores are left out, the first: {' '.join(left_out[0])}")
+        return "differs", f"{len(left_out)} scores are left out, the first: {' '.join(left_out[0])}"
     wrong = [(place, value) for place, value in told if not _close(place[-1], value, values.get(place), same=same)]
     if wrong:
         (place, value), count = wrong[0], f"{len(wrong)} of {len(told)} scores differ"
         pictures = "none" if place not in values else f"{values[place]:.6g}"
-        return ended(
-            "differs", f"{count}, the first: {' '.join(place)} is told as {value:.6g}, pictures have {pictures}"
-        )
+        return "differs", f"{count}, the first: {' '.join(place)} is told as {value:.6g}, pictures have {pictures}"
     without = "" if weights_file() else "; LPIPS is not checked, for its weights are not installed"
     how = "equal" if same else "within what counts as no change (the same scene, rendered elsewhere)"
     text = f"{len(views)} pictures scored again on {folder}, {len(told)} scores are {how}{without}"
-    return ended("equal" if same else "near", text)
+    return "equal" if same else "near", text
 
 
 def _scores(summary: Sequence[Summary], views: Sequence[ViewScore]) -> list[tuple[tuple[str, ...], float]]:

@@ -1,7 +1,6 @@
 """Captures and methods that are fakes, and trained avatars for the tests that show them."""
 
 import shutil
-import time
 from pathlib import Path
 
 import numpy as np
@@ -22,21 +21,6 @@ SCORED: dict[bytes, dict[tuple[str, str], float]] = {}
 def capture(shared: Shared) -> Path:
     """Three boxes that swing, for methods that are fakes."""
     return shared("capture", fakes.write_capture)
-
-
-@pytest.fixture(scope="session")
-def ci_run(shared: Shared, ci_data: Path) -> Path:
-    """The suite `ci` in `run`, and what it took in `seconds`."""
-
-    def make(folder: Path) -> None:
-        start = time.monotonic()
-        command = ["run", "ci", "--out", str(folder / "run"), "--data", str(ci_data)]
-        with pytest.MonkeyPatch.context() as patch:
-            patch.delenv(metrics.LPIPS_WEIGHTS)
-            assert cli.main(command) == cli.DONE
-        (folder / "seconds").write_text(f"{time.monotonic() - start:.1f}")
-
-    return shared("ci", make)
 
 
 @pytest.fixture

@@ -5,14 +5,16 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
+import threading
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 from helpers.commands import refused, refused_last
 from helpers.waiting import wait_for
 
+import ash.files
 from ash.capture.manifest import read_manifest
 from benchmarks import cli
 from benchmarks.cell import registry
@@ -85,7 +87,9 @@ def test_what_train_made_is_reported_and_evaluated_also_when_it_was_moved(
 
 
 def test_a_methods_configuration_is_flags_recorded_hashed_and_used(capture: Path, tmp_path: Path, capsys) -> None:
-    train = ["train", "fake_tuned", str(capture), "--preset", "ci", "--out", str(tmp_path)]
+    """On a person that is there to choose by, whom training takes."""
+    person = str(with_subject(capture, tmp_path / "capture", 100))
+    train = ["train", "fake_tuned", person, "--preset", "ci", "--out", str(tmp_path)]
     found, psnr = {}, {}
     for flags in ((), ("--detail", "0.8"), ("--detail", "0.5"), ("--detail", "0.8", "--row", "sharp")):
         assert cli.main([*train, *flags]) == arguments.DONE
@@ -102,7 +106,7 @@ def test_a_methods_configuration_is_flags_recorded_hashed_and_used(capture: Path
         "fake_tuned",
         {"detail": 0.8},
     )
-    assert found["--detail", "0.8", "--row", "sharp"]["method"] == "sharp"
+    assert found["--detail", "0.8", "--row", "sharp"]["method"] == "sharp" and varied["subject"] == 100
     assert cli.main([*train, "--detail", "0.8"]) == arguments.DONE
     assert "trained before, from the same inputs" in capsys.readouterr().err
     assert "detail: expected 0 to 1, got 2.0" in refused(capsys, *train, "--detail", "2")
@@ -152,28 +156,27 @@ def test_suites_are_printed_as_files(tmp_path: Path, capsys) -> None:
     assert replace(mine, name="quick") == ours
 
 
-def test_a_run_refuses_what_is_for_validation_and_training_does_not(capture: Path, tmp_path: Path, capsys) -> None:
-    folder, out = tmp_path / "capture", str(tmp_path / "out")
+def with_subject(capture: Path, folder: Path, subject: int) -> Path:
+    """A copy of a capture that says whom it shows."""
     shutil.copytree(capture, folder)
     manifest = read_manifest(folder)
-    person = {"parameters": manifest.parameters | {"subject": 100}}
-    for what, number, told in (("seed", 123, {"seed": 123}), ("subject", 100, person)):
-        replace(manifest, **told).write(folder)
-        message = f"{what} {number} is for validation and tuning, expected one below 100"
-        assert message in refused(capsys, "run", "ci", "--capture", str(folder), "--methods", "fake_good", "--out", out)
-    assert cli.main(["train", "fake_good", str(folder), "--preset", "ci", "--out", out]) == arguments.DONE
-    (cell,) = (tmp_path / "out").glob("cells/*/config.json")
-    assert json.loads(cell.read_text())["config"]["subject"] == 100
+    replace(manifest, parameters=manifest.parameters | {"subject": subject}).write(folder)
+    return folder
+
+
+def test_a_run_refuses_what_is_for_validation(capture: Path, tmp_path: Path, capsys) -> None:
+    folder = with_subject(capture, tmp_path / "capture", 100)
+    run = ["run", "ci", "--capture", str(folder), "--methods", "fake_good", "--out", str(tmp_path / "out")]
+    assert "subject 100 is for validation and tuning, expected one below 100" in refused(capsys, *run)
+    replace(read_manifest(capture), seed=123).write(folder)
+    assert "seed 123 is for validation and tuning, expected one below 100" in refused(capsys, *run)
 
 
 def test_people_to_choose_by_have_runs_of_their_own_which_say_so(
     finished: Path, capture: Path, tmp_path: Path, capsys
 ) -> None:
     """Those of the finished run are for tables."""
-    chosen = tmp_path / "capture"
-    shutil.copytree(capture, chosen)
-    manifest = read_manifest(chosen)
-    replace(manifest, parameters=manifest.parameters | {"subject": 100}).write(chosen)
+    chosen = with_subject(capture, tmp_path / "capture", 100)
     run = ["run", "ci", "--methods", "fake_good", "--validation", "--out", str(tmp_path / "search")]
     search, table = tmp_path / "search", finished
     assert "expected it or --scenes" in refused_last(capsys, *run, "--capture", str(chosen), "--scenes", "tight")
@@ -219,21 +222,23 @@ def test_reports_need_a_finished_cell(finished: Path, tmp_path: Path, capsys) ->
     assert (out / "report.html").read_bytes() == page
 
 
-def test_ctrl_c_exits_with_130_and_the_same_command_goes_on(capture: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "benchmarks.cli", "train", "fake_sleeping", str(capture), "--out", str(tmp_path)]
-    for number in (signal.SIGINT, signal.SIGTERM):
-        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+def test_ctrl_c_exits_with_130_and_the_same_command_goes_on(capture: Path, tmp_path: Path, capsys) -> None:
+    def interrupt_the_training(number: int) -> None:
         wait_for(lambda: list(tmp_path.glob("cells/*/*/log.jsonl")))
-        time.sleep(0.5)
-        process.send_signal(number)
-        _, told = process.communicate(timeout=20)
-        assert process.returncode == arguments.INTERRUPTED
-        assert told.strip().endswith("interrupted; the same command goes on where it was")
+        os.kill(os.getpid(), number)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        threading.Thread(target=interrupt_the_training, args=(number,)).start()
+        command = ["train", "fake_sleeping", str(capture), "--out", str(tmp_path)]
+        assert cli.main(command) == arguments.INTERRUPTED
+        assert capsys.readouterr().err.endswith("interrupted; the same command goes on where it was\n")
+        assert not list(tmp_path.glob("cells/*/result.json"))
         shutil.rmtree(tmp_path / "cells")
 
 
 def test_the_code_version_follows_every_deciding_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    root = Path(shutil.copytree(Path(cli.__file__).parents[1] / "ash", tmp_path / "ash"))
+    assert registry._package_folder("ash") == Path(ash.files.__file__).parent, "it reads the sources that run"
+    root = Path(shutil.copytree(Path(ash.files.__file__).parent, tmp_path / "ash"))
     monkeypatch.setattr(registry, "_package_folder", lambda package: root)
     seen = set()
     for path in (None, root / "model.py", root / "native" / "splat.cpp", root / "native" / "project.inc"):
@@ -246,13 +251,6 @@ def test_the_code_version_follows_every_deciding_source(tmp_path: Path, monkeypa
     assert registry._package_folder("ash") == root
 
 
-def test_the_code_version_reads_the_sources_that_run() -> None:
-    import ash.files
-    from benchmarks.cell.registry import _package_folder
-
-    assert _package_folder("ash") == Path(ash.files.__file__).parent
-
-
 def test_two_runs_in_one_folder_do_not_meet(boxes: str, tmp_path: Path, capsys) -> None:
     from ash.files import run_lock
 
@@ -262,9 +260,13 @@ def test_two_runs_in_one_folder_do_not_meet(boxes: str, tmp_path: Path, capsys) 
 
 
 def test_shards_are_merged_into_the_undisturbed_run(finished: Path, boxes: str, tmp_path: Path, capsys) -> None:
-    shards = [tmp_path / "a", tmp_path / "b"]
+    """Each shard has done its cell before, and finds it."""
+    shards = [Path(shutil.copytree(finished, tmp_path / name)) for name in ("a", "b")]
+    cells = json.loads((finished / "run.json").read_text())["cells"]
     for index, shard in enumerate(shards, 1):
+        shutil.rmtree(shard / "cells" / cells[2 - index])
         assert cli.main(["run", boxes, "--out", str(shard), "--shard", f"{index}/2"]) == arguments.DONE
+        assert "1 of 1 cells are there already" in capsys.readouterr().err
     twice = ["report", str(shards[0]), str(shards[0]), "--out", str(tmp_path / "half")]
     assert re.search(r"cells are in no shard, the first: \w+ .* seed 0", refused_last(capsys, *twice))
     assert cli.main(["report", *map(str, shards), "--out", str(tmp_path / "merged")]) == arguments.DONE
@@ -303,18 +305,17 @@ OPENMP = ("OMP_NUM_THREADS", "GOMP_SPINCOUNT", "OMP_WAIT_POLICY")
 
 
 def test_commands_set_how_idle_threads_wait_unless_the_user_did() -> None:
+    """Torch's OpenMP runtime, loaded alone, prints what it was told."""
+    (torch,) = find_spec("torch").submodule_search_locations
+    runtime = next(Path(torch, "lib").glob("libgomp*"), None)
+    if runtime is None:
+        pytest.skip("torch's OpenMP runtime is not GNU's")
     settings = {name: value for name, value in os.environ.items() if name not in OPENMP}
-    code = "from benchmarks import cli; cli.main(['suites', 'ci']); import torch"
-    started = []
+    code = f"import ctypes; from benchmarks import cli; ctypes.CDLL({str(runtime)!r})"
     for given, spins in (({}, "1000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "passive"}, "0")):
         own = settings | given | {"OMP_DISPLAY_ENV": "verbose"}
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
-        started.append((subprocess.Popen([sys.executable, "-c", code], env=own, **quiet), spins))
-    for process, told, spins in [(process, process.communicate()[1], spins) for process, spins in started]:
-        assert process.returncode == 0, told
-        reported = {name: re.findall(rf"{name} ?= ?'(\w+)'", told) for name in OPENMP}
-        if not reported["GOMP_SPINCOUNT"]:
-            pytest.skip("torch's OpenMP runtime is not GNU's")
+        done = subprocess.run([sys.executable, "-c", code], env=own, capture_output=True, text=True, check=True)
+        reported = {name: re.findall(rf"{name} ?= ?'(\w+)'", done.stderr) for name in OPENMP}
         assert (reported["GOMP_SPINCOUNT"], reported["OMP_NUM_THREADS"]) == ([spins], ["1"])
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from helpers.commands import ash_bench, refused
+from helpers.commands import refused, refused_last
 
 from benchmarks import cli
 from benchmarks.commands import arguments
@@ -33,35 +33,34 @@ def _cut(folder: Path) -> None:
     path.write_bytes(path.read_bytes()[:-200])
 
 
+def _flip(folder: Path) -> None:
+    path = folder / "motion.npz"
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1  # In the archive's comment length: still readable, and still not what was made.
+    path.write_bytes(bytes(content))
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
         (lambda folder: (folder / "frames" / "cam0" / "000002.png").unlink(), "cam0/000002.png: missing"),
         (_cut, "cam0/000002.png: altered"),
+        (_flip, "motion.npz: altered (SHA-256 differs from the manifest)"),
         (_edited('"schema": 1', '"schema": 99'), "expected capture schema 1, got 99"),
         (_edited('"complete": true', '"complete": false'), "unfinished"),
         (shutil.rmtree, "manifest.json"),
     ],
-    ids=["missing", "truncated", "schema", "unfinished", "none"],
+    ids=["missing", "truncated", "flipped", "schema", "unfinished", "none"],
 )
 def test_a_capture_that_is_not_whole(
     damage: Callable[[Path], object], message: str, capture: Path, tmp_path: Path, capsys
 ) -> None:
     folder = Path(shutil.copytree(capture, tmp_path / "damaged"))
+    assert cli.main(["verify", str(folder)]) == arguments.DONE
     damage(folder)
     assert message in refused(capsys, "train", "fake_good", str(folder))
     assert cli.main(["verify", str(folder)]) == arguments.WRONG_INPUT
-
-
-def test_a_wrong_hash(capture: Path, tmp_path: Path, capsys) -> None:
-    folder = Path(shutil.copytree(capture, tmp_path / "damaged"))
-    path = folder / "motion.npz"
-    content = bytearray(path.read_bytes())
-    content[-1] ^= 1  # In the archive's comment length: still readable, and still not what was made.
-    path.write_bytes(bytes(content))
-    assert cli.main(["verify", str(folder)]) == arguments.WRONG_INPUT
-    assert "motion.npz: altered (SHA-256 differs from the manifest)" in capsys.readouterr().err
-    assert cli.main(["verify", str(capture)]) == arguments.DONE
+    assert message in capsys.readouterr().err or not folder.exists()
 
 
 def test_a_folder_that_cannot_be_written(capture: Path, tmp_path: Path, capsys) -> None:
@@ -72,28 +71,26 @@ def test_a_folder_that_cannot_be_written(capture: Path, tmp_path: Path, capsys) 
     )
 
 
-def test_no_space_on_the_device(capture: Path, tmp_path: Path) -> None:
+def test_no_space_on_the_device(capture: Path, tmp_path: Path, capsys) -> None:
     small = tmp_path / "small"
     small.mkdir()
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=40k", "tmpfs", small], capture_output=True).returncode:
         pytest.skip("mounting a small file system needs rights that this user lacks")
     try:
-        told = ash_bench("train", "fake_good", str(capture), "--out", str(small))
-        assert told.returncode == arguments.WRONG_INPUT
-        assert told.stderr.strip().splitlines()[-1].endswith("no space left on the device")
-        assert "Traceback" not in told.stderr
+        told = refused_last(capsys, "train", "fake_good", str(capture), "--out", str(small))
+        assert told.endswith("no space left on the device")
     finally:
         subprocess.run(["umount", small], check=True)
 
 
-def test_a_file_beyond_the_systems_limit(capture: Path, tmp_path: Path) -> None:
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
-
-    told = ash_bench("train", "fake_good", str(capture), "--out", str(tmp_path / "out"), preexec_fn=limit)
-    assert told.returncode == arguments.WRONG_INPUT
-    assert "larger than the system allows" in told.stderr
-    assert "Traceback" not in told.stderr
+def test_a_file_beyond_the_systems_limit(capture: Path, tmp_path: Path, capsys) -> None:
+    _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, most))
+    try:
+        told = refused_last(capsys, "train", "fake_good", str(capture), "--out", str(tmp_path / "out"))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+    assert "larger than the system allows" in told
 
 
 def test_closed_streams_change_nothing(finished: Path, boxes: str) -> None:

@@ -1,22 +1,9 @@
 """Commands as a user gives them, and how they are refused."""
 
-import os
-import subprocess
-import sys
-
 import pytest
 
 from benchmarks import cli
 from benchmarks.commands import arguments
-
-
-def ash_bench(*command: str, preexec_fn=None) -> subprocess.CompletedProcess[str]:
-    """A command in a process of its own."""
-    whole = [sys.executable, "-m", "benchmarks.cli", *command]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.run(
-        whole, env=environment, capture_output=True, text=True, timeout=120, preexec_fn=preexec_fn, check=False
-    )
 
 
 def refused(capsys: pytest.CaptureFixture[str], *command: str) -> str:

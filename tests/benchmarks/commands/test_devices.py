@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import fakes
-from helpers.cells import cell
+from helpers.cells import cell, config
 from helpers.commands import refused, refused_last
 
 import ash.devices
@@ -69,32 +69,22 @@ def test_doctor_says_why_a_gpu_cannot_be_used(monkeypatch: pytest.MonkeyPatch) -
 
 
 def learned_on_cuda(method: str) -> CellConfig:
-    return CellConfig(
-        scene="still",
-        size="ci",
-        capture_seed=0,
-        capture="0" * 64,
-        method=method,
-        preset="ci",
-        seed=0,
-        code="0",
-        changes={"device": "cuda", "model.texels": 128},
-    )
+    return replace(config(method), changes={"device": "cuda", "model.texels": 128})
 
 
 def test_an_avatar_is_looked_at_without_a_gpu() -> None:
-    config = learned_on_cuda("ash")
-    here = placed_on(config, "cpu")
-    assert here.changes == {"model.texels": 128} and (config.device, here.device) == ("cuda", "cpu")
-    assert here.key != config.key == placed_on(config, "cuda").key
+    there = learned_on_cuda("ash")
+    here = placed_on(there, "cpu")
+    assert here.changes == {"model.texels": 128} and (there.device, here.device) == ("cuda", "cpu")
+    assert here.key != there.key == placed_on(there, "cuda").key
     assert placed_on(here, "cuda:1").changes == {"device": "cuda:1", "model.texels": 128}
 
 
 def test_what_has_no_device_or_is_not_ours_stays_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fakes.use(tmp_path / "plugins", monkeypatch)
     for method in ("nearest", "fake_good"):
-        config = learned_on_cuda(method)
-        assert placed_on(config, "cpu") is config
+        there = learned_on_cuda(method)
+        assert placed_on(there, "cpu") is there
 
 
 @without_cuda
@@ -102,11 +92,11 @@ def test_a_cell_that_learned_on_a_gpu_is_scored_here_where_the_cpu_is_named(
     tube_cells: dict[str, Path], tmp_path: Path, capsys
 ) -> None:
     learned = read_cell(tube_cells["ash"])
-    config = replace(learned.config, changes=learned.config.changes | {"device": "cuda"})
-    folder = Path(shutil.copytree(learned.folder, tmp_path / config.key))
+    there = replace(learned.config, changes=learned.config.changes | {"device": "cuda"})
+    folder = Path(shutil.copytree(learned.folder, tmp_path / there.key))
     result = read_result(folder)
-    write_config(replace(learned, config=config, folder=folder))
-    write_result(folder, replace(result, config=config, drawn_on="cuda"))
+    write_config(replace(learned, config=there, folder=folder))
+    write_result(folder, replace(result, config=there, drawn_on="cuda"))
     assert f"device cuda: {cuda_error()}" in refused_last(capsys, "eval", str(folder))
     assert read_result(folder).drawn_on == "cuda"
     assert cli.main(["eval", str(folder), "--device", "cpu"]) == cli.DONE

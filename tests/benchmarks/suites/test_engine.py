@@ -3,6 +3,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -10,37 +11,18 @@ from pathlib import Path
 
 import psutil
 import pytest
+from helpers.running import fake_cell, run
 from helpers.waiting import wait_for
 
 from ash.files import InputError
 from benchmarks.cell.metrics import PROTOCOL
 from benchmarks.cell.schema import Cell, read_result
 from benchmarks.suites import engine
-from benchmarks.suites.engine import CellPlan, Limits, make_executor, plan_cells, run_cells, run_in_process, shard_of
+from benchmarks.suites.engine import Limits, plan_cells, run_cells, shard_of
 from benchmarks.suites.progress import Progress
-from benchmarks.suites.runs import cell_for, read_run
-from benchmarks.suites.suites import CaptureSpec, CellSpec
-
-LIMITS = Limits(seconds=300.0, memory_mb=4096)
-
+from benchmarks.suites.runs import read_run
 
 pytestmark = pytest.mark.usefixtures("installed_fakes")
-
-
-def cell(method: str, capture: Path, out: Path, *, seed: int = 0) -> Cell:
-    spec = CaptureSpec(scene="boxes", size="ci")
-    return cell_for(CellSpec(capture=spec, method=f"fake_{method}", preset="ci", seed=seed), capture, out)
-
-
-def quiet(total: int) -> Progress:
-    return Progress("cells", total, expected_s=1.0, workers=1, stream=io.StringIO())
-
-
-def run(cells: list[Cell], *, limits: Limits = LIMITS, workers: int = 2) -> CellPlan:
-    plan = plan_cells(cells)
-    with make_executor("local", workers=workers) as executor:
-        run_cells(plan, executor, limits, quiet(len(plan.todo)))
-    return plan
 
 
 @pytest.fixture
@@ -51,12 +33,13 @@ def done(finished: Path) -> Cell:
 
 def test_cells_run_side_by_side_and_failures_are_results(capture: Path, tmp_path: Path) -> None:
     expected = {"good": "done", "nan": "diverged", "raising": "crashed", "dying": "crashed"}
-    cells = [cell(method, capture, tmp_path) for method in expected]
+    cells = [fake_cell(method, capture, tmp_path) for method in expected]
     run(cells)
     results = [read_result(c.folder) for c in cells]
     assert [r.status for r in results if r] == list(expected.values())
     assert "the method's own mistake" in results[2].reason
     assert "SIGABRT" in results[3].reason
+    assert "RuntimeError: the method's own mistake" in (cells[2].folder / "output.log").read_text()
     for failed in results[1:]:
         assert failed.value("novel_view", "foreground", "psnr") == 0
         assert failed.value("novel_pose", "full", "iou") == 0
@@ -66,10 +49,9 @@ def test_cells_run_side_by_side_and_failures_are_results(capture: Path, tmp_path
 
 
 def test_a_cell_beyond_its_time_or_memory_is_ended_and_recorded(capture: Path, tmp_path: Path) -> None:
-    slow, large = cell("sleeping", capture, tmp_path), cell("growing", capture, tmp_path)
-    with make_executor("local", workers=1) as executor:
-        run_cells(plan_cells([slow]), executor, Limits(seconds=4.0, memory_mb=4096), quiet(1))
-        run_cells(plan_cells([large]), executor, Limits(seconds=60.0, memory_mb=700), quiet(1))
+    slow, large = fake_cell("sleeping", capture, tmp_path), fake_cell("growing", capture, tmp_path)
+    run([slow], Limits(seconds=4.0, memory_mb=4096))
+    run([large], Limits(seconds=60.0, memory_mb=700))
     assert read_result(slow.folder).status == "timeout"
     assert read_result(large.folder).status == "out of memory"
 
@@ -106,7 +88,7 @@ def test_shards_cover_all_cells_once() -> None:
 
 
 def test_interrupting_ends_the_children_and_the_cell_can_be_resumed(capture: Path, tmp_path: Path) -> None:
-    target = cell("sleeping", capture, tmp_path)
+    target = fake_cell("sleeping", capture, tmp_path)
     code = (
         "import io; from pathlib import Path; from benchmarks.cell.schema import read_cell\n"
         "from benchmarks.suites.engine import *\n"
@@ -137,41 +119,29 @@ def test_a_thread_that_its_executor_forgot_takes_an_interruption_for_no_failure(
             wait_for_child(os.getpid())
             raise KeyboardInterrupt
 
-    target, executor = cell("sleeping", capture, tmp_path), Forgetful(1)
+    target, executor = fake_cell("sleeping", capture, tmp_path), Forgetful(1)
     progress = Impatient("", 1, expected_s=1.0, workers=1, stream=io.StringIO())
     with pytest.raises(KeyboardInterrupt):
         run_cells(plan_cells([target]), executor, Limits(seconds=60.0, memory_mb=4096), progress)
     ThreadPoolExecutor.shutdown(executor)
     assert read_result(target.folder) is None
-    assert len(run([cell("good", capture, tmp_path)]).todo) == 1, "the next run is not stopped"
+    assert len(run([fake_cell("good", capture, tmp_path)]).todo) == 1, "the next run is not stopped"
 
 
 def test_a_cell_that_was_told_to_stop_is_unfinished_and_not_failed(capture: Path, tmp_path: Path) -> None:
-    target = cell("sleeping", capture, tmp_path)
-    stopper = subprocess.Popen([sys.executable, "-c", STOP_THE_CELL, str(os.getpid()), target.config.key])
+    target = fake_cell("sleeping", capture, tmp_path)
+
+    def stop() -> None:
+        wait_for(lambda: list(target.folder.glob("*/log.jsonl")))
+        (process,) = (p for p in psutil.Process().children() if target.config.key in " ".join(p.cmdline()))
+        process.send_signal(signal.SIGTERM)
+
+    stopper = threading.Thread(target=stop)
+    stopper.start()
     plan = run([target])
-    stopper.wait()
+    stopper.join()
     assert len(plan.todo) == 1 and read_result(target.folder) is None
     assert len(plan_cells([target]).todo) == 1
-
-
-STOP_THE_CELL = """
-import os, signal, sys, time, psutil
-def cells():
-    others = [p for p in psutil.Process(int(sys.argv[1])).children() if p.pid != os.getpid()]
-    return [p for p in others if sys.argv[2] in ' '.join(p.cmdline())]
-while not cells():
-    time.sleep(0.05)
-time.sleep(1)
-cells()[0].send_signal(signal.SIGTERM)
-"""
-
-
-def test_a_run_in_a_process_leaves_its_log(capture: Path, tmp_path: Path) -> None:
-    target = cell("raising", capture, tmp_path)
-    engine.write_config(target)
-    assert run_in_process(str(target.folder), LIMITS) == "crashed"
-    assert "RuntimeError: the method's own mistake" in (target.folder / "output.log").read_text()
 
 
 def test_progress_without_a_terminal_is_one_line_per_cell() -> None:
@@ -192,11 +162,6 @@ def test_time_left_starts_with_the_expectation_and_follows_the_pace() -> None:
     progress.start -= 30
     progress.finish("a")
     assert progress.seconds_left() == pytest.approx(90, abs=1)
-
-
-def test_an_unknown_executor_is_refused() -> None:
-    with pytest.raises(InputError, match="expected local or dask://"), make_executor("slurm", workers=1):
-        pass
 
 
 def wait_for_child(pid: int) -> psutil.Process:
