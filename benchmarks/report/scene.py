@@ -75,16 +75,8 @@ class SceneData:
     worst_frames: int
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SceneReport:
-    """A scene's sections, and its sheets of pictures by file name."""
-
-    sections: tuple[Section, ...]
-    sheets: dict[str, bytes]
-
-
-def scene_report(data: SceneData) -> SceneReport:
-    """The part of one scene."""
+def scene_report(data: SceneData) -> tuple[list[Section], dict[str, bytes]]:
+    """The sections of one scene, and its sheets of pictures by file name."""
     run_tables, scene = data.tables, data.scene
     capture, shown, trouble = _pictured(data)
     exposed = sentences.exposed(data.results)
@@ -124,7 +116,7 @@ def scene_report(data: SceneData) -> SceneReport:
             folded=True,
         ),
     ]
-    return SceneReport(sections=tuple(s for s in sections if s.blocks), sheets=sheets)
+    return [section for section in sections if section.blocks], sheets
 
 
 def _facts(data: SceneData, capture: Capture | None, *, smoke: bool) -> list[tuple[str, str]]:
@@ -303,7 +295,7 @@ def _picture_sections(
 
 def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Flipbook, dict[str, bytes]]:
     tracks = pictures.tracks(capture, shown, data.album, max_bytes=data.max_bytes)
-    series = vega.series_of([each.cell.config.method for each in shown])
+    series = tuple(vega.series_of(each.cell.config.method for each in shown).values())
     points = [
         {"track": index, "series": each.title, "frame": frame, "psnr": psnr}
         for index, track in enumerate(tracks)
