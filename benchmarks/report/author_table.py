@@ -146,13 +146,11 @@ def _by_scene(spec: TableSpec, scenes: Sequence[str]) -> list[TableSpec]:
     return [replace(spec, scene=s, label=f"{spec.label}-{_plain(s)}" if several else spec.label) for s in scenes]
 
 
-def _resolved(tables: RunTables, spec: TableSpec) -> tuple[TableSpec, list[str]]:
-    """The spec with every row of the run, splits, regions and scenes where it names none; and the notes below it."""
-    columns = tuple(_complete(tables, column, spec.scene) for column in spec.columns)
-    scenes = _scenes(columns)
+def _groups(tables: RunTables, spec: TableSpec) -> tuple[tuple[tuple[TableRow, ...], ...], list[str]]:
+    """The rows, those that stand in for others among them, by default every method of the run; and the notes below."""
+    scenes = _scenes(spec.columns)
+    notes: list[str] = []
     ran = {method for scene in scenes for method in tables.methods(scene)}
-    order = tables.rows[tables.rows["scene"].isin(scenes)]["method"].unique()  # of the suite
-    notes = []
 
     def shown(row: TableRow) -> TableRow:
         if row.method in ran or row.instead not in ran:
@@ -160,9 +158,9 @@ def _resolved(tables: RunTables, spec: TableSpec) -> tuple[TableSpec, list[str]]
         notes.append(row.note)
         return replace(row, method=row.instead)
 
+    order = tables.rows[tables.rows["scene"].isin(scenes)]["method"].unique()  # of the suite
     groups = spec.rows or (tuple(TableRow(method=str(method)) for method in order),)
-    rows = tuple(tuple(map(shown, group)) for group in groups)
-    return replace(spec, columns=columns, rows=rows), [*filter(None, notes)]
+    return tuple(tuple(map(shown, group)) for group in groups), [*filter(None, notes)]
 
 
 def _complete(tables: RunTables, column: TableColumn, scene: str) -> TableColumn:
@@ -181,8 +179,9 @@ def _scenes(columns: Sequence[TableColumn]) -> tuple[str, ...]:
 
 
 def _table(tables: RunTables, asked: TableSpec) -> AuthorTable:
-    spec, notes = _resolved(tables, asked)
-    rows, scenes = [row for group in spec.rows for row in group], _scenes(spec.columns)
+    spec = replace(asked, columns=tuple(_complete(tables, column, asked.scene) for column in asked.columns))
+    groups, notes = _groups(tables, spec)
+    rows, scenes = [row for group in groups for row in group], _scenes(spec.columns)
     tests, marks = _differences(tables, spec, rows), _marks(tables, spec, rows)
     numbers = pd.DataFrame(
         _record(tables, spec, row, column, test=tests.get((i, k)), mark=marks.get((i, k), ""))
@@ -193,7 +192,7 @@ def _table(tables: RunTables, asked: TableSpec) -> AuthorTable:
     heads = pd.MultiIndex.from_tuples([_head(column, scenes) for column in spec.columns])
     frame = pd.DataFrame(texts, index=[_name(tables, row, scenes) for row in rows], columns=heads)
     caption = _caption(tables, spec, set(marks.values()), notes)
-    ends = tuple(accumulate(len(group) for group in spec.rows[:-1]))
+    ends = tuple(accumulate(len(group) for group in groups[:-1]))
     return AuthorTable(spec=spec, shown=Table(frame=frame, marks=marks), numbers=numbers, caption=caption, breaks=ends)
 
 
