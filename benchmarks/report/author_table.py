@@ -6,6 +6,7 @@ What it shows stands in a TOML file, see `benchmarks.suites.tables`. `load` give
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -134,7 +135,7 @@ def of_tables(tables: RunTables, specs: Sequence[TableSpec]) -> tuple[AuthorTabl
         scenes = {column.scene or spec.scene for column in spec.columns if column.metric}
         ran = {method for scene in scenes for method in tables.methods(scene)}
         if ran & (names or ran):
-            made.append(_Maker(tables, spec).table())
+            made.append(_table(tables, spec))
     return tuple(made)
 
 
@@ -145,189 +146,172 @@ def _by_scene(spec: TableSpec, scenes: Sequence[str]) -> list[TableSpec]:
     return [replace(spec, scene=s, label=f"{spec.label}-{_plain(s)}" if several else spec.label) for s in scenes]
 
 
-class _Maker:
-    """Makes one table of a run."""
+def _groups(tables: RunTables, spec: TableSpec) -> tuple[tuple[tuple[TableRow, ...], ...], list[str]]:
+    """The rows, those that stand in for others among them, by default every method of the run; and the notes below."""
+    scenes = _scenes(spec.columns)
+    notes: list[str] = []
+    ran = {method for scene in scenes for method in tables.methods(scene)}
 
-    def __init__(self, tables: RunTables, spec: TableSpec) -> None:
-        self.tables = tables
-        columns = [self._complete(column, spec) for column in spec.columns]
-        self.scenes = tuple(dict.fromkeys(column.scene for column in columns if column.metric))
-        ran = {method for scene in self.scenes for method in tables.methods(scene)}
-        order = tables.rows[tables.rows["scene"].isin(self.scenes)]["method"].unique()  # of the suite
-        groups = spec.rows or (tuple(TableRow(method=str(method)) for method in order),)
-        self.notes = [row.note for group in groups for row in group if row.note and self._replaced(row, ran)]
-        self.groups = [
-            [replace(row, method=row.instead) if self._replaced(row, ran) else row for row in group] for group in groups
-        ]
-        self.rows = [row for group in self.groups for row in group]
-        self.columns = columns
-        self.spec = spec
+    def shown(row: TableRow) -> TableRow:
+        if row.method in ran or row.instead not in ran:
+            return row
+        notes.append(row.note)
+        return replace(row, method=row.instead)
 
-    @staticmethod
-    def _replaced(row: TableRow, ran: set[str]) -> bool:
-        return row.method not in ran and row.instead in ran
+    order = tables.rows[tables.rows["scene"].isin(scenes)]["method"].unique()  # of the suite
+    groups = spec.rows or (tuple(TableRow(method=str(method)) for method in order),)
+    return tuple(tuple(map(shown, group)) for group in groups), [*filter(None, notes)]
 
-    def _complete(self, column: TableColumn, spec: TableSpec) -> TableColumn:
-        """The column with split, region and scene, where the run has the metric."""
-        if not column.metric:
-            return column
-        scene = column.scene or spec.scene
-        rows = self.tables.of(scene)
-        rows = rows[rows["metric"] == column.metric]
-        split = column.split or _first(("novel_view", *SPLITS), rows["split"])
-        region = column.region or _first(REGIONS, rows[rows["split"] == split]["region"])
-        return replace(column, scene=scene, split=split, region=region)
 
-    def table(self) -> AuthorTable:
-        """All of it."""
-        cells = [[self._cell(row, column) for column in self.columns] for row in self.rows]
-        places = [(i, k) for i, row in enumerate(cells) for k, cell in enumerate(row) if cell["comparison"] is not None]
-        tests = corrected([cells[i][k]["comparison"] for i, k in places])
-        for (i, k), test in zip(places, tests, strict=True):
-            cells[i][k]["comparison"] = test
-        marks = self._marks(cells)
-        records, texts = [], []
-        for i, row in enumerate(self.rows):
-            texts.append([self._text(cell, column) for cell, column in zip(cells[i], self.columns, strict=True)])
-            for k, column in enumerate(self.columns):
-                records.append(self._record(row, column, cells[i][k], marks.get((i, k), ""), texts[-1][k]))
-        heads = pd.MultiIndex.from_tuples([self._head(column) for column in self.columns])
-        frame = pd.DataFrame(texts, index=[self._name(row) for row in self.rows], columns=heads)
-        breaks, at = [], 0
-        for group in self.groups[:-1]:
-            at += len(group)
-            breaks.append(at)
-        return AuthorTable(
-            spec=self.spec,
-            shown=Table(frame=frame, marks=marks),
-            numbers=pd.DataFrame(records),
-            caption=self._caption({*marks.values()}),
-            breaks=tuple(breaks),
-        )
+def _complete(tables: RunTables, column: TableColumn, scene: str) -> TableColumn:
+    """The column with split, region and scene, where the run has the metric."""
+    if not column.metric:
+        return column
+    rows = tables.of(column.scene or scene)
+    rows = rows[rows["metric"] == column.metric]
+    split = column.split or _first(("novel_view", *SPLITS), rows["split"])
+    region = column.region or _first(REGIONS, rows[rows["split"] == split]["region"])
+    return replace(column, scene=column.scene or scene, split=split, region=region)
 
-    def _cell(self, row: TableRow, column: TableColumn) -> dict[str, Any]:
-        """Mean, interval and comparison of a cell, in the metric's unit; `lost`: every training failed."""
-        empty: dict[str, Any] = {"mean": math.nan, "half": math.nan, "n": 0, "lost": False, "comparison": None}
-        if column.given:
-            return {**empty, "mean": row.given.get(column.given, math.nan)}
-        found = self.tables.get(column.scene, row.method, _quantity(column))
-        if found is None:
-            return empty
-        compared = self.spec.form == "difference" and row.method != self.spec.reference
-        comparison = self._compare(column, row.method, self.spec.reference) if compared else None
-        lost = self.tables.failed(column.scene, row.method) == self.tables.cells["cells"][column.scene, row.method]
-        return {
-            "mean": float(found.value),
-            "half": float(found.half_width),
-            "n": int(found.n),
-            "lost": bool(lost),
-            "comparison": comparison,
-        }
 
-    def _compare(self, column: TableColumn, method: str, other: str) -> Comparison | None:
-        return compare(self.tables.of(column.scene), method, other, _quantity(column))
+def _scenes(columns: Sequence[TableColumn]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(column.scene for column in columns if column.metric))
 
-    def _marks(self, cells: list[list[dict[str, Any]]]) -> dict[tuple[int, int], Mark]:
-        """Best where it is better than every other row, and second then; oracles are not ranked."""
-        tests: list[tuple[int, list[int], list[Comparison]]] = []
-        for k, column in enumerate(self.columns if self.spec.marks else ()):
-            direction = METRICS[column.metric].direction if column.metric else "none"
-            ranked = [i for i, row in enumerate(self.rows) if cells[i][k]["n"] and not is_oracle(row.method)]
-            ranked = [i for i in ranked if not self.tables.failed(column.scene, self.rows[i].method)]
-            if direction == "none" or column.metric in measured.UNRANKED or len(ranked) < 2:
-                continue
-            ranked.sort(key=lambda i, k=k: cells[i][k]["mean"], reverse=direction == "up")  # type: ignore[misc]
-            first, *others = ranked
-            compared = [self._compare(column, self.rows[first].method, self.rows[i].method) for i in others]
-            tests.append((k, ranked, [each for each in compared if each is not None]))
-        adjusted = iter(corrected([pair for _, _, pairs in tests for pair in pairs]))
-        marks: dict[tuple[int, int], Mark] = {}
-        for k, ranked, pairs in tests:
-            verdicts = [next(adjusted).verdict for _ in pairs]
-            if verdicts and all(verdict == "better" for verdict in verdicts):
-                marks |= {(ranked[0], k): "best", (ranked[1], k): "second"}
-        return marks
 
-    def _text(self, cell: dict[str, Any], column: TableColumn) -> str:
-        if cell["lost"]:
-            return "failed"
-        if math.isnan(cell["mean"]):
-            return "n/a"
-        factor, text = _factor(column), _number(column, cell["mean"] * _factor(column))
-        comparison, half = cell["comparison"], cell["half"] * factor
-        if self.spec.form == "difference" and comparison is not None:
-            change = _number(column, comparison.mean * factor, signed=True)
-            width = (comparison.high - comparison.low) / 2 * factor
-            return f"{text} ({change})" if math.isnan(width) else f"{text} ({change} ± {_number(column, width)})"
-        if math.isnan(half) or self.spec.form in ("mean", "difference"):
-            return text
-        mean = cell["mean"] * factor
-        if self.spec.form == "interval":
-            return f"{text} [{_number(column, mean - half)}, {_number(column, mean + half)}]"
-        return f"{text} ± {_number(column, half)}"
+def _table(tables: RunTables, asked: TableSpec) -> AuthorTable:
+    spec = replace(asked, columns=tuple(_complete(tables, column, asked.scene) for column in asked.columns))
+    groups, notes = _groups(tables, spec)
+    rows, scenes = [row for group in groups for row in group], _scenes(spec.columns)
+    tests, marks = _differences(tables, spec, rows), _marks(tables, spec, rows)
+    numbers = pd.DataFrame(
+        _record(tables, spec, row, column, test=tests.get((i, k)), mark=marks.get((i, k), ""))
+        for i, row in enumerate(rows)
+        for k, column in enumerate(spec.columns)
+    )
+    texts = numbers["text"].to_numpy().reshape(len(rows), len(spec.columns))
+    heads = pd.MultiIndex.from_tuples([_head(column, scenes) for column in spec.columns])
+    frame = pd.DataFrame(texts, index=[_name(tables, row, scenes) for row in rows], columns=heads)
+    caption = _caption(tables, spec, set(marks.values()), notes)
+    ends = tuple(accumulate(len(group) for group in groups[:-1]))
+    return AuthorTable(spec=spec, shown=Table(frame=frame, marks=marks), numbers=numbers, caption=caption, breaks=ends)
 
-    def _record(
-        self, row: TableRow, column: TableColumn, cell: dict[str, Any], mark: Mark, text: str
-    ) -> dict[str, Any]:
-        factor, test = _factor(column), cell["comparison"] or Comparison(mean=math.nan)
-        group, head = self._head(column)
-        return {
-            **{"row": self._name(row), "method": row.method, "group": group, "column": head},
-            **{"scene": column.scene, "split": column.split, "region": column.region, "metric": column.metric},
-            "unit": _unit(column),
-            "mean": cell["mean"] * factor,
-            **{"low": (cell["mean"] - cell["half"]) * factor, "high": (cell["mean"] + cell["half"]) * factor},
-            "n": cell["n"],
-            **{"difference": test.mean * factor, "difference_low": test.low * factor},
-            **{"difference_high": test.high * factor, "p": test.p, "mark": mark, "text": text},
-        }
 
-    def _name(self, row: TableRow) -> str:
-        title = row.title or style_of(row.method).title
-        failed = sum(self.tables.failed(scene, row.method) for scene in self.scenes)
-        cells = sum(int(self.tables.cells["cells"].get((scene, row.method), 0)) for scene in self.scenes)
-        return f"{title} ({failed} of {cells} failed)" if failed else title
+def _record(
+    tables: RunTables, spec: TableSpec, row: TableRow, column: TableColumn, *, test: Comparison | None, mark: Mark
+) -> dict[str, Any]:
+    """A cell: its place, its numbers in the unit shown, and its text."""
+    factor, scenes, test = _factor(column), _scenes(spec.columns), test or Comparison(mean=math.nan)
+    score = tables.get(column.scene, row.method, _quantity(column)) if column.metric else None
+    mean = row.given.get(column.given, math.nan) if score is None else float(score.value)
+    half = math.nan if score is None else float(score.half_width)
+    change, low, high = (value * factor for value in (test.mean, test.low, test.high))
+    trained = tables.cells["cells"].get((column.scene, row.method), 0)
+    lost = score is not None and tables.failed(column.scene, row.method) == trained
+    group, head = _head(column, scenes)
+    return {
+        **{"row": _name(tables, row, scenes), "method": row.method, "group": group, "column": head},
+        **{"scene": column.scene, "split": column.split, "region": column.region, "metric": column.metric},
+        **{"unit": _unit(column), "mean": mean * factor},
+        **{"low": (mean - half) * factor, "high": (mean + half) * factor},
+        **{"n": 0 if score is None else int(score.n), "difference": change, "difference_low": low},
+        **{"difference_high": high, "p": test.p, "mark": mark},
+        "text": "failed" if lost else _text(column, spec.form, mean * factor, half * factor, change, (high - low) / 2),
+    }
 
-    def _head(self, column: TableColumn) -> tuple[str, str]:
-        if not column.metric:
-            return column.group, column.title
-        group, title = measured.head_of(_quantity(column)) if column.split else ("", METRICS[column.metric].title)
-        own, unit = METRICS[column.metric].unit, _unit(column)
-        title = title.replace(f" [{own}]", f" [{unit}]" if unit != "1" else "") if own else title
-        title = f"{title} [{unit}]" if unit and not own else title
-        where = f"{column.scene}, {group}" if len(self.scenes) > 1 else group
-        return column.group or where, column.title or title
 
-    def _caption(self, marks: set[Mark]) -> str:
-        """People, seeds, what stands in a cell, those marks that the table has, protocol."""
-        sentences = [self.spec.caption.rstrip(".") + "."] if self.spec.caption else []
-        units = set()
-        for scene in self.scenes:
-            rows = self.tables.of(scene)
-            if not len(rows):
-                continue
-            people, seeds = rows["capture"].nunique(), rows["seed"].nunique()
+def _differences(tables: RunTables, spec: TableSpec, rows: Sequence[TableRow]) -> dict[tuple[int, int], Comparison]:
+    """To the reference, by row and column, where the form asks for them; p is corrected over the table."""
+    if spec.form != "difference":
+        return {}
+    compared = {
+        (i, k): compare(tables.of(column.scene), row.method, spec.reference, _quantity(column))
+        for i, row in enumerate(rows)
+        for k, column in enumerate(spec.columns)
+        if column.metric and row.method != spec.reference
+    }
+    tests = {place: test for place, test in compared.items() if test is not None}
+    return dict(zip(tests, corrected([*tests.values()]), strict=True))
+
+
+def _marks(tables: RunTables, spec: TableSpec, rows: Sequence[TableRow]) -> dict[tuple[int, int], Mark]:
+    """Best where it is better than every other row, and second then; oracles and failed rows are not ranked."""
+    places = {row.method: i for i, row in enumerate(rows) if not is_oracle(row.method)}
+    tests: list[tuple[int, list[str], list[Comparison]]] = []
+    for k, column in enumerate(spec.columns if spec.marks else ()):
+        direction = METRICS[column.metric].direction if column.metric else "none"
+        if direction == "none" or column.metric in measured.UNRANKED:
+            continue
+        whole = [method for method in places if not tables.failed(column.scene, method)]
+        means = pd.Series(tables.values(column.scene, _quantity(column), whole), dtype=float)
+        order = [*means.sort_values(ascending=direction == "down", kind="stable").index]
+        pairs = [compare(tables.of(column.scene), order[0], other, _quantity(column)) for other in order[1:]]
+        tests.append((k, order, [each for each in pairs if each is not None]))
+    adjusted = iter(corrected([pair for _, _, pairs in tests for pair in pairs]))
+    marks: dict[tuple[int, int], Mark] = {}
+    for k, order, pairs in tests:
+        verdicts = [next(adjusted).verdict for _ in pairs]
+        if verdicts and all(verdict == "better" for verdict in verdicts):
+            marks |= {(places[order[0]], k): "best", (places[order[1]], k): "second"}
+    return marks
+
+
+def _text(column: TableColumn, form: str, mean: float, half: float, change: float, width: float) -> str:
+    """What stands in a cell: its mean, half the width of its interval, and the same of its difference."""
+    text = "n/a" if math.isnan(mean) else _number(column, mean)
+    if form == "difference" and not math.isnan(change):
+        interval = "" if math.isnan(width) else f" ± {_number(column, width)}"
+        return f"{text} ({_number(column, change, signed=True)}{interval})"
+    if math.isnan(half) or form in ("mean", "difference"):
+        return text
+    if form == "interval":
+        return f"{text} [{_number(column, mean - half)}, {_number(column, mean + half)}]"
+    return f"{text} ± {_number(column, half)}"
+
+
+def _name(tables: RunTables, row: TableRow, scenes: Sequence[str]) -> str:
+    title = row.title or style_of(row.method).title
+    failed = sum(tables.failed(scene, row.method) for scene in scenes)
+    cells = sum(int(tables.cells["cells"].get((scene, row.method), 0)) for scene in scenes)
+    return f"{title} ({failed} of {cells} failed)" if failed else title
+
+
+def _head(column: TableColumn, scenes: Sequence[str]) -> tuple[str, str]:
+    """Group and title."""
+    if not column.metric:
+        return column.group, column.title
+    group, title = measured.head_of(_quantity(column)) if column.split else ("", METRICS[column.metric].title)
+    own, unit = METRICS[column.metric].unit, _unit(column)
+    title = title.replace(f" [{own}]", f" [{unit}]" if unit != "1" else "") if own else title
+    title = f"{title} [{unit}]" if unit and not own else title
+    where = f"{column.scene}, {group}" if len(scenes) > 1 else group
+    return column.group or where, column.title or title
+
+
+def _caption(tables: RunTables, spec: TableSpec, marks: set[Mark], notes: Sequence[str]) -> str:
+    """People, seeds, what stands in a cell, those marks that the table has, protocol."""
+    sentences = [spec.caption.rstrip(".") + "."] if spec.caption else []
+    units = set()
+    for scene in _scenes(spec.columns):
+        people, seeds = tables.captures(scene), tables.seeds(scene)
+        if people:
             counts = f"{people} {'person' if people == 1 else 'people'}, {seeds} seed{'' if seeds == 1 else 's'}"
             sentences.append(f"Scene {scene}: {counts}{' each' if people > 1 else ''}.")
             units.add("people" if people > 1 else "the seeds of one person" if seeds > 1 else "")
-        over = " and ".join(sorted(filter(None, units)))
-        if over:
-            reference = style_of(self.spec.reference).title if self.spec.reference else ""
-            form = FORMS[self.spec.form].format(reference=reference)
-            test = ", in pairs" if self.spec.form == "difference" and "people" in units else ""
-            sentences.append(f"{form}{test}, over {over}." if self.spec.form != "mean" else f"Mean over {over}.")
-            best, second = (
-                " and ".join(text for mark, text in words.items() if mark in self.spec.marks).capitalize()
-                for words in (BEST, SECOND)
-            )
-            if marks:
-                sentences += [f"{best}: better than every other row (p < 0.05, Holm)."] if best else []
-                sentences += [f"{second}: second."] if second else []
-            elif self.spec.marks:
-                sentences.append("No row is significantly better than all others.")
-        else:
-            sentences.append("One value per row: no interval, and no row is marked as best.")
-        return " ".join([*sentences, *self.notes, f"Protocol {PROTOCOL} of ash-bench."])
+    over = " and ".join(sorted(filter(None, units)))
+    if not over:
+        sentences.append("One value per row: no interval, and no row is marked as best.")
+    else:
+        form = FORMS[spec.form].format(reference=style_of(spec.reference).title if spec.reference else "")
+        test = ", in pairs" if spec.form == "difference" and "people" in units else ""
+        sentences.append(f"{form}{test}{'' if spec.form == 'mean' else ','} over {over}.")
+        if marks:
+            meanings = (BEST, "better than every other row (p < 0.05, Holm)"), (SECOND, "second")
+            for words, meaning in meanings:
+                if names := " and ".join(text for mark, text in words.items() if mark in spec.marks):
+                    sentences.append(f"{names.capitalize()}: {meaning}.")
+        elif spec.marks:
+            sentences.append("No row is significantly better than all others.")
+    return " ".join([*sentences, *notes, f"Protocol {PROTOCOL} of ash-bench."])
 
 
 def _first(order: Sequence[str], present: pd.Series) -> str:

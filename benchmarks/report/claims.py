@@ -2,23 +2,21 @@
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
 
-from ash.capture.formats import load_capture
 from ash.files import InputError, write_atomic
 from benchmarks.analysis.claims import HOLDS, Claim, broken, judge
 from benchmarks.analysis.error_attribution import psnr_of
 from benchmarks.analysis.results import load
 from benchmarks.cell.metrics import METRICS
-from benchmarks.cell.schema import Cell, CellResult
-from benchmarks.report import pictures
-from benchmarks.report.compare import Rows, cells_by_row
-from benchmarks.report.content import Block, Bullets, Mark, Report, Section, Strip, Strips, Table, Text
+from benchmarks.cell.schema import ViewScore
+from benchmarks.report.compare import Rows, Views, cells_by_row, same_person, shared_views
+from benchmarks.report.content import Block, Bullets, Mark, Section, Strip, Strips, Table, Text
 from benchmarks.report.page import render
-from benchmarks.report.pictures import Album, Shown
+from benchmarks.report.pictures import Album
 from benchmarks.suites.runs import Run
 
 ABOUT = (
@@ -31,7 +29,6 @@ ABOUT = (
     "paper's, levels never."
 )
 ORDER = ("confirmed", "confirmed but smaller", "contradicted", "not shown", "cannot be judged here")
-Cells = list[tuple[Cell, CellResult]]  # of one row
 IN_IMAGES = ("psnr", "ssim", "flip", "lpips", "iou")
 
 
@@ -70,7 +67,7 @@ def write_claims(
     page = [*blocks, *([Strips(file="", title="", groups=groups)] if groups else [])]
     for form, content in (("html", page), ("md", blocks)):
         section = Section(title="Claims", headline=f"{headline}.", blocks=tuple(content))
-        text = render(Report(title="ash-bench: claims", sections=(section,)), form, album)  # type: ignore[arg-type]
+        text = render("ash-bench: claims", [section], form, album)  # type: ignore[arg-type]
         write_atomic(out / f"claims.{form}", text.encode())
     return [*([shown.to_string(), ""] if len(shown) else []), headline], lost
 
@@ -126,34 +123,21 @@ def _pictures(
     claims: Sequence[Claim], table: pd.DataFrame, runs: Mapping[str, Rows], album: Album
 ) -> Iterator[tuple[str, tuple[Strip, ...]]]:
     """Of each claim about pictures that was judged: truth and both rows, in the view of the median difference."""
-    by_name: Mapping[str, Claim] = {claim.name: claim for claim in claims}
-    strips: dict[tuple[str, ...], Strip] = {}
+    by_name = {claim.name: claim for claim in claims}
+    strips: dict[tuple[str, ...], Strip | None] = {}
     for name, scene, effect, run in zip(*(table[column] for column in ("name", "scene", "effect", "run")), strict=True):
         claim = by_name[name]
         if pd.isna(effect) or claim.metric not in IN_IMAGES:
             continue
-        pair = runs[run][scene, claim.a], runs[run][scene, claim.b]
-        if (key := (run, scene, claim.a, claim.b, claim.split)) not in strips:
-            if (strip := _typical(pair, claim.split, album)) is None:
-                continue
-            strips[key] = strip
-        yield f"{name} on {scene}: {METRICS[claim.metric].title}", (strips[key],)
+        key = (run, scene, claim.a, claim.b, claim.split)
+        if key not in strips:
+            pair = same_person(runs[run][scene, claim.a], runs[run][scene, claim.b])
+            median = partial(_median, split=claim.split)
+            strips[key] = next((f.strip(album) for f in shared_views(pair, median)), None) if pair else None
+        if (strip := strips[key]) is not None:
+            yield f"{name} on {scene}: {METRICS[claim.metric].title}", (strip,)
 
 
-def _typical(pair: tuple[Cells, Cells], split: str, album: Album) -> Strip | None:
-    """Of the first capture and seed that both rows have; None where they or the pictures are missing."""
-    ours, theirs = ({(cell.config.capture, cell.config.seed): (cell, r) for cell, r in cells} for cells in pair)
-    both = [key for key in ours if key in theirs]
-    if not both:
-        return None
-    shown = [Shown(cell=cell, result=result) for cell, result in (ours[both[0]], theirs[both[0]])]
-    views = [{(v.camera, v.frame): v for v in each.result.views if v.split == split} for each in shown]
-    if not all(each.result.has_alpha for each in shown) or not (shared := [key for key in views[0] if key in views[1]]):
-        return None
-    shared.sort(key=lambda key: psnr_of(views[0][key]) - psnr_of(views[1][key]))
-    try:
-        capture = load_capture(shown[0].cell.capture_folder)
-        frames = pictures.compare(capture, shown, views[0][shared[len(shared) // 2]], with_errors=False)
-    except InputError:
-        return None
-    return replace(frames, title=f"{frames.title}: the view of the median difference").strip(album)
+def _median(views: Views, split: str) -> list[tuple[ViewScore, str]]:
+    views = sorted((v for v in views if v[0].split == split), key=lambda both: psnr_of(both[0]) - psnr_of(both[1]))
+    return [(view, "the view of the median difference") for view, _ in views[len(views) // 2 :][:1]]

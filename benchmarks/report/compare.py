@@ -1,6 +1,7 @@
 """Two runs side by side, before and after: each row of both, what changed in it, and the worst frames of each."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,11 +15,11 @@ from benchmarks.analysis.results import RANKED_SPLITS, Quantity, foreground, loa
 from benchmarks.analysis.statistics import compare_samples, corrected
 from benchmarks.analysis.style import SPLIT_NAMES
 from benchmarks.cell.metrics import METRICS
-from benchmarks.cell.schema import Cell, CellResult, read_result
+from benchmarks.cell.schema import Cell, CellResult, ViewScore
 from benchmarks.report import pictures
-from benchmarks.report.content import Block, Mark, Report, Section, Strip, Strips, Table, Text
+from benchmarks.report.content import Block, Mark, Section, Strip, Strips, Table, Text
 from benchmarks.report.page import render
-from benchmarks.report.pictures import Album, Shown
+from benchmarks.report.pictures import Album, Frames, Shown
 from benchmarks.suites.runs import Run, require_one_of_each, results_of
 
 NAMES = ("Before", "After")
@@ -44,7 +45,9 @@ QUANTITIES = (
 WORST = 2  # frames of each run that are shown of a row
 COLUMNS = ["scene", "method", "what", "unit", "before", "after", "change", "low", "high", "p", "verdict"]
 
-Rows = dict[tuple[str, str], list[tuple[Cell, CellResult]]]
+Done = tuple[Cell, CellResult]
+Rows = dict[tuple[str, str], list[Done]]
+Views = list[tuple[ViewScore, ViewScore]]  # those that two cells have, with the scores of each
 
 
 def write_comparison(before: Run, after: Run, out: Path) -> str:
@@ -63,16 +66,16 @@ def write_comparison(before: Run, after: Run, out: Path) -> str:
     last = len(shown.columns) - 2
     marks = {(i, last): kinds[kind] for i, kind in enumerate(table["verdict"]) if kind in kinds}
     groups = [
-        (f"{key[1]} on {key[0]}: the worst frames", tuple(_worst_frames(*pair, album)))
+        (f"{key[1]} on {key[0]}: the worst frames", tuple(_worst_frames(pair, album)))
         for key in old
-        if key in new and (pair := _same_person(old[key], new[key])) is not None
+        if key in new and (pair := same_person(old[key], new[key])) is not None
     ]
     groups = [(name, strips) for name, strips in groups if strips]
     about = f"Before: {before.folder} ({before.suite}). After: {after.folder} ({after.suite}). {ABOUT}"
     blocks: list[Block] = [Text(text=about), Table(frame=shown.set_index("scene"), corner="scene", marks=marks)]
     blocks.append(Strips(file="", title="", groups=tuple(groups)) if groups else Text(text=NO_PICTURES))
     section = Section(title="Before and after", headline=verdict, blocks=tuple(blocks))
-    page = render(Report(title="ash-bench: before and after", sections=(section,)), "html", album)
+    page = render("ash-bench: before and after", [section], "html", album)
     write_atomic(out / "compare.html", page.encode())
     return f"{verdict}\n\n{shown.to_string(index=False)}"
 
@@ -159,23 +162,34 @@ def cells_by_row(run: Run) -> Rows:
     Raises:
         InputError: there is none, or two of one name were trained differently.
     """
-    results_of(run)  # Refuses a run without any.
     require_one_of_each(run.cells)
+    cells = {cell.config.key: cell for cell in run.cells}
     rows: Rows = {}
-    for cell in run.cells:
-        result = read_result(cell.folder)
-        if result is not None:
-            rows.setdefault((cell.config.place, cell.config.method), []).append((cell, result))
+    for result in results_of(run):
+        rows.setdefault((result.config.place, result.config.method), []).append((cells[result.config.key], result))
     return rows
 
 
-def _same_person(
-    before: list[tuple[Cell, CellResult]], after: list[tuple[Cell, CellResult]]
-) -> tuple[tuple[Cell, CellResult], tuple[Cell, CellResult]] | None:
-    """The first cells of both runs that are of one subject and seed."""
-    theirs = {(cell.config.subject, cell.config.seed): (cell, result) for cell, result in after}
-    pairs = ((mine, theirs.get((mine[0].config.subject, mine[0].config.seed))) for mine in before)
+def same_person(ours: Sequence[Done], theirs: Sequence[Done]) -> tuple[Done, Done] | None:
+    """The first cells of two rows that are of one subject and seed."""
+    by_person = {(cell.config.subject, cell.config.seed): (cell, result) for cell, result in theirs}
+    pairs = ((mine, by_person.get((mine[0].config.subject, mine[0].config.seed))) for mine in ours)
     return next(((mine, other) for mine, other in pairs if other is not None), None)
+
+
+def shared_views(
+    pair: tuple[Done, Done], choose: Callable[[Views], Iterable[tuple[ViewScore, str]]]
+) -> Iterator[Frames]:
+    """Truth and both cells in those views of both that are chosen, each with its reason; none without the pictures."""
+    shown = [Shown(cell=cell, result=result) for cell, result in pair]
+    if not all(each.result.has_alpha for each in shown):
+        return
+    ours, theirs = ({(v.split, v.camera, v.frame): v for v in each.result.views} for each in shown)
+    with suppress(InputError):
+        capture = load_capture(shown[0].cell.capture_folder)
+        for view, reason in choose([(view, theirs[key]) for key, view in ours.items() if key in theirs]):
+            frames = pictures.compare(capture, shown, view, with_errors=False)
+            yield replace(frames, title=f"{frames.title}: {reason}")
 
 
 def _by_subject(results: Sequence[CellResult]) -> pd.DataFrame:
@@ -193,24 +207,18 @@ def _predictions(cells: list[tuple[Cell, CellResult]]) -> set[tuple[int, int, st
     }
 
 
-def _worst_frames(before: tuple[Cell, CellResult], after: tuple[Cell, CellResult], album: Album) -> Iterator[Strip]:
-    """The worst views of each run that the other has as well, of the first seed; none where pictures are missing."""
-    shown = [Shown(cell=cell, result=result) for cell, result in (before, after)]
-    if not all(each.result.has_alpha for each in shown):
-        return
-    views = [{(view.split, view.camera, view.frame): view for view in each.result.views} for each in shown]
-    shared = [key for key in views[0] if key in views[1] and key[0] in RANKED_SPLITS]  # not training views
-    chosen: dict[tuple[str, str, int], str] = {}
-    for name, views_of_run in zip(NAMES, views, strict=True):
-        for key in sorted(shared, key=lambda key, views_of_run=views_of_run: psnr_of(views_of_run[key]))[:WORST]:  # type: ignore[misc]
-            chosen[key] = "before and after" if key in chosen else name.lower()
-    try:
-        capture = load_capture(before[0].capture_folder)
-        for key, run in chosen.items():
-            frames = pictures.compare(capture, shown, views[0][key], with_errors=False)
-            truth, *drawn = frames.images
-            named = (replace(frame, caption=name) for frame, name in zip(drawn, NAMES, strict=True))
-            title = f"{frames.title}: among the worst {run}"
-            yield replace(frames, title=title, images=(truth, *named)).strip(album)
-    except InputError:
-        return
+def _worst_frames(pair: tuple[Done, Done], album: Album) -> Iterator[Strip]:
+    """The worst held-out views of each run that the other has as well."""
+
+    def worst(views: Views) -> Iterator[tuple[ViewScore, str]]:
+        views = [each for each in views if each[0].split in RANKED_SPLITS]
+        orders = [sorted(range(len(views)), key=[psnr_of(both[run]) for both in views].__getitem__) for run in (0, 1)]
+        before, after = (order[:WORST] for order in orders)
+        for index in dict.fromkeys([*before, *after]):
+            runs = [name.lower() for name, chosen in zip(NAMES, (before, after), strict=True) if index in chosen]
+            yield views[index][0], f"among the worst {' and '.join(runs)}"
+
+    for frames in shared_views(pair, worst):
+        truth, *drawn = frames.images
+        named = (replace(frame, caption=name) for frame, name in zip(drawn, NAMES, strict=True))
+        yield replace(frames, images=(truth, *named)).strip(album)

@@ -4,6 +4,7 @@ A table is a DataFrame of texts. The page and the Markdown are two templates ove
 """
 
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Any, ClassVar, Literal
 
 import pandas as pd
@@ -60,13 +61,7 @@ class Table:
     @property
     def groups(self) -> list[tuple[str, int]]:
         """Column groups and how many columns each spans."""
-        spans: list[tuple[str, int]] = []
-        for group, _ in self.heads:
-            if spans and spans[-1][0] == group:
-                spans[-1] = (group, spans[-1][1] + 1)
-            else:
-                spans.append((group, 1))
-        return spans
+        return [(group, len([*columns])) for group, columns in groupby(group for group, _ in self.heads)]
 
     @property
     def rows(self) -> list[tuple[str, list[tuple[str, Mark]]]]:
@@ -121,11 +116,3 @@ class Section:
     blocks: tuple[Block, ...]
     folded: bool = False
     headline: str = ""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Report:
-    """A whole report."""
-
-    title: str
-    sections: tuple[Section, ...]

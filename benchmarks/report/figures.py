@@ -1,5 +1,7 @@
 """The charts of a scene: its numbers as the tables that `charts.py` draws, with captions."""
 
+from collections.abc import Mapping
+
 import pandas as pd
 
 from benchmarks.analysis import pareto
@@ -8,7 +10,7 @@ from benchmarks.analysis.statistics import intervals
 from benchmarks.analysis.style import EXACT, SPLIT_NAMES
 from benchmarks.cell.registry import WRONG_BY_MM
 from benchmarks.report import charts, vega
-from benchmarks.report.vega import Figure
+from benchmarks.report.vega import Figure, Series
 
 PLANTED = {method for mm, row in WRONG_BY_MM.items() if mm > 0 for method in row}  # They have a chart of their own.
 SPAN_DB = 9.0  # below the best point: lower points are named in the subtitle and not drawn
@@ -17,7 +19,7 @@ SPAN_DB = 9.0  # below the best point: lower points are named in the subtitle an
 def speed_figure(tables: RunTables, scene: str) -> Figure | None:
     """Foreground PSNR against milliseconds per frame, for novel views and novel poses."""
     methods = [m for m in tables.methods(scene) if m not in PLANTED and tables.whole(scene, m)]
-    styles = dict(zip(methods, vega.series_of(methods), strict=True))
+    styles = vega.series_of(methods)
     frames = tables.values(scene, FRAME_MS, methods)
     points, front, links = [], [], []
     notes: dict[str, list[str]] = {}
@@ -28,7 +30,7 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
         spans = intervals(timed) if timed else {}
         floor = max((span.mean for span in spans.values()), default=0.0) - SPAN_DB
         shown = {m: span for m, span in spans.items() if span.mean >= floor}
-        competing = [each for each in pareto.candidates(tables, scene, split)]
+        competing = pareto.candidates(tables, scene, split)
         sufficient = pareto.smallest_sufficient(competing)
         for method, span in shown.items():
             ringed = sufficient is not None and sufficient.name == method
@@ -75,7 +77,7 @@ def training_figure(tables: RunTables, scene: str) -> Figure | None:
     caption = "Foreground PSNR of reserved training views, which no step sees, over seconds of training. First seed;"
     return line_figure(
         curves[curves["method"].isin(methods)].assign(panel=title),
-        methods,
+        vega.series_of(methods),
         name=f"training_{scene}",
         title=title,
         caption=f"{caption} warm-up included.",
@@ -89,7 +91,7 @@ def training_figure(tables: RunTables, scene: str) -> Figure | None:
 
 def line_figure(
     table: pd.DataFrame,
-    methods: list[str],
+    series: Mapping[str, Series] | None = None,
     *,
     name: str,
     title: str,
@@ -102,11 +104,16 @@ def line_figure(
     rules: pd.DataFrame | None = None,
     columns: int = 2,
 ) -> Figure:
-    """A line per method through `table` (panel, method, psnr, the column `x`, and low, high, scale where known)."""
-    series = vega.series_of(methods)
-    names = {method: each.title for method, each in zip(methods, series, strict=True)}
-    samples = table.assign(series=table["method"].map(names), x=table[x].astype(float), y=table["psnr"])
-    shown = [column for column in ("panel", "scale", "series", "x", "y", "low", "high") if column in samples]
-    panels = charts.lines(samples[shown], series, x=x_title, y=y_title, size=size, log=log, rules=rules)
+    """A line per method through `table` (panel, method, psnr, the column `x`, and low, high, scale, crossed if known).
+
+    `series`: by the values of `method`; by default those of the methods.
+    """
+    series = vega.series_of(table["method"].unique()) if series is None else series
+    titles = {method: each.title for method, each in series.items()}
+    places = table[x].astype(float) if pd.api.types.is_numeric_dtype(table[x]) else table[x]
+    samples = table.assign(series=table["method"].map(titles), x=places, y=table["psnr"])
+    known = [c for c in ("panel", "scale", "series", "x", "y", "low", "high", "crossed") if c in samples]
+    drawn = tuple(series.values())
+    panels = charts.lines(samples[known], drawn, x=x_title, y=y_title, size=size, log=log, rules=rules)
     columns = min(columns, len(panels))
-    return Figure(name=name, title=title, caption=caption, panels=panels, series=series, columns=columns)
+    return Figure(name=name, title=title, caption=caption, panels=panels, series=drawn, columns=columns)

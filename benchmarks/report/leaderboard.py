@@ -12,7 +12,7 @@ import io
 import math
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -57,9 +57,10 @@ ORIGINS: dict[Kind, str] = {
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Entry:
-    """A finished cell of one of the sources; `name` is its own among all of them."""
+    """A finished cell of one of the sources; `name` is its own among all of them, `place` its scene."""
 
     name: str
+    place: str
     source: str
     origin: str  # how far its scores can be trusted
     cell: Cell
@@ -81,9 +82,7 @@ def write_leaderboard(sources: Sequence[Path], out: Path, *, captures: Sequence[
         titles: dict[str, str] = {}
         for number, source in enumerate(sources):
             folder = source if source.is_dir() else stack.enter_context(unpacked(source))
-            near = (
-                entry.capture for entry in entries if entry.capture is not None
-            )  # A run knows where its truth lies.
+            near = (each.capture for each in entries if each.capture is not None)  # A run knows where its truth lies.
             entries += _entries(number, source, folder, tuple(dict.fromkeys((*captures, *near))))
             if source.is_dir():  # Titles that a pack gives would stand above rows of others too.
                 titles = read_run(folder).titles | titles
@@ -92,11 +91,10 @@ def write_leaderboard(sources: Sequence[Path], out: Path, *, captures: Sequence[
         if len({entry.cell.config.subject >= VALIDATION for entry in entries}) > 1:
             raise InputError(f"{out}: people from {VALIDATION} on are there to choose by, expected none or no others")
         with titles_of((entry.cell.config for entry in entries), titles):
-            places = _places(entries)
-            pictures, truths = _write_pictures(entries, out)
-            data = _data(entries, places, pictures, truths)
+            entries = _told_apart(entries)
+            data = _data(entries, _write_pictures(entries, out))
             page = environment("html").get_template("leaderboard.html").render(data=data)
-            write_atomic(out / "images.csv", _csv(entries, places).encode())
+            write_atomic(out / "images.csv", _csv(entries).encode())
             write_atomic(out / "index.html", page.encode())
     count = sum(len(entry.result.views) for entry in entries)
     unseen = sorted({entry.cell.capture_folder.name for entry in entries if entry.capture is None})
@@ -116,6 +114,7 @@ def _entries(number: int, source: Path, folder: Path, captures: Sequence[Path]) 
         if (result := result_of(cell)) is not None:
             yield Entry(
                 name=f"{number}-{cell.config.key}",
+                place=cell.config.place,
                 source=printable(source.resolve().name),
                 origin=origins.get(cell.folder, default),
                 cell=cell,
@@ -124,38 +123,38 @@ def _entries(number: int, source: Path, folder: Path, captures: Sequence[Path]) 
             )
 
 
-def _places(entries: Sequence[Entry]) -> dict[str, str]:
-    """The scene of each entry, by its name; scenes of one name that show different truths are told apart."""
-    configs = {entry.name: entry.cell.config for entry in entries}
-    mixed = mixed_places(configs.values())
-    return {
-        name: f"{c.place} ({c.size}, {c.truth[:6]})" if c.place in mixed else c.place for name, c in configs.items()
-    }
+def _told_apart(entries: Sequence[Entry]) -> list[Entry]:
+    """The entries; scenes of one name that show different truths have names of their own."""
+    mixed = mixed_places(entry.cell.config for entry in entries)
+    return [
+        replace(e, place=f"{e.place} ({e.cell.config.size}, {e.cell.config.truth[:6]})") if e.place in mixed else e
+        for e in entries
+    ]
 
 
-def _write_pictures(entries: Sequence[Entry], out: Path) -> tuple[set[str], dict[str, str]]:
-    """Pictures and truth as they were compared; which entries have any, and the truth's folder by a capture's identity.
+def _write_pictures(entries: Sequence[Entry], out: Path) -> set[str]:
+    """Pictures and truth as they were compared; the names of the entries that have pictures.
 
-    A run that was unpacked from its numbers has no pictures.
+    A run that was unpacked from its numbers has none.
     """
     drawn: set[str] = set()
-    truths: dict[str, Capture] = {}
+    truths: dict[Path, Capture] = {}
     for entry in entries:
-        identity = entry.cell.config.capture
-        if entry.capture is not None and identity not in truths:
-            truths[identity] = load_capture(entry.capture)
+        if entry.capture is not None and entry.capture not in truths:
+            truths[entry.capture] = load_capture(entry.capture)
         for view in entry.result.views:
             if (stored := prediction_path(entry.cell.folder, view)).is_file():
                 drawn.add(entry.name)
                 _write(prediction_path(out / "pictures" / entry.name, view), _pixels(stored)[..., :3])
-            if entry.capture is not None and view.camera in truths[identity].cameras:
-                truth = metrics.on_black(truths[identity].image(view.camera, view.frame))[..., :3]
-                _write(out / _truth(identity) / view.camera / f"{view.frame:06d}.png", truth)
-    return drawn, {identity: _truth(identity) for identity in truths}
+            if entry.capture is not None and view.camera in truths[entry.capture].cameras:
+                truth = metrics.on_black(truths[entry.capture].image(view.camera, view.frame))[..., :3]
+                _write(out / _truth(entry) / view.camera / f"{view.frame:06d}.png", truth)
+    return drawn
 
 
-def _truth(identity: str) -> str:
-    return f"truth/{hash_of(identity)[:16]}"
+def _truth(entry: Entry) -> str:
+    """The folder of its truth."""
+    return f"truth/{hash_of(entry.cell.config.capture)[:16]}"
 
 
 def _pixels(path: Path) -> np.ndarray:
@@ -170,14 +169,12 @@ def _write(path: Path, rgb: np.ndarray) -> None:
     Image.fromarray(rgb).save(path, compress_level=4)
 
 
-def _data(
-    entries: Sequence[Entry], places: dict[str, str], pictures: set[str], truths: dict[str, str]
-) -> dict[str, Any]:
-    """What the page shows, as JSON."""
+def _data(entries: Sequence[Entry], pictures: set[str]) -> dict[str, Any]:
+    """What the page shows, as JSON; `pictures`: names of entries that have any."""
     rows: dict[tuple[str, ...], list[Entry]] = {}
     for entry in entries:
         config, source = entry.cell.config, entry.name.partition("-")[0]
-        rows.setdefault((places[entry.name], config.method, config.preset, source), []).append(entry)
+        rows.setdefault((entry.place, config.method, config.preset, source), []).append(entry)
     return {
         "splits": [(split, SPLIT_NAMES[split].title) for split in IMAGE_SPLITS],
         "regions": list(REGIONS.items()),
@@ -185,8 +182,8 @@ def _data(
         "costs": [(name, _metric(name)) for _, name in COSTS],
         "qualities": QUALITIES,
         "scores": ["/".join(name) for name in SCORES],
-        "rows": [_row(places[group[0].name], group) for group in rows.values()],
-        "cells": [_cell(entry, places[entry.name], pictures, truths) for entry in entries],
+        "rows": [_row(group) for group in rows.values()],
+        "cells": [_cell(entry, has_pictures=entry.name in pictures) for entry in entries],
     }
 
 
@@ -201,7 +198,7 @@ def _metric(name: str) -> dict[str, Any]:
     }
 
 
-def _row(place: str, group: Sequence[Entry]) -> dict[str, Any]:
+def _row(group: Sequence[Entry]) -> dict[str, Any]:
     """A method on a scene, of one source: means over people, or over seeds of one."""
     results, config = [entry.result for entry in group], group[0].cell.config
     scores: dict[str, dict[str, list[float | None]]] = {}
@@ -211,7 +208,7 @@ def _row(place: str, group: Sequence[Entry]) -> dict[str, Any]:
     machines = {_machine(result) for result in results} - {""}
     counts = {"people": len({r.config.subject for r in results}), "seeds": len({r.config.seed for r in results})}
     return {
-        "scene": place,
+        "scene": group[0].place,
         "method": style_of(config.method).title,
         "origin": "; ".join([*dict.fromkeys(f"{each.source}: {each.origin}" for each in group), *_notes(results)]),
         "protocol": config.protocol,
@@ -252,7 +249,7 @@ def _machine(result: CellResult) -> str:
     return f"{facts.get('processor', 'unknown processor')}, {facts.get('cores', '?')} cores"
 
 
-def _cell(entry: Entry, place: str, pictures: set[str], truths: dict[str, str]) -> dict[str, Any]:
+def _cell(entry: Entry, *, has_pictures: bool) -> dict[str, Any]:
     config = entry.cell.config
     views = []
     for view in entry.result.views:
@@ -264,14 +261,14 @@ def _cell(entry: Entry, place: str, pictures: set[str], truths: dict[str, str]) 
         "name": entry.name,
         "title": f"{style_of(config.method).title}{who}",
         "source": entry.source,
-        "capture": f"{place}, subject {config.subject}",
-        "pictures": f"pictures/{entry.name}/images" if entry.name in pictures else "",
-        "truth": truths[config.capture] if entry.capture is not None else "",
+        "capture": f"{entry.place}, subject {config.subject}",
+        "pictures": f"pictures/{entry.name}/images" if has_pictures else "",
+        "truth": _truth(entry) if entry.capture is not None else "",
         "views": views,
     }
 
 
-def _csv(entries: Sequence[Entry], places: dict[str, str]) -> str:
+def _csv(entries: Sequence[Entry]) -> str:
     """Every score of every image."""
     buffer = io.StringIO()
     table = csv.writer(buffer, lineterminator="\n")
@@ -281,7 +278,7 @@ def _csv(entries: Sequence[Entry], places: dict[str, str]) -> str:
     )
     for entry in entries:
         config = entry.cell.config
-        texts = places[entry.name], config.subject, config.capture, config.method, config.preset, config.seed
+        texts = entry.place, config.subject, config.capture, config.method, config.preset, config.seed
         about = [csv_text(str(text)) for text in (*texts, config.protocol, entry.source, entry.origin)]
         for view in entry.result.views:
             place = [view.split, csv_text(view.camera), view.frame, csv_text(view.prediction)]

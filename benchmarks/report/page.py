@@ -3,7 +3,8 @@
 Everything comes from the results of the run's cells; the page needs no network and no other file.
 """
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -17,9 +18,9 @@ from benchmarks.analysis.style import titles_of
 from benchmarks.cell.schema import printable
 from benchmarks.report import author_table, content, escaping, glossary, sections, sentences, tables, vega
 from benchmarks.report.author_table import AuthorTable
-from benchmarks.report.content import Report, Section
+from benchmarks.report.content import Section
 from benchmarks.report.pictures import Album
-from benchmarks.report.scene import FEW_WORST, MANY, WORST, SceneData, SceneReport, scene_report
+from benchmarks.report.scene import FEW_WORST, MANY, WORST, SceneData, scene_report
 from benchmarks.report.vega import Figure
 from benchmarks.suites.archive import write_archive
 from benchmarks.suites.runs import Run, results_of
@@ -48,7 +49,7 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
     own = author_table.of_tables(run_tables, run.table)
     album = Album()
     many = sum(len(run_tables.methods(scene)) for scene in run_tables.scenes) > MANY
-    scenes = [
+    made = [
         scene_report(
             SceneData(
                 run=run,
@@ -62,33 +63,31 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
         )
         for scene in run_tables.scenes
     ]
-    first, others = _first_sections(scenes, run.command)
+    first, others = _first_sections([parts for parts, _ in made], run.command)
     curves = [*sections.training_cost(run_tables), *sections.template_errors(run_tables)]
     novelty = sections.novelty(run_tables)
-    report = Report(
-        title=f"Report of suite {run.suite}",
-        sections=(
-            Section(title="", blocks=(content.Text(text=run.about[:1].upper() + run.about[1:] + "."),)),
-            *first,
-            *([Section(title="Tables of the suite", blocks=_blocks(own))] if own else []),
-            *sections.ablations(run_tables, None if chosen_on is None else RunTables(results_of(chosen_on))),
-            *sections.stabilities(run_tables),
-            *curves,
-            *others,
-            *novelty,
-            *sections.beside_the_paper(run_tables, run.suite),
-            *sections.failed_cells(results, len(run.cells) + len(run.absent) - len(results)),
-            sections.provenance(results, run.command),
-            sections.glossary(),
-        ),
-    )
-    files = {figure.file: figure.svg().encode() for figure in figures_of(report)}
-    files |= {name: png for scene in scenes for name, png in scene.sheets.items()}
+    title = f"Report of suite {run.suite}"
+    parts = [
+        Section(title="", blocks=(content.Text(text=run.about[:1].upper() + run.about[1:] + "."),)),
+        *first,
+        *([Section(title="Tables of the suite", blocks=_blocks(own))] if own else []),
+        *sections.ablations(run_tables, None if chosen_on is None else RunTables(results_of(chosen_on))),
+        *sections.stabilities(run_tables),
+        *curves,
+        *others,
+        *novelty,
+        *sections.beside_the_paper(run_tables, run.suite),
+        *sections.failed_cells(results, len(run.cells) + len(run.absent) - len(results)),
+        sections.provenance(results, run.command),
+        sections.glossary(),
+    ]
+    files = {each.file: each.svg().encode() for part in parts for each in part.blocks if isinstance(each, Figure)}
+    files |= {name: png for _, sheets in made for name, png in sheets.items()}
     files |= {
         "results.csv": csv_of(_without_formulas(run_tables.all_rows)).encode(),
         "tables.tex": author_table.latex(own or author_table.default_tables(run_tables)).encode(),
-        "report.md": render(report, "md").encode(),
-        "report.html": render(report, "html", album).encode(),
+        "report.md": render(title, parts, "md").encode(),
+        "report.html": render(title, parts, "html", album).encode(),
     }
     for name, data in files.items():
         write_atomic(run.folder / name, data)
@@ -97,12 +96,12 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
     return [*lines, *shown, f"report: {run.folder / 'report.html'}"]
 
 
-def _first_sections(scenes: Sequence[SceneReport], command: str) -> tuple[Sequence[Section], Sequence[Section]]:
+def _first_sections(scenes: Sequence[Sequence[Section]], command: str) -> tuple[Sequence[Section], Sequence[Section]]:
     """What stands first, the opening of a single scene or the findings of all; and the other sections of scenes."""
-    every = [section for scene in scenes for section in scene.sections]
+    every = [section for scene in scenes for section in scene]
     if len(scenes) == 1:
         return every[:1], every[1:]
-    findings = [(scene.sections[0].title, scene.sections[0].headline) for scene in scenes]
+    findings = [(opening.title, opening.headline) for opening, *_ in scenes]
     again = [("Again", command)] if command else []
     return [Section(title="Results by scene", blocks=(content.Facts(items=(*findings, *again)),))], every
 
@@ -126,7 +125,7 @@ def write_tables(
     if latex is not None:
         write_atomic(latex, author_table.latex(made).encode())
     if markdown is not None:
-        page = render(Report(title="Tables", sections=(Section(title="", blocks=_blocks(made)),)), "md")
+        page = render("Tables", [Section(title="", blocks=_blocks(made))], "md")
         write_atomic(markdown, page.encode())
     if csv is not None:
         write_atomic(csv, numbers.assign(**texts).to_csv(lineterminator="\n").encode())
@@ -158,25 +157,23 @@ def publish(run: Run, folder: Path) -> None:
     write_archive(run, folder / CELLS)
 
 
-def figures_of(report: Report) -> Iterator[Figure]:
-    """Every chart that becomes a file."""
-    return (block for section in report.sections for block in section.blocks if isinstance(block, Figure))
-
-
-def render(report: Report, form: Literal["html", "md"], album: Album | None = None) -> str:
-    """The report by its template."""
-    template = environment(form).get_template(f"report.{form}")
-    text = template.render(
-        report=report,
-        album=[] if album is None else album.pictures,
-        library=Markup(vega.library()) if form == "html" and _has_charts(report) else "",
-        dark_rules=Markup(vega.dark_rules(".vega ")),
+def render(title: str, parts: Sequence[Section], form: Literal["html", "md"], album: Album | None = None) -> str:
+    """A report by its template."""
+    has_charts = any(isinstance(block, Figure | content.Flipbook) for part in parts for block in part.blocks)
+    text = (
+        environment(form)
+        .get_template(f"report.{form}")
+        .render(
+            title=title,
+            sections=parts,
+            album=[] if album is None else album.pictures,
+            library=Markup(vega.library()) if form == "html" and has_charts else "",
+            dark_rules=Markup(vega.dark_rules(".vega ")),
+        )
     )
-    return text if form == "html" else "\n".join(_without_blank_runs(text.splitlines())) + "\n"
-
-
-def _has_charts(report: Report) -> bool:
-    return any(isinstance(block, Figure | content.Flipbook) for section in report.sections for block in section.blocks)
+    if form == "html":
+        return text
+    return re.sub(r"\n{3,}", "\n\n", re.sub(r" +$", "", text, flags=re.MULTILINE)).lstrip("\n")
 
 
 def environment(form: Literal["html", "md"]) -> Environment:
@@ -231,11 +228,3 @@ def _terms(text: str) -> Markup:
         for piece, term in glossary.split_terms(text)
     ]
     return Markup("").join(pieces)
-
-
-def _without_blank_runs(lines: list[str]) -> Iterator[str]:
-    before = ""
-    for line in lines:
-        if line.strip() or before.strip():
-            yield line.rstrip()
-        before = line

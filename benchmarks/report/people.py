@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -14,7 +13,7 @@ from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.schema import CellResult
 from benchmarks.report import pictures
 from benchmarks.report.content import Block, Bullets, Strips, Table, Text
-from benchmarks.report.pictures import Album, Frames, Shown
+from benchmarks.report.pictures import Album, Frames
 from benchmarks.suites.runs import Run
 
 REFERENCE = "ash"
@@ -86,9 +85,13 @@ def pictured(
     others = _others(tables, scene)
     if not others:
         return None, {}
-    groups, columns = [], []
-    for who, (folder, cells) in _cells_by_subject(run, results, tables, scene, (REFERENCE, *others)).items():
-        capture, first = load_capture(folder), cells[0].result
+    groups, columns, names = [], [], _names(tables, scene)
+    for by_method in pictures.first_cells(run, results):
+        if not {REFERENCE, *others} <= by_method.keys():
+            continue
+        cells = [by_method[method] for method in (REFERENCE, *others)]
+        folder, first = cells[0].cell.capture_folder, cells[0].result
+        capture, who = load_capture(folder), names[folder.name]
         views = [view for split in RANKED_SPLITS for view in pictures.choose_views(first, split, 1)]
         rows = [pictures.compare(capture, cells, view, with_errors=False) for view in views]
         groups.append((who, tuple(replace(row, title=f"{who}, {row.title}").strip(album) for row in rows)))
@@ -97,23 +100,6 @@ def pictured(
     file = f"pictures_people_{scene}.png"
     strips = Strips(file=file, title=f"All subjects on {scene}", groups=tuple(groups))
     return strips, {file: pictures.sheet(lines, scale=1 if len(columns) > FEW_SUBJECTS else 2)}
-
-
-def _cells_by_subject(
-    run: Run, results: Sequence[CellResult], tables: RunTables, scene: str, methods: Sequence[str]
-) -> dict[str, tuple[Path, list[Shown]]]:
-    """The capture's folder, and the first cell of each method on it, the reference first."""
-    names, done = _names(tables, scene), {result.config.key: result for result in results}
-    by_subject: dict[str, tuple[Path, dict[str, Shown]]] = {}
-    for cell in run.cells:
-        if cell.config.key in done and cell.config.method in methods:
-            _, cells = by_subject.setdefault(names[cell.capture_folder.name], (cell.capture_folder, {}))
-            cells.setdefault(cell.config.method, Shown(cell=cell, result=done[cell.config.key]))
-    return {
-        who: (folder, [cells[m] for m in methods])
-        for who, (folder, cells) in by_subject.items()
-        if len(cells) == len(methods)
-    }
 
 
 def _others(tables: RunTables, scene: str) -> list[str]:

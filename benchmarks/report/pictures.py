@@ -22,6 +22,7 @@ from benchmarks.cell import metrics
 from benchmarks.cell.evaluation import spread
 from benchmarks.cell.schema import Cell, CellResult, View, ViewScore, stored_prediction
 from benchmarks.report.content import Strip
+from benchmarks.suites.runs import Run
 
 PAPER = 236  # grey behind the subject: dark hair and light cloth are both visible
 MARGIN = 0.06
@@ -81,6 +82,17 @@ class Frames:
         """The row for the page."""
         tiles = tuple((frame.caption, frame.score, album.add(frame.pixels)) for frame in self.images)
         return Strip(title=self.title, tiles=tiles, width=self.images[0].pixels.shape[1])
+
+
+def first_cells(run: Run, results: Sequence[CellResult]) -> list[dict[str, Shown]]:
+    """Of each capture: the first cell by method that has one of the results."""
+    done = {result.config.key: result for result in results}
+    cells: dict[tuple[str, int], dict[str, Shown]] = {}
+    for cell in run.cells:
+        if (result := done.get(cell.config.key)) is not None:
+            by_method = cells.setdefault((cell.config.capture, cell.config.subject), {})
+            by_method.setdefault(cell.config.method, Shown(cell=cell, result=result))
+    return [*cells.values()]
 
 
 def tracks(capture: Capture, shown: Sequence[Shown], album: Album, *, max_bytes: int) -> list[dict[str, Any]]:

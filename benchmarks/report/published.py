@@ -1,4 +1,4 @@
-"""`reports/README.md` from its template `README.md.j2`: every number in it comes from a published csv or `cells.zip`.
+"""`reports/README.md` from its template `README.md.j2`: every number in it comes from a published csv.
 
 `.venv/bin/python -m benchmarks.report.published` writes it anew after a report was published; a test compares the two.
 """
@@ -20,14 +20,11 @@ from benchmarks.analysis.style import style_of
 from benchmarks.cell.metrics import METRICS, PROTOCOL
 from benchmarks.cell.registry import code_version
 from benchmarks.report.claims import printed
-from benchmarks.report.page import CELLS
 from benchmarks.report.tables import ON_WHOLE_FRAMES, cost_columns, head_of, quality_columns
-from benchmarks.suites.archive import unpacked
-from benchmarks.suites.runs import read_run, results_of
 
 FOLDER = Path(__file__).parents[2] / "reports"
 NAME = "README.md"
-FACT = re.compile(r"^\| (code|commit) \| (.*?) \|$", re.MULTILINE)  # of a report's provenance
+FACT = re.compile(r"^\| (code|commit|command|processor|cores) \| (.*?) \|$", re.MULTILINE)  # of a report's provenance
 
 
 def read_me(folder: Path = FOLDER) -> str:
@@ -61,7 +58,12 @@ class Numbers:
     ) -> str:
         """Row `a` minus row `b` in pairs over people, with its 95 % interval. `region`: by default that of tables."""
         quantity = Quantity(split, region, metric) if region else _quantity(split, metric)
-        return _told(self._compared(report, scene, a, b, quantity), metric)
+        rows = self._rows(report)
+        of_scene = rows[rows["scene"] == scene]
+        test = compare(of_scene, a, b, quantity)
+        if test is None or not samples_of(of_scene, quantity).keys() >= {a, b}:
+            raise InputError(f"{self.folder / report}: expected rows {a} and {b} on {scene}")
+        return _with_interval(test, metric)
 
     def scores(self, report: str, scene: str) -> str:
         """A table in Markdown: PSNR and LPIPS on all held-out splits, milliseconds and training seconds."""
@@ -82,15 +84,12 @@ class Numbers:
 
     def origin(self, report: str) -> str:
         """Command, commit, machine and core-hours of training of a published report."""
-        with unpacked(self.folder / report / CELLS) as folder:
-            run = read_run(folder)
-            results = results_of(run)
-        made = [result.provenance for result in results if result.provenance is not None]
-        commits = ", ".join(sorted({each.commit for each in made}))
-        machines = ", ".join(sorted({f"{e.machine['cores']} cores of {e.machine['processor']}" for e in made}))
+        facts = self._facts(report)
+        commits = ", ".join(sorted(facts["commit"].split(", ")))
         rows = self._rows(report)
         hours = rows[(rows["metric"] == "train_cpu_s") & (rows["split"] == "speed")]["value"].sum() / 3600
-        return f"`{run.command}`, code of {commits}, {machines}, {hours:.1f} core-hours of training"
+        machine = f"{facts['cores']} cores of {facts['processor']}"
+        return f"`{facts['command']}`, code of {commits}, {machine}, {hours:.1f} core-hours of training"
 
     def cells(self, report: str) -> int:
         """How many trainings a report has."""
@@ -110,8 +109,12 @@ class Numbers:
 
     def state(self, report: str) -> str:
         """Whether today's code made a published report."""
-        facts = dict(FACT.findall((self.folder / report / "report.md").read_text()))
+        facts = self._facts(report)
         return "current" if facts.get("code") == code_version("ash") else f"stale, {facts.get('commit', 'unknown')}"
+
+    def _facts(self, report: str) -> dict[str, str]:
+        """The provenance that its page prints, without the backslashes of Markdown."""
+        return dict(FACT.findall((self.folder / report / "report.md").read_text().replace("\\", "")))
 
     def _score(self, report: str, scene: str, method: str, quantity: Quantity) -> str:
         table = self._means(report)
@@ -120,14 +123,6 @@ class Numbers:
             return "n/a"
         measure = METRICS[quantity.metric]
         return f"{table.loc[key, 'value']:.{measure.decimals}f}"
-
-    def _compared(self, report: str, scene: str, a: str, b: str, quantity: Quantity) -> Comparison:
-        rows = self._rows(report)
-        of_scene = rows[rows["scene"] == scene]
-        test = compare(of_scene, a, b, quantity)
-        if test is None or not samples_of(of_scene, quantity).keys() >= {a, b}:
-            raise InputError(f"{self.folder / report}: expected rows {a} and {b} on {scene}")
-        return test
 
     def _read(self, report: str) -> pd.DataFrame:
         rows = read_csv(self.folder / report / "results.csv")
@@ -142,7 +137,7 @@ def _quantity(split: str, metric: str) -> Quantity:
     return Quantity(split, "full", metric) if metric in ON_WHOLE_FRAMES else foreground(split, metric)
 
 
-def _told(test: Comparison, metric: str) -> str:
+def _with_interval(test: Comparison, metric: str) -> str:
     """A difference with its interval; without one where there is one person."""
     measure = METRICS[metric]
 

@@ -75,18 +75,16 @@ class SceneData:
     worst_frames: int
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SceneReport:
-    """A scene's sections, and its sheets of pictures by file name."""
-
-    sections: tuple[Section, ...]
-    sheets: dict[str, bytes]
-
-
-def scene_report(data: SceneData) -> SceneReport:
-    """The part of one scene."""
+def scene_report(data: SceneData) -> tuple[list[Section], dict[str, bytes]]:
+    """The sections of one scene, and its sheets of pictures by file name."""
     run_tables, scene = data.tables, data.scene
-    capture, shown, trouble = _pictured(data)
+    capture: Capture | None = None
+    shown, trouble = _first_cells(data), "No pictures: every cell failed, or has pictures without alpha."
+    if shown:
+        try:
+            capture = load_capture(shown[0].cell.capture_folder)
+        except InputError as error:
+            trouble = _no_pictures(data, error)
     exposed = sentences.exposed(data.results)
     doubts = [Text(text=doubt, note=True) for doubt in sentences.doubts(data.results)]
     seen = [Text(text=each, note=True) for each in sentences.training_views(run_tables, scene)]
@@ -124,7 +122,7 @@ def scene_report(data: SceneData) -> SceneReport:
             folded=True,
         ),
     ]
-    return SceneReport(sections=tuple(s for s in sections if s.blocks), sheets=sheets)
+    return [section for section in sections if section.blocks], sheets
 
 
 def _facts(data: SceneData, capture: Capture | None, *, smoke: bool) -> list[tuple[str, str]]:
@@ -248,21 +246,12 @@ def _conventions(run_tables: RunTables, scene: str) -> tuple[Block, ...]:
     return (*blocks, Text(text=CONVENTIONS_NOTE, note=True)) if blocks else ()
 
 
-def _pictured(data: SceneData) -> tuple[Capture | None, list[Shown], str]:
-    """The capture and the first finished cell of each method on it, the user's first; or why there are none."""
-    done = {result.config.key: result for result in data.results if result.status == "done" and result.has_alpha}
-    first: dict[str, Shown] = {}
-    for cell in data.run.cells:
-        if cell.config.key in done:
-            first.setdefault(cell.config.method, Shown(cell=cell, result=done[cell.config.key]))
-    shown = [first[method] for method in data.tables.methods(data.scene) if method in first]
-    shown = [each for each in shown if each.cell.config.capture == shown[0].cell.config.capture]
-    if not shown:
-        return None, [], "No pictures: every cell failed, or has pictures without alpha."
-    try:
-        return load_capture(shown[0].cell.capture_folder), shown, ""
-    except InputError as error:
-        return None, [], _no_pictures(data, error)
+def _first_cells(data: SceneData) -> list[Shown]:
+    """The first finished cell of each method, the user's first; all on one capture."""
+    finished = [result for result in data.results if result.status == "done" and result.has_alpha]
+    methods, captures = data.tables.methods(data.scene), pictures.first_cells(data.run, finished)
+    shown = ([cells[m] for m in methods if m in cells] for first in methods for cells in captures if first in cells)
+    return next(shown, [])
 
 
 def _no_pictures(data: SceneData, error: InputError) -> str:
@@ -282,7 +271,7 @@ def _picture_sections(
     except InputError as error:
         files = {f"{kind}_{data.scene}.png": name for kind, name in SHEETS.items()}  # of an earlier report
         earlier = [Strips(file=f, title=name, groups=()) for f, name in files.items() if (data.run.folder / f).exists()]
-        reason = Text(text=trouble or _no_pictures(data, error), note=True)
+        reason = Text(text=trouble if capture is None else _no_pictures(data, error), note=True)
         return [Section(title=title, blocks=(*earlier, reason))], {}
     note = (
         "Cropped to the subject, on grey; compressed for this page, while scores come from the stored pictures. First "
@@ -303,7 +292,7 @@ def _picture_sections(
 
 def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Flipbook, dict[str, bytes]]:
     tracks = pictures.tracks(capture, shown, data.album, max_bytes=data.max_bytes)
-    series = vega.series_of([each.cell.config.method for each in shown])
+    series = tuple(vega.series_of(each.cell.config.method for each in shown).values())
     points = [
         {"track": index, "series": each.title, "frame": frame, "psnr": psnr}
         for index, track in enumerate(tracks)

@@ -121,7 +121,6 @@ def _strengths(table: pd.DataFrame, split: str) -> list[Block]:
     words = SPLIT_NAMES[split].words
     figure = line_figure(
         table.assign(panel=table["scene"], method=table["row"], psnr=table["mean"]),
-        list(dict.fromkeys(table["row"])),
         name=f"strength_{split}",
         title=f"Loss against strength, {words}",
         caption=f"Foreground PSNR lost without a component that the scene should need, {words}, by the phenomenon's "
@@ -186,7 +185,6 @@ def template_errors(tables: RunTables) -> list[Section]:
     levels = template_error.levels(tables).merge(margins[["scene", "split"]].drop_duplicates())
     level_figure = line_figure(
         levels.assign(panel=panel(levels)),
-        list(levels["method"].unique()),
         name="levels",
         title="Quality against the template's error",
         caption="Foreground PSNR when a method is given a template of known error (the exact surface, displaced "
@@ -194,31 +192,26 @@ def template_errors(tables: RunTables) -> list[Section]:
         x="error_mm",
         x_title="template error [mm rms]",
     )
-    pair = (
-        Series(title="planted error", colour=vega.BLUE),
-        Series(title="learned template", colour=vega.ORANGE, shape="square"),
-    )
+    templates = {
+        template_error.PLANTED: Series(title="planted error", colour=vega.BLUE),
+        "": Series(title="learned template", colour=vega.ORANGE, shape="square"),
+    }
     rules = [(place, 0.0, "") for place in panel(margins).unique()]
     for scene, split in margins[["scene", "split"]].drop_duplicates().itertuples(index=False):
         if (db := template_error.PAPER_DB[split].get(scene)) is not None:
             rules.append((f"{scene}, {SPLIT_NAMES[split].words}", db, f"the paper's {db:+.1f} dB"))
-    kinds = (margins["template"] == template_error.PLANTED).map({True: pair[0].title, False: pair[1].title})
-    rows = margins.assign(panel=panel(margins), series=kinds, x=margins["error_mm"], y=margins["mean"])
-    panels = charts.lines(
-        rows[["panel", "series", "x", "y", "low", "high"]],
-        pair,
-        x="template error [mm rms]",
-        y="ASH minus DDC [dB]",
-        size=(390, 240),
-        rules=pd.DataFrame(rules, columns=["panel", "y", "text"]),
-    )
-    margin_figure = Figure(
+    kinds = margins["template"].where(margins["template"] == template_error.PLANTED, "")
+    margin_figure = line_figure(
+        margins.assign(panel=panel(margins), method=kinds, psnr=margins["mean"]),
+        templates,
         name="margin",
         title="ASH minus DDC against the template's error",
         caption="Foreground PSNR of ASH minus DDC when both are given such a template, and on templates that both "
         f"learned. {WHISKERS}",
-        panels=panels,
-        series=pair,
+        x="error_mm",
+        x_title="template error [mm rms]",
+        y_title="ASH minus DDC [dB]",
+        rules=pd.DataFrame(rules, columns=["panel", "y", "text"]),
     )
     sentences = Bullets(items=tuple(template_error.sentences(tables, margins)))
     return [Section(title=level_figure.title, blocks=(level_figure, margin_figure, sentences))]
@@ -239,7 +232,6 @@ def training_cost(tables: RunTables) -> list[Section]:
             snapshots = "Snapshots: the learning rate falls only at the end of a training." if name == "budget" else ""
             figure = line_figure(
                 table.assign(panel=table["scene"] + ", " + words, scale=table["scene"]),
-                list(table["method"].unique()),
                 name=name,
                 title=title,
                 caption=" ".join(filter(None, ("Foreground PSNR.", snapshots, WHISKERS))),
@@ -258,7 +250,6 @@ def novelty(tables: RunTables) -> list[Section]:
         return []
     figure = line_figure(
         table.assign(panel=table["scene"], scale=table["scene"], novelty_deg=table["novelty_deg"].round(1)),
-        list(table["method"].unique()),
         name="novelty",
         title="Quality against novelty",
         caption="Foreground PSNR by how far a pose lies from the nearest training pose: the mean over the joints of "
@@ -279,9 +270,7 @@ def stabilities(tables: RunTables) -> list[Section]:
 
 
 def _stability(tables: RunTables, scene: str, breakdowns: pd.DataFrame, steps: pd.DataFrame) -> Section:
-    methods = list(breakdowns["method"].unique())
-    series = vega.series_of(methods)
-    names = {method: each.title for method, each in zip(methods, series, strict=True)}
+    series = vega.series_of(breakdowns["method"].unique())
     titles = {name: f"{axis.title} [{axis.unit}]" for name, axis in AXES.items()}
     caption = "Accuracy against severity, the clean capture at 0. A failed cell counts with the worst score."
     caption += " Crossed: the breakdown point." if breakdowns["midpoint"].notna().any() else ""
@@ -289,35 +278,33 @@ def _stability(tables: RunTables, scene: str, breakdowns: pd.DataFrame, steps: p
     for index, split in enumerate(RANKED_SPLITS):
         here = steps[(steps["scene"] == scene) & (steps["split"] == split)]
         floor = here[(here["method"] == stability.TRIVIAL) & (here["severity"] == 0)]
-        here = here[here["method"].isin(methods)].merge(breakdowns, on=["scene", "axis", "split", "method"])
-        samples = here.assign(
-            panel=here["axis"].map(titles),
-            series=here["method"].map(names),
-            x=here["severity"].map("{:g}".format),
-            y=here["psnr"],
-            crossed=here["severity"] == here["breakdown"],
-        )
+        here = here[here["method"].isin(series)].merge(breakdowns, on=["scene", "axis", "split", "method"])
         text = style_of(stability.TRIVIAL).title
-        rules = pd.DataFrame({"panel": floor["axis"].map(titles), "y": floor["psnr"], "text": text})
         title = SPLIT_NAMES[split].words.capitalize()
-        columns = ["panel", "series", "x", "y", "low", "high", "crossed"]
-        panels = charts.lines(samples[columns], series, x="severity", y="PSNR [dB]", size=(240, 150), rules=rules)
-        blocks.append(
-            Figure(
-                name=f"stability_{scene}_{index}",
-                title=title,
-                caption=f"{title}. {caption} {WHISKERS}",
-                panels=panels,
-                series=series,
-                columns=3,
-            )
+        figure = line_figure(
+            here.assign(
+                panel=here["axis"].map(titles),
+                severity=here["severity"].map("{:g}".format),
+                crossed=here["severity"] == here["breakdown"],
+            ),
+            series,
+            name=f"stability_{scene}_{index}",
+            title=title,
+            caption=f"{title}. {caption} {WHISKERS}",
+            x="severity",
+            x_title="severity",
+            y_title="PSNR [dB]",
+            size=(240, 150),
+            rules=pd.DataFrame({"panel": floor["axis"].map(titles), "y": floor["psnr"], "text": text}),
+            columns=3,
         )
+        blocks.append(figure)
     point = breakdowns["breakdown"].map("{:g}".format).where(breakdowns["breakdown"].notna(), "none")
     point = point.where(breakdowns["midpoint"].notna(), "n/a")
     text = point + breakdowns["loss"].map(" ({:.1f} dB lost at worst)".format)
     place = breakdowns["axis"].map(titles) + ", " + breakdowns["split"].map(lambda split: SPLIT_NAMES[split].words)
     wide = breakdowns.assign(text=text, place=place).pivot(index="place", columns="method", values="text")
-    wide = wide.loc[place.unique(), methods].fillna("n/a").set_axis([names[m] for m in methods], axis=1)
+    wide = wide.loc[place.unique(), [*series]].fillna("n/a").rename(columns={m: s.title for m, s in series.items()})
     title = "Breakdown point (and the worst loss along the axis)"
     blocks.append(Table(title=title, corner="axis", frame=wide))
     rates = stability.reliability(tables.all_rows, scene)

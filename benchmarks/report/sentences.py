@@ -130,12 +130,15 @@ def facts(tables: RunTables, scene: str) -> list[tuple[str, str]]:
     return [(label, text.strip()) for label, text in lines if text.strip()]
 
 
+def _ranked(tables: RunTables, scene: str) -> list[str]:
+    return [name for name in tables.methods(scene, oracles=False) if tables.whole(scene, name)]
+
+
 def _scores(tables: RunTables, scene: str) -> str:
     """Foreground PSNR of the methods, the best first; of many, the main pairs and the best."""
     parts = []
     for split in RANKED_SPLITS:
-        names = [name for name in tables.methods(scene, oracles=False) if tables.whole(scene, name)]
-        means = tables.values(scene, foreground(split), names)
+        means = tables.values(scene, foreground(split), _ranked(tables, scene))
         order = sorted(means, key=lambda name: -means[name])
         if len(order) > FEW_METHODS:
             order = [name for name in order if name in (order[0], *chain(*PAIRS))]
@@ -176,8 +179,7 @@ def _sufficient(tables: RunTables, scene: str) -> str:
 
 def _weakest(tables: RunTables, scene: str) -> str:
     """The split on which the methods score lowest, and the methods that draw every frame alike."""
-    names = [name for name in tables.methods(scene, oracles=False) if tables.whole(scene, name)]
-    means = {split: tables.values(scene, foreground(split), names) for split in HELD_OUT_SPLITS}
+    means = {split: tables.values(scene, foreground(split), _ranked(tables, scene)) for split in HELD_OUT_SPLITS}
     means = {split: values for split, values in means.items() if values}
     text = ""
     if len(means) > 1:
@@ -230,8 +232,7 @@ def _exact(tables: RunTables, scene: str) -> str:
 
 def _cost(tables: RunTables, scene: str) -> str:
     """Of many methods only the main two, the fastest and the slowest."""
-    names = [method for method in tables.methods(scene, oracles=False) if tables.whole(scene, method)]
-    frame_ms = tables.values(scene, FRAME_MS, names)
+    frame_ms = tables.values(scene, FRAME_MS, _ranked(tables, scene))
     if len(frame_ms) > FEW_METHODS:
         ends = [pick(frame_ms, key=lambda name: frame_ms[name]) for pick in (min, max)]
         frame_ms = {name: ms for name, ms in frame_ms.items() if name in (*chain(*PAIRS), *ends)}

@@ -5,12 +5,13 @@ each other where it is narrow, with values on hover, zoom, and a legend whose en
 paper, ink and grid are replaced on dark pages by those of `DARK`, in the file and in the page alike.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
 from typing import Any, ClassVar
+from xml.sax.saxutils import escape
 
 import altair as alt
 import vl_convert
@@ -89,23 +90,23 @@ class Figure:
         )
         spec: dict[str, Any] = chart.to_dict(validate=False) | {"config": CONFIG}
         drawn = vl_convert.vegalite_to_svg(spec, vl_version=VERSION, allowed_base_urls=[])
-        return drawn.replace(">", f"><title>{_plain(self.title)}</title><style>{dark_rules()}</style>", 1)
+        return drawn.replace(">", f"><title>{escape(self.title)}</title><style>{dark_rules()}</style>", 1)
 
     def specs(self) -> list[dict[str, Any]]:
         """The panels as the page shows them."""
         return [_interactive(panel) for panel in self.panels]
 
 
-def series_of(methods: Sequence[str]) -> tuple[Series, ...]:
-    """The series of methods; those of one colour differ in shape."""
-    series: list[Series] = []
+def series_of(methods: Iterable[str]) -> dict[str, Series]:
+    """The series of each method; those of one colour differ in shape."""
+    series: dict[str, Series] = {}
     for method in methods:
         style, hollow = style_of(method), is_oracle(method)
-        alike = sum((other.colour, other.hollow) == (style.colour, hollow) for other in series)
-        title = method if any(other.title == style.title for other in series) else style.title
+        alike = sum((other.colour, other.hollow) == (style.colour, hollow) for other in series.values())
+        title = method if any(other.title == style.title for other in series.values()) else style.title
         shape = SHAPES[alike % len(SHAPES)]
-        series.append(Series(title=title, colour=style.colour, hollow=hollow, shape=shape))
-    return tuple(series)
+        series[method] = Series(title=title, colour=style.colour, hollow=hollow, shape=shape)
+    return series
 
 
 def dark_rules(scope: str = "") -> str:
@@ -146,7 +147,3 @@ def _without_legends(node: Any) -> Any:
 
 def _is_continuous(encoding: dict[str, Any]) -> bool:
     return all(encoding[axis]["type"] == "quantitative" for axis in ("x", "y"))
-
-
-def _plain(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

@@ -83,6 +83,13 @@ def test_one_value_has_no_mark_and_no_interval() -> None:
     assert "One value per row" in table.caption and "Bold" not in table.caption
 
 
+def test_without_the_reference_there_are_means_alone() -> None:
+    asked = {key: value for key, value in ASKED.items() if key != "rows"}
+    results = people({"wo_mot": LEVELS["wo_mot"]})
+    (table,) = author_table.of_tables(RunTables(results), tables_of(asked, place="x.toml"))
+    assert table.shown.frame.iloc[:, 0].tolist() == ["21.55"]
+
+
 @pytest.mark.parametrize(
     ("form", "text"), [("mean", "25.50"), ("interval", "25.50 [23.45, 27.55]"), ("half-width", "25.50 ± 2.05")]
 )

@@ -18,16 +18,22 @@ from benchmarks.commands.arguments import FAILED
 from benchmarks.report.claims import write_claims
 from benchmarks.suites.files import find_suite, suite_files
 from benchmarks.suites.runs import Run, read_run
+from benchmarks.suites.suites import Suite
 
 PAPER = {"view_psnr": ("novel_view", "psnr"), "pose_psnr": ("novel_pose", "psnr")}
 PAPER |= {"view_lpips": ("novel_view", "lpips"), "pose_lpips": ("novel_pose", "lpips")}
 
 
-def test_every_contrast_can_be_run_by_a_suite_of_ours() -> None:
-    suites = [find_suite(name) for name in suite_files()]
+@pytest.fixture(scope="module")
+def suites() -> dict[str, Suite]:
+    """Ours by name; reading them takes seconds."""
+    return {name: find_suite(name) for name in suite_files()}
+
+
+def test_every_contrast_can_be_run_by_a_suite_of_ours(suites: dict[str, Suite]) -> None:
     rows = {
         (scene.name, method)
-        for suite in suites
+        for suite in suites.values()
         for scene in suite.scenes
         for method in (scene.methods or [row.name for row in suite.methods])
     }
@@ -36,10 +42,10 @@ def test_every_contrast_can_be_run_by_a_suite_of_ours() -> None:
     assert len(judged) > 30 and missing == []
 
 
-def test_published_differences_are_those_of_the_tables_beside_ours() -> None:
+def test_published_differences_are_those_of_the_tables_beside_ours(suites: dict[str, Suite]) -> None:
     """`paper.toml` and `cameras.toml` have the paper's numbers; a row is a method or, of others, its title."""
     given: dict[tuple[str, str], dict[str, float]] = {}
-    for table in (*find_suite("paper").table, *find_suite("cameras").table):
+    for table in (*suites["paper"].table, *suites["cameras"].table):
         for row in (row for group in table.rows for row in group):
             name = row.method or {"HDHumans": "hdhumans", "NA": "neural_actor", "TAVA": "tava"}[row.title]
             given[table.scene, name] = dict(row.given)

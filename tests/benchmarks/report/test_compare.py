@@ -119,7 +119,7 @@ def test_compare_tells_rows_and_shows_the_worst_frames(
     assert same.startswith("No quantity is better or worse.") and "equivalent" in same
 
 
-def test_a_report_over_runs_and_cells(runs: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_report_over_runs_and_cells(runs: tuple[Path, Path], tmp_path: Path, no_chart_files: None) -> None:
     cells = [*(runs[0] / "cells").iterdir()]
     assert cli.main(["report", *map(str, cells), "--out", str(tmp_path / "both")]) == 0
     assert "boxes" in (tmp_path / "both" / "report.md").read_text()

@@ -101,17 +101,17 @@ def test_a_report_over_people_shows_everybody(run: Run, tmp_path: Path) -> None:
     data = SceneData(
         run=cast, tables=tables, results=tuple(results), scene="boxes", album=Album(), max_bytes=10**6, worst_frames=1
     )
-    made = scene_report(data)
-    (strips,) = (b for s in made.sections if s.title == "All subjects on boxes" for b in s.blocks if b.kind == "strips")
+    sections, sheets = scene_report(data)
+    (strips,) = (b for s in sections if s.title == "All subjects on boxes" for b in s.blocks if b.kind == "strips")
     assert [name for name, _ in strips.groups] == ["subject 0", "subject 1"]
     assert all([caption for caption, *_ in strip.tiles] == ["Truth", "ASH", "DDC"] for strip in strips.groups[0][1])
     assert [strip.title.split(",")[:2] for strip in strips.groups[1][1]] == [
         ["subject 1", " novel views"],
         ["subject 1", " novel poses"],
     ]
-    sheet = Image.open(io.BytesIO(made.sheets[strips.file]))
-    alone = next(b for s in made.sections for b in s.blocks if b.kind == "flipbook")
-    assert strips.file in made.sheets and alone.file in made.sheets and sheet.width < sheet.height
+    sheet = Image.open(io.BytesIO(sheets[strips.file]))
+    alone = next(b for s in sections for b in s.blocks if b.kind == "flipbook")
+    assert strips.file in sheets and alone.file in sheets and sheet.width < sheet.height
     shutil.rmtree(tmp_path / "other")
     with pytest.raises(InputError):
         people.pictured(cast, results, tables, "boxes", Album())
