@@ -3,6 +3,7 @@
 import json
 import os
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -105,54 +106,19 @@ class Careless(FakeAvatar):
     """Draws whatever pose it is asked for."""
 
 
-def honest(capture: Capture, *, seed: int, preset: str) -> Honest:
-    return Honest(capture, detail=0.9, seed=seed)
-
-
-def peeking(capture: Capture, *, seed: int, preset: str) -> Peeking:
-    return Peeking(capture, detail=0.9, seed=seed)
-
-
-def linking(capture: Capture, *, seed: int, preset: str) -> Linking:
-    return Linking(capture, detail=0.9, seed=seed)
-
-
-def unseeded(capture: Capture, *, seed: int, preset: str) -> Unseeded:
-    return Unseeded(capture, detail=0.9, seed=seed)
+def _make(kind: type[FakeAvatar], capture: Capture, *, seed: int, preset: str) -> FakeAvatar:
+    return kind(capture, detail=0.9, seed=seed)
 
 
 def one_seed(capture: Capture, *, seed: int, preset: str) -> Honest:
     return Honest(capture, detail=0.9, seed=7)
 
 
-def not_a_number(capture: Capture, *, seed: int, preset: str) -> NotANumber:
-    return NotANumber(capture, detail=0.9, seed=seed)
-
-
-def hoarding(capture: Capture, *, seed: int, preset: str) -> Hoarding:
-    return Hoarding(capture, detail=0.9, seed=seed)
-
-
-def mutating(capture: Capture, *, seed: int, preset: str) -> Mutating:
-    return Mutating(capture, detail=0.9, seed=seed)
-
-
-def overwriting(capture: Capture, *, seed: int, preset: str) -> Overwriting:
-    return Overwriting(capture, detail=0.9, seed=seed)
-
-
-def sleeping(capture: Capture, *, seed: int, preset: str) -> Sleeping:
-    return Sleeping(capture, detail=0.9, seed=seed)
-
-
-def careless(capture: Capture, *, seed: int, preset: str) -> Careless:
-    return Careless(capture, detail=0.9, seed=seed)
-
-
-NAMES = (
-    "honest", "peeking", "linking", "unseeded", "one_seed", "not_a_number", "hoarding", "mutating", "overwriting",
-    "sleeping", "careless",
-)  # fmt: skip
+KINDS = {
+    "honest": Honest, "peeking": Peeking, "linking": Linking, "unseeded": Unseeded, "not_a_number": NotANumber,
+    "hoarding": Hoarding, "mutating": Mutating, "overwriting": Overwriting, "sleeping": Sleeping, "careless": Careless,
+}  # fmt: skip
+globals().update({name: partial(_make, kind) for name, kind in KINDS.items()})
 
 
 def use(folder: Path, monkeypatch) -> None:
@@ -160,7 +126,7 @@ def use(folder: Path, monkeypatch) -> None:
     info = folder / "ash_bench_cheats-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: ash-bench-cheats\nVersion: 1.0\n")
-    lines = ["[ash_bench.methods]", *(f"{name} = helpers.cheats:{name}" for name in NAMES)]
+    lines = ["[ash_bench.methods]", *(f"{name} = helpers.cheats:{name}" for name in (*KINDS, "one_seed"))]
     (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
     paths = [str(folder), str(Path(__file__).parents[1]), *filter(None, [os.environ.get(METHOD_PATH)])]
     monkeypatch.setenv(METHOD_PATH, os.pathsep.join(paths))
