@@ -92,7 +92,7 @@ def effects(table: pd.DataFrame, split: str) -> list[AblationEffect]:
 def matrix(tables: RunTables, table: pd.DataFrame, split: str) -> list[AblationEffect]:
     """The cells of the matrix; none of fewer than two scenes or without an ablation."""
     cells = [effect for effect in effects(table, split) if effect.scene not in OTHER_STRENGTHS]
-    scenes = [scene for scene in {*tables.scenes} - OTHER_STRENGTHS if REFERENCE in tables.methods(scene)]
+    scenes = [name for name in tables.scenes if name not in OTHER_STRENGTHS and REFERENCE in tables.methods(name)]
     return cells if len(scenes) > 1 and any(effect.row != "ddc" for effect in cells) else []
 
 

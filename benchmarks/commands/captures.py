@@ -170,13 +170,19 @@ class ImportCommand:
 
     def __call__(self) -> int:
         """Check the whole, then write it."""
-        from benchmarks.importing.footage import HeldOut, import_footage, read_footage
+        from benchmarks.importing.footage import import_footage
         from benchmarks.importing.overlap import overlap_table
 
-        test = HeldOut(cameras=self.test_cameras, frames=_first_and_last(self.test_frames))
         try:
-            footage = read_footage(self.footage, cameras=self.cameras, test=test)
-            capture, overlaps = import_footage(footage, self.out, name=self.name, least_iou=self.least_iou)
+            capture, overlaps = import_footage(
+                self.footage,
+                self.out,
+                name=self.name,
+                cameras=self.cameras,
+                test_cameras=self.test_cameras,
+                test_frames=_first_and_last(self.test_frames),
+                least_iou=self.least_iou,
+            )
         except Problems as problems:
             return refuse_all(problems)
         print(overlap_table(overlaps))

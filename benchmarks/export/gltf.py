@@ -88,7 +88,7 @@ def _document(primitive: dict) -> dict:
     }
 
 
-COMPONENT_TYPES = {"float32": 5126, "uint32": 5125, "uint16": 5123}
+COMPONENT_TYPES = {"float32": 5126, "uint32": 5125}
 
 
 class GltfBuffer:

@@ -14,7 +14,6 @@ import re
 import shutil
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -48,90 +47,28 @@ NUMBERED = re.compile(r".*?(\d{1,9})\.(?:png|jpg|jpeg)", re.IGNORECASE)
 Files = dict[str, dict[int, Path]]  # by camera and frame
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class HeldOut:
-    """What no method may learn from. By default a quarter of the cameras, and of several sequences the last."""
-
-    cameras: tuple[str, ...] = ()  # held out; none: a quarter, 1 to 8
-    frames: tuple[int, int] | None = None  # from the first to before the second
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Footage:
-    """A folder whose small parts are read and whose files are listed."""
-
-    folder: Path
-    cameras: dict[str, Camera]
-    skeleton: Skeleton
-    template: TemplateMesh
-    motion: Motion
-    splits: dict[str, Split]
-    images: Files
-    masks: Files  # empty: the images have alpha
-
-    @property
-    def views(self) -> list[tuple[str, int]]:
-        """All (camera, frame) pairs that become images of the capture."""
-        return [view for split in self.splits.values() for view in split.views]
-
-
-def read_footage(folder: Path, *, cameras: Path | None = None, test: HeldOut | None = None) -> Footage:
-    """Read the small parts of a folder and list its pictures; none is opened.
-
-    `cameras`: the file of cameras, where it is not one of those that the folder is searched for.
-
-    Raises:
-        InputError: a part is missing or damaged, or its lengths are no metres.
-        Problems: cameras and pictures do not match, or pictures are missing.
-    """
-    skeleton = read_skeleton(folder / "skeleton.json")
-    joints = len(skeleton.names)
-    template = read_template(folder / "template.npz", joints=joints)
-    motion = read_motion(folder / "motion.npz", joints=joints)
-    rig = read_any_cameras(cameras or find_camera_file(folder))
-    _require_metres(folder, template, skeleton, motion, rig)
-    images, problems = _pictures(folder / "images", rig)
-    masks: Files = {}
-    if (folder / "masks").is_dir():
-        masks, more = _pictures(folder / "masks", rig)
-        problems += more
-    if problems:
-        raise Problems(problems)
-    frames = sorted(set().union(*images.values()))
-    if frames[-1] >= len(motion.dofs):
-        raise InputError(f"{folder}/images: frame {frames[-1]}, and motion.npz ends with {len(motion.dofs) - 1}")
-    splits = _splits(folder, list(rig), frames, motion, test or HeldOut())
-    footage = Footage(
-        folder=folder, cameras=rig, skeleton=skeleton, template=template, motion=motion, splits=splits,
-        images=images, masks=masks,
-    )  # fmt: skip
-    wanted: dict[str, list[int]] = {name: [] for name in rig}
-    for camera, frame in footage.views:
-        wanted[camera].append(frame)
-    for what, files in (("images", images), ("masks", masks)):
-        if not files:
-            continue
-        for name, frames in wanted.items():
-            if missing := [frame for frame in frames if frame not in files[name]]:
-                count = f"{len(missing)} of {len(frames)} frames are missing"
-                problems.append(f"{folder / what / name}: {count}, the first is {missing[0]}")
-    if problems:
-        raise Problems(problems)
-    return footage
-
-
 def import_footage(
-    footage: Footage, out: Path, *, name: str = "", least_iou: float = LEAST_IOU
+    folder: Path,
+    out: Path,
+    *,
+    name: str = "",
+    cameras: Path | None = None,
+    test_cameras: Sequence[str] = (),
+    test_frames: tuple[int, int] | None = None,
+    least_iou: float = LEAST_IOU,
 ) -> tuple[Capture, list[Overlap]]:
     """Write footage as a capture without truth into `out`, which appears when all of it is good.
 
-    `name`: of the scene, by default that of `out`; `least_iou`: what each camera's masks and the posed template must
-    reach, 0 to 1.
+    `name`: of the scene, by default that of `out`; `cameras`: their file, where it is not one of those that the folder
+    is searched for; `test_cameras`: held out, by default a quarter, 1 to 8; `test_frames`: held out, from the first to
+    before the second, by default those of the last sequence of several; `least_iou`: what each camera's masks and the
+    posed template must reach, 0 to 1.
 
     Raises:
-        InputError: `out` is not empty, or the name is not plain.
-        Problems: a picture is damaged or of another size, a mask is empty or full, or a camera's masks are elsewhere
-            than the template.
+        InputError: a part is missing or damaged, its lengths are no metres, `out` is not empty, or the name is not
+            plain.
+        Problems: cameras and pictures do not match, a picture is missing, damaged or of another size, a mask is empty
+            or full, or a camera's masks are elsewhere than the template.
     """
     out = out.resolve()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -140,23 +77,40 @@ def import_footage(
         scene = require_plain(name or out.name, what="scene")
     except ValueError as error:
         raise InputError(f"--name: {error}") from error
+    skeleton = read_skeleton(folder / "skeleton.json")
+    template = read_template(folder / "template.npz", joints=len(skeleton.names))
+    motion = read_motion(folder / "motion.npz", joints=len(skeleton.names))
+    rig = read_any_cameras(cameras or find_camera_file(folder))
+    _require_metres(folder, template, skeleton, motion, rig)
+    kinds = ("images", "masks") if (folder / "masks").is_dir() else ("images",)
+    files = _pictures(folder, kinds, rig)
+    frames = sorted(set().union(*files["images"].values()))
+    if frames[-1] >= len(motion.dofs):
+        raise InputError(f"{folder}/images: frame {frames[-1]}, and motion.npz ends with {len(motion.dofs) - 1}")
+    splits = _splits(folder, list(rig), frames, motion, test_cameras, test_frames)
+    _require_complete(folder, files, splits)
     out.parent.mkdir(parents=True, exist_ok=True)
     made = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name[:40]}."))
     try:
         problems = []
-        for camera, frame in footage.views:
+        for camera, frame in (view for split in splits.values() for view in split.views):
             try:
-                write_image(image_path(made, camera, frame), _rgba(footage, camera, frame))
+                paths = [files[kind][camera][frame] for kind in kinds]
+                write_image(image_path(made, camera, frame), _rgba(paths, rig[camera]))
             except InputError as error:
                 problems.append(str(error))
         if problems:
             raise Problems(problems)
-        _write_parts(footage, made, scene)
+        write_cameras(made / "cameras.json", list(rig.values()))
+        write_skeleton(made / "skeleton.json", skeleton)
+        write_template(made / "template.npz", template)
+        write_motion(made / "motion.npz", motion)
+        _write_manifest(made, scene, motion, splits)
         overlaps = template_overlaps(load_capture(made))
         if apart := [row for row in overlaps if row.iou < least_iou]:
             raise Problems(
                 [
-                    f"{footage.folder}: camera {row.camera}: masks and posed template overlap by {row.iou:.2f} (IoU),"
+                    f"{folder}: camera {row.camera}: masks and posed template overlap by {row.iou:.2f} (IoU),"
                     f" expected {least_iou:g} or more: do its name, axes, units and frame numbers fit?"
                     for row in apart
                 ]
@@ -168,16 +122,10 @@ def import_footage(
     return load_capture(out), overlaps
 
 
-def _write_parts(footage: Footage, folder: Path, scene: str) -> None:
-    """Everything of a capture but its images, the manifest last."""
-    write_cameras(folder / "cameras.json", list(footage.cameras.values()))
-    write_skeleton(folder / "skeleton.json", footage.skeleton)
-    write_template(folder / "template.npz", footage.template)
-    write_motion(folder / "motion.npz", footage.motion)
-    splits, files, novelty = footage.splits, hash_files(folder), None
+def _write_manifest(folder: Path, scene: str, motion: Motion, splits: dict[str, Split]) -> None:
+    files, novelty = hash_files(folder), None
     if "novel_pose" in splits:
-        far = novelty_deg(footage.motion, train=splits["train"].frames, test=splits["novel_pose"].frames)
-        novelty = float(np.mean(far))
+        novelty = float(np.mean(novelty_deg(motion, train=splits["train"].frames, test=splits["novel_pose"].frames)))
     source = f"imported {hash_of(files)[:16]}"  # Tells captures apart that no scene describes.
     Manifest(scene=scene, seed=0, splits=splits, files=files, source=source, pose_novelty_deg=novelty).write(folder)
 
@@ -202,50 +150,79 @@ def _require_metres(
             raise InputError(f"{folder}: {what} {value:.4g} units, expected metres, {least:g} to {most:g}{guess}")
 
 
-def _pictures(folder: Path, cameras: dict[str, Camera]) -> tuple[Files, list[str]]:
-    """The pictures below a folder by camera and frame, and a line for each thing that does not fit."""
-    if not folder.is_dir():
-        raise InputError(f"{folder}: expected a folder with a folder of pictures for each camera")
-    folders = sorted(entry.name for entry in os.scandir(folder) if entry.is_dir())
-    problems = [f"{folder / name}: no camera is called so, expected {', '.join(cameras):.200}"
-                for name in folders if name not in cameras]  # fmt: skip
-    problems += [f"{folder / name}: camera {name} has no folder of pictures" for name in cameras if name not in folders]
-    files: Files = {}
-    for name in sorted(set(folders) & set(cameras)):
-        files[name] = {}
-        for count, entry in enumerate(sorted(os.scandir(folder / name), key=lambda entry: entry.name)):
-            if count == MOST_FILES:
-                raise InputError(f"{folder / name}: more than {MOST_FILES} files")
-            matched = NUMBERED.fullmatch(entry.name)
-            if matched is None:
-                problems.append(f"{entry.path}: expected a .png or .jpg whose name ends with the frame's number")
-            elif (frame := int(matched[1])) in files[name]:
-                problems.append(f"{entry.path}: frame {frame} is also {files[name][frame].name}")
-            else:
-                files[name][frame] = Path(entry.path)
-        if not files[name]:
-            problems.append(f"{folder / name}: no pictures")
-    return files, problems
+def _pictures(folder: Path, kinds: Sequence[str], cameras: dict[str, Camera]) -> dict[str, Files]:
+    """The pictures of each kind by camera and frame; `Problems` has a line for each thing that does not fit."""
+    files: dict[str, Files] = {kind: {name: {} for name in cameras} for kind in kinds}
+    problems = []
+    for kind in kinds:
+        place = folder / kind
+        if not place.is_dir():
+            raise InputError(f"{place}: expected a folder with a folder of pictures for each camera")
+        for name in sorted({entry.name for entry in os.scandir(place) if entry.is_dir()} | set(cameras)):
+            if name not in cameras:
+                problems.append(f"{place / name}: no camera is called so, expected {', '.join(cameras):.200}")
+                continue
+            if not (place / name).is_dir():
+                problems.append(f"{place / name}: camera {name} has no folder of pictures")
+                continue
+            listed = files[kind][name]
+            for count, entry in enumerate(sorted(os.scandir(place / name), key=lambda entry: entry.name)):
+                if count == MOST_FILES:
+                    raise InputError(f"{place / name}: more than {MOST_FILES} files")
+                matched = NUMBERED.fullmatch(entry.name)
+                if matched is None:
+                    problems.append(f"{entry.path}: expected a .png or .jpg whose name ends with the frame's number")
+                elif (frame := int(matched[1])) in listed:
+                    problems.append(f"{entry.path}: frame {frame} is also {listed[frame].name}")
+                else:
+                    listed[frame] = Path(entry.path)
+            if not listed:
+                problems.append(f"{place / name}: no pictures")
+    if problems:
+        raise Problems(problems)
+    return files
 
 
-def _splits(folder: Path, cameras: list[str], frames: list[int], motion: Motion, test: HeldOut) -> dict[str, Split]:
+def _require_complete(folder: Path, files: dict[str, Files], splits: dict[str, Split]) -> None:
+    """Refuse missing pictures, with a line per camera."""
+    wanted: dict[str, list[int]] = {}
+    for camera, frame in (view for split in splits.values() for view in split.views):
+        wanted.setdefault(camera, []).append(frame)
+    problems = []
+    for kind, listed in files.items():
+        for name, frames in wanted.items():
+            if missing := [frame for frame in frames if frame not in listed[name]]:
+                count = f"{len(missing)} of {len(frames)} frames are missing"
+                problems.append(f"{folder / kind / name}: {count}, the first is {missing[0]}")
+    if problems:
+        raise Problems(problems)
+
+
+def _splits(
+    folder: Path,
+    cameras: list[str],
+    frames: list[int],
+    motion: Motion,
+    test_cameras: Sequence[str],
+    test_frames: tuple[int, int] | None,
+) -> dict[str, Split]:
     """Training cameras in training frames; held-out cameras in those, and in test frames, which come last."""
-    if unknown := sorted(set(test.cameras) - set(cameras)):
+    if unknown := sorted(set(test_cameras) - set(cameras)):
         raise InputError(f"test cameras: no camera {unknown[0]}, expected some of {', '.join(cameras):.200}")
     count = min(max(1, len(cameras) // 4), 8) if len(cameras) > 1 else 0
-    held = tuple(dict.fromkeys(test.cameras)) or tuple(
+    held = tuple(dict.fromkeys(test_cameras)) or tuple(
         cameras[int(len(cameras) / count * (k + 0.5))] for k in range(count)
     )
     shown = tuple(name for name in cameras if name not in held)
     last = int(motion.sequence[frames[-1]])
-    if test.frames is not None:
-        tested = tuple(frame for frame in frames if test.frames[0] <= frame < test.frames[1])
+    if test_frames is not None:
+        tested = tuple(frame for frame in frames if test_frames[0] <= frame < test_frames[1])
     elif last != int(motion.sequence[frames[0]]):
         tested = tuple(frame for frame in frames if motion.sequence[frame] == last)
     else:
         tested = ()
     train = tuple(frame for frame in frames if frame not in set(tested))
-    if not shown or not train or (test.frames is not None and not tested):
+    if not shown or not train or (test_frames is not None and not tested):
         raise InputError(
             f"{folder}: expected frames and cameras to train on besides those to test on, and frames there"
         )
@@ -259,15 +236,14 @@ def _splits(folder: Path, cameras: list[str], frames: list[int], motion: Motion,
     return splits
 
 
-def _rgba(footage: Footage, camera: str, frame: int) -> np.ndarray:
-    """A view as uint8 `[h, w, 4]`, straight alpha."""
-    path, by = footage.images[camera][frame], footage.cameras[camera]
-    if not footage.masks:
-        rgba = _read(path, by, ("RGBA",), "with alpha, as there is no folder masks")
+def _rgba(paths: Sequence[Path], camera: Camera) -> np.ndarray:
+    """A view from its picture and, where it has no alpha, its mask: uint8 `[h, w, 4]`, straight alpha."""
+    path = paths[-1]
+    if len(paths) == 1:
+        rgba = _read(path, camera, ("RGBA",), "with alpha, as there is no folder masks")
     else:
-        colour = _read(path, by, ("RGB", "RGBA"), "in colour")[..., :3]
-        path = footage.masks[camera][frame]
-        rgba = np.dstack([colour, _read(path, by, ("L", "1", "P", "RGB"), "in grey")])
+        colour = _read(paths[0], camera, ("RGB", "RGBA"), "in colour")[..., :3]
+        rgba = np.dstack([colour, _read(path, camera, ("L", "1", "P", "RGB"), "in grey")])
     mask = rgba[..., 3] > 127
     if mask.all() or not mask.any():
         most = int(rgba[..., 3].max())

@@ -107,8 +107,6 @@ def open_server(options: AuthOptions, *, label: str) -> tuple[viser.ViserServer,
     port = server.get_port()
     auth.origins = frozenset({*_own_origins(options.host, port), *options.allow_origins})
     inner = server._websock_server
-    for kind in [kind for kind in inner._incoming_handlers if kind not in ALLOWED_MESSAGES]:
-        inner.unregister_handler(kind)
     _drop_other_messages(inner)
     inner.on_client_connect(_drop_other_messages)
     shown = "127.0.0.1" if options.host in ANY_ADDRESS else options.host
@@ -186,8 +184,7 @@ def respond(auth: Auth, connection: Any, request: Request, page: Callable[[Any, 
     if reason is not None:
         return _plain(http.HTTPStatus.FORBIDDEN, reason)
     if _is_websocket(request):
-        is_full = auth.connected >= auth.options.clients
-        return _plain(http.HTTPStatus.SERVICE_UNAVAILABLE, "too many viewers") if is_full else None
+        return None
     url = urlsplit(request.path)
     if url.path != "/":
         return _plain(http.HTTPStatus.NOT_FOUND, "there is one page: /")

@@ -7,7 +7,6 @@
 `docs/draw_a_frame.py` does this, with a motion from a file if one is given.
 """
 
-import math
 import tempfile
 import weakref
 from collections import OrderedDict
@@ -19,25 +18,22 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ash.avatar import AshAvatar
 from ash.capture.dataset import Camera, Capture, Motion, Pose
 from ash.capture.formats import load_capture
 from ash.files import InputError, link_or_copy
 from ash.gaussians.gaussians import Gaussians
-from ash.gaussians.splatting import Splatted, splat
+from ash.gaussians.splatting import splat
 from ash.model import image_of, views_of
-from ash.protocol import Avatar, PosedGeometry, PosesGaussians, StageClock
+from ash.protocol import Avatar, PosesGaussians, StageClock
 from benchmarks.analysis.style import style_of
+from benchmarks.cell import metrics
 from benchmarks.cell.registry import is_oracle
 from benchmarks.cell.run import load_avatar as open_avatar
 from benchmarks.cell.schema import CHECKPOINT, Cell, is_trained, read_cell
 from benchmarks.play.motions import motion_clip
 from benchmarks.suites.runs import RUN_FILE, read_run
 
-Colour = tuple[int, int, int]  # 0 to 255
-
 CACHED_POSES = 48  # A short motion that is repeated, or a camera that turns, decodes nothing twice.
-NOT_FINITE = "the rendered image holds NaN or infinity"
 
 
 class LoadedAvatar:
@@ -80,60 +76,28 @@ class LoadedAvatar:
         return np.rint(np.clip(straight, 0, 1) * 255).astype(np.uint8)
 
     @torch.no_grad()
-    def premultiplied(self, pose: Pose, camera: Camera, clock: StageClock) -> np.ndarray:
-        """The picture that is scored: premultiplied RGBA, float32 `[h, w, 4]`."""
-        if not isinstance(self.avatar, PosesGaussians):
-            return self.avatar.render(pose, camera, clock=clock)
-        gaussians = self._gaussians(pose, clock)
-        with clock.stage("stg4"):
-            return image_of(self._splat(gaussians, camera, None))
+    def on_black(self, pose: Pose, camera: Camera) -> np.ndarray:
+        """The picture that is scored: on black, uint8 `[h, w, 4]`.
 
-    @torch.no_grad()
-    def on_colour(self, pose: Pose, camera: Camera, clock: StageClock, background: Colour) -> np.ndarray:
-        """The picture over a colour, uint8 `[h, w, 3]`, at less cost than the one that is scored."""
-        if not isinstance(self.avatar, PosesGaussians):
-            return composite(self.premultiplied(pose, camera, clock), background)
-        gaussians = self._gaussians(pose, clock)
-        with clock.stage("stg4"):
-            rgb = self._splat(gaussians, camera, torch.tensor(background) / 255).rgb[0]
-            if not math.isfinite(float(rgb.sum())):
-                raise FloatingPointError(NOT_FINITE)
-            return rgb.mul_(255).add_(0.5).clamp_(0, 255).to(torch.uint8).cpu().numpy()
+        Raises:
+            FloatingPointError: a value is NaN or infinite.
+        """
+        avatar = self.avatar
+        if not isinstance(avatar, PosesGaussians):
+            return metrics.quantise(avatar.render(pose, camera, clock=StageClock()))
+        threads = torch.get_num_threads()
+        drawn = splat(self._gaussians(pose), **views_of([camera]), dilation=avatar.dilation, threads=threads)
+        return metrics.quantise(image_of(drawn))
 
-    def template(self, pose: Pose) -> np.ndarray | None:
-        """The posed template `[v, 3]` metres, of an avatar that has one."""
-        vertices = self.avatar.template_vertices(pose) if isinstance(self.avatar, PosedGeometry) else ()
-        return np.asarray(vertices) if len(vertices) else None
-
-    def _gaussians(self, pose: Pose, clock: StageClock) -> Gaussians:
+    def _gaussians(self, pose: Pose) -> Gaussians:
         assert isinstance(self.avatar, PosesGaussians)
         key = (pose.motion.dofs[pose.window(8)].tobytes(), pose.frame)
         if key not in self._cache:
-            if isinstance(self.avatar, AshAvatar):
-                self._cache[key] = self.avatar.gaussians(pose, clock=clock)
-            else:
-                self._cache[key] = self.avatar.gaussians(pose)
+            self._cache[key] = self.avatar.gaussians(pose)
             if len(self._cache) > CACHED_POSES:
                 self._cache.popitem(last=False)
         self._cache.move_to_end(key)
         return self._cache[key]
-
-    def _splat(self, gaussians: Gaussians, camera: Camera, background: torch.Tensor | None) -> Splatted:
-        assert isinstance(self.avatar, PosesGaussians)
-        options = {**views_of([camera]), "dilation": self.avatar.dilation, "threads": torch.get_num_threads()}
-        return splat(gaussians, background=background, **options)
-
-
-def composite(premultiplied: np.ndarray, background: Colour) -> np.ndarray:
-    """A picture, float premultiplied RGBA, over a colour: uint8 `[h, w, 3]`.
-
-    Raises:
-        FloatingPointError: a value is NaN or infinite.
-    """
-    if not np.isfinite(premultiplied).all():
-        raise FloatingPointError(NOT_FINITE)
-    rgb = 255 * premultiplied[..., :3] + (1 - premultiplied[..., 3:]) * np.array(background, dtype=np.float32)
-    return np.clip(rgb + 0.5, 0, 255).astype(np.uint8)
 
 
 def load_avatar(folder: Path | str, *, trust: bool = False) -> LoadedAvatar:

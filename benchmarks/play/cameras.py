@@ -1,6 +1,6 @@
 """Cameras beside a capture's own: a browser's viewpoint, the paper's spiral around the person, other image sizes."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,29 +12,7 @@ from synth.camera.rig import look_at
 FREE, SPIRAL, RIG = "free", "spiral", "rig"
 SPIRAL_RISE = 0.35  # of its distance: how far the spiral's camera goes up and down
 SPIRAL_STEPS = 96  # of one turn
-SPIRAL_STEPS_PER_SECOND = 12.0  # in the player
 START = (0.25, 0.12, 0.96)  # direction from the person's middle to a new viewer, nearly of length 1
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Viewpoint:
-    """The camera of a browser, and the size of its window."""
-
-    viewmat: np.ndarray  # [4, 4] world to camera, OpenCV axes
-    fov: float  # radians, from bottom to top
-    width: int  # pixels
-    height: int
-
-    @property
-    def position(self) -> np.ndarray:
-        """Optical centre, `[3]` metres."""
-        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
-
-    def camera(self, *, width: int, height: int) -> Camera:
-        """The same view in other pixels of the same shape."""
-        focal = height / 2 / np.tan(self.fov / 2)
-        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-        return Camera(name=FREE, width=width, height=height, K=K, viewmat=self.viewmat)
 
 
 def resized(camera: Camera, *, width: int, height: int) -> Camera:
@@ -73,12 +51,7 @@ def camera_distance(capture: Capture) -> float:
     return float(np.linalg.norm(first_camera(capture).position - middle_of(capture)))
 
 
-def start_position(capture: Capture) -> np.ndarray:
-    """Where a new viewer stands, `[3]` metres: in front of the person, as far away as the first camera."""
-    return middle_of(capture) + camera_distance(capture) * np.array(START)
-
-
-def spiral_camera(capture: Capture, step: float, *, width: int, height: int) -> Camera:
+def spiral_camera(capture: Capture, step: int, *, width: int, height: int) -> Camera:
     """Camera number `step` of the spiral: once around the person in `SPIRAL_STEPS`, up and down at half that rate.
 
     It has the distance and the field of view of the capture's first camera.

@@ -1,11 +1,10 @@
 """Motions that an avatar can be played through: its capture's, generated ones, and those of files."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ash.capture.dataset import Capture, Motion
 from ash.files import InputError
@@ -23,12 +22,6 @@ CAPTURED = {
 }
 GENERATED_SECONDS, GENERATED_SEED = 5.0, 7  # another walk than that of any capture
 MAX_FRAMES = 20_000  # of a file: half an hour
-
-
-EULER = "XZY"  # Intrinsic turns of a joint's rotation, about the axes of its parent at rest: x left, y up, z front.
-EULER_DEG = (180.0, 90.0, 180.0)  # either way
-
-Angles = tuple[float, float, float]  # degrees, in the order of EULER
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -121,18 +114,3 @@ def frames_in(clip: MotionClip, text: str | None) -> tuple[int, ...]:
     if not 0 <= start < stop <= len(clip):
         raise InputError(f"frames: expected A:B within 0:{len(clip)}, got {text}")
     return clip.frames[start:stop]
-
-
-def angles_of(motion: Motion, frame: int, joint: int) -> Angles:
-    """The angles of a joint in a frame."""
-    rotation = Rotation.from_rotvec(motion.dofs[frame, 3 + 3 * joint : 6 + 3 * joint])
-    x, z, y = rotation.as_euler(EULER, degrees=True).tolist()
-    return x, z, y
-
-
-def with_angles(motion: Motion, angles: Mapping[int, Angles]) -> Motion:
-    """The motion with joints (joint -> angles) fixed in all frames."""
-    dofs = motion.dofs.copy()
-    for joint, degrees in angles.items():
-        dofs[:, 3 + 3 * joint : 6 + 3 * joint] = Rotation.from_euler(EULER, degrees, degrees=True).as_rotvec()
-    return replace(motion, dofs=dofs)

@@ -13,17 +13,7 @@ import viser._messages as messages
 from scipy.spatial.transform import Rotation
 
 from ash.capture.dataset import Camera, Capture
-from benchmarks.play.cameras import (
-    FREE,
-    SPIRAL,
-    Viewpoint,
-    distance_between,
-    fov_of,
-    middle_of,
-    resized,
-    start_position,
-)
-from benchmarks.play.motions import EULER, EULER_DEG, Angles, angles_of
+from benchmarks.play.cameras import FREE, distance_between, fov_of, middle_of, resized
 from benchmarks.play.rendering import NOTHING, TRUTH, RenderedView, ViewRenderer, ViewState
 from benchmarks.play.viewer import Viewer, may_be_closed
 
@@ -31,29 +21,25 @@ NUMBERS_SECONDS = 0.3  # between two changes of the line of numbers, so that it 
 SPEEDS = {"1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0}
 SETTLE_SECONDS = 0.6  # after a jump, in which the browser may still report its old camera
 SAME_M, SAME_RAD = 0.01, 0.01  # errors of a browser's numbers
-NARROW = 0.75  # width by height
-NO_JOINT = "(choose a joint)"
 BACK, TOGGLE, AHEAD = "◀", "Play / pause", "▶"
 
 LABEL = "ash-bench play"
 SCRIPT = Path(__file__).with_name("page.js")
 
 HELP = """\
-**Look around**: drag to turn, right-drag or two fingers to move, wheel or pinch to come closer.
+**Look around**: drag to turn, right-drag to move, wheel to come closer.
 
 **Keys**: space plays and pauses, ← and → go frame by frame, M is the next avatar, C the next camera, T the truth \
-beside it, E the error, \
-D dark, L light.
+beside it, E the error.
 
 **What you see** is an avatar that learned from films of a synthetic person. It is given only a pose and a camera. \
-Because the person is synthetic, the *truth* is known too: put it beside the avatar under *Compare*, for any pose and \
-from any side.
+Because the person is synthetic, the *truth* is known too: put it beside the avatar under *Compare*, for any motion \
+and from any side.
 
 **Numbers**: the error against the truth in dB (higher is better) and as FLIP (lower is better); the picture's size, \
-and how many milliseconds it took. Of these, Stg.1 poses the template mesh, Stg.2 draws what the networks see of it, \
-Stg.3 decodes the Gaussians, Stg.4 splats them. Poses seen before need Stg.4 alone.
+and how many milliseconds it took.
 
-**While you move**, the picture is coarser, so that it stays smooth; it is sharp again once you let go.
+**While something moves**, the picture is coarser, so that it stays smooth; it is sharp again once all stands still.
 """
 
 
@@ -66,11 +52,9 @@ class Page:
         self._clips, self._capture = renderer.clips, renderer.avatars.capture
         self._client, self._gui = viewer.client, viewer.client.gui
         self._numbers_at = 0.0  # when the line of numbers changed
-        self._angles_of: tuple[int | None, int, int] = (None, 0, 0)  # joint, clip and step of the sliders' angles
         self._build()
-        constants = f"const LABEL = {json.dumps(LABEL)}, DIVIDER = {json.dumps(self._divider._impl.uuid)};\n"
-        script = messages.RunJavascriptMessage(constants + SCRIPT.read_text())
-        self._client._websock_connection.queue_message(script)
+        script = f"const LABEL = {json.dumps(LABEL)};\n{SCRIPT.read_text()}"
+        self._client._websock_connection.queue_message(messages.RunJavascriptMessage(script))
         viewer.show = self.show
         self.cameras = CameraControl(viewer, self._capture, self._select_camera)
 
@@ -80,20 +64,15 @@ class Page:
     def _build(self) -> None:
         self._title = self._gui.add_markdown(self._headline(self.viewer.state, ""))
         self._numbers = self._gui.add_markdown("*loading the avatar ...*")
-        self._divider = self._gui.add_slider(
-            "Divider", 0.0, 1.0, 0.002, 0.5, hint="Or drag the line in the picture.", visible=False
-        )
+        self._divider = self._gui.add_slider("Divider", 0.0, 1.0, 0.002, 0.5, visible=False)
         self._sets(self._divider, "divider", float)
         tabs = self._gui.add_tab_group()
-        for name, build in (
-            ("Motion", self._build_motion),
-            ("Compare", self._build_compare),
-            ("Pose", self._build_pose),
-            ("View", self._build_view),
-            ("Help", lambda: self._gui.add_markdown(HELP)),
-        ):
-            with tabs.add_tab(name):
-                build()
+        with tabs.add_tab("Motion"):
+            self._build_motion()
+        with tabs.add_tab("Compare"):
+            self._build_compare()
+        with tabs.add_tab("Help"):
+            self._gui.add_markdown(HELP)
         self._build_keys()
 
     def _build_motion(self) -> None:
@@ -109,16 +88,14 @@ class Page:
         hint = "1 is as fast as it was recorded."
         speed = self._gui.add_dropdown("Speed", list(SPEEDS), initial_value="1", hint=hint)
         self._sets(speed, "speed", lambda value: SPEEDS[str(value)])
-        loop = self._gui.add_checkbox("Again and again", state.loop, hint="Begin anew at the end of the motion.")
-        self._sets(loop, "loop", bool)
-        hint = "Yours, the paper's spiral around the person, or one of the capture's. Key: C"
+        hint = "Yours, or one of the capture's. Key: C"
         self._camera = self._gui.add_dropdown("Camera", self._camera_names(), initial_value=FREE, hint=hint)
         self._on(self._camera, lambda value: self.cameras.jump(str(value)))
 
     def _camera_names(self) -> list[str]:
         """Novel-view cameras first: the truth of novel poses is known for them."""
         training = self._capture.splits["train"].cameras
-        return [FREE, SPIRAL, *sorted(self._capture.cameras, key=lambda name: name in training)]
+        return [FREE, *sorted(self._capture.cameras, key=lambda name: name in training)]
 
     def _build_compare(self) -> None:
         titles, left = list(self._renderer.avatars.titles), self.viewer.state.left
@@ -133,35 +110,7 @@ class Page:
         self._on(self._error, lambda value: self._show_error(bool(value)))
         hint = "Path-traces this pose from this side; takes some seconds."
         self._gui.add_button("Render truth here", hint=hint).on_click(lambda _: self._ask_truth())
-        self._progress = self._gui.add_progress_bar(0, visible=False, animated=True)
         self._truth_message = self._gui.add_markdown("")
-
-    def _build_pose(self) -> None:
-        hint = "Hold a joint as you like, and see whether the avatar bears it; the others go on moving."
-        self._gui.add_markdown(hint)
-        self._joint_names = [name.replace("_", " ") for name in self._capture.skeleton.names]
-        choices, hint = [NO_JOINT, *self._joint_names], "Joints that you hold are marked in the skeleton."
-        self._joint = self._gui.add_dropdown("Joint", choices, initial_value=NO_JOINT, hint=hint)
-        self._on(self._joint, lambda _: self._choose_joint())
-        self._sliders = []
-        hint = "Degrees about an axis of the resting person: x to the left, y up, z to the front."
-        for number, (axis, most) in enumerate(zip(EULER.lower(), EULER_DEG, strict=True)):
-            slider = self._gui.add_slider(f"About {axis}", -most, most, 0.5, 0.0, visible=False, hint=hint)
-            self._on(slider, lambda value, number=number: self._turn(number, float(value)))
-            self._sliders.append(slider)
-        self._reset_joint = self._gui.add_button("Reset this joint", visible=False)
-        self._reset_joint.on_click(lambda _: self._reset(self._joint_index()))
-        self._gui.add_button("Reset all joints").on_click(lambda _: self._reset(None))
-
-    def _build_view(self) -> None:
-        for name, label, hint in (
-            ("mesh", "Template mesh", "The surface that carries the Gaussians."),
-            ("skeleton", "Skeleton", "The joints that the pose turns."),
-        ):
-            self._sets(self._gui.add_checkbox(label, False, hint=hint), name, bool)
-        hint = "Page and background; at first as your system has it. Keys: D and L"
-        self._dark = self._gui.add_checkbox("Dark", False, hint=hint)
-        self._on(self._dark, lambda value: self._darken(bool(value)))
 
     def _build_keys(self) -> None:
         titles = list(self._renderer.avatars.titles)
@@ -172,8 +121,6 @@ class Page:
             ("Next avatar", "M", lambda: self._next(self._left, titles, lambda value: self._set(left=value))),
             ("Next camera", "C", lambda: self._next(self._camera, self._camera_names(), self.cameras.jump)),
             ("Truth beside it", "T", lambda: self._next(self._right, [NOTHING, TRUTH], self._choose_right)),
-            ("Dark", "D", lambda: self._darken(True)),
-            ("Light", "L", lambda: self._darken(False)),
             ("Error", "E", lambda: self._show_error(not self.viewer.state.error)),
         ):
             command = self._gui.add_command(label, hotkey=key)  # type: ignore[arg-type]
@@ -204,12 +151,10 @@ class Page:
 
     def _press(self, button: str) -> None:
         def pressed(state: ViewState) -> ViewState:
-            length = len(self._clips[state.clip])
             if button == TOGGLE:
-                restart = not state.playing and not state.loop and state.step == length - 1
-                return replace(state, playing=not state.playing, step=0 if restart else state.step)
-            moved = replace(state, playing=False, loop=True).advanced(1 if button == AHEAD else -1, length)
-            return replace(moved, loop=state.loop)
+                return replace(state, playing=not state.playing)
+            step = (state.step + (1 if button == AHEAD else -1)) % len(self._clips[state.clip])
+            return replace(state, playing=False, step=step)
 
         self.viewer.change(pressed)
 
@@ -225,43 +170,9 @@ class Page:
         if self._camera.value != name:
             self._camera.value = name
 
-    def _joint_index(self) -> int | None:
-        return None if self._joint.value == NO_JOINT else self._joint_names.index(self._joint.value)
-
-    def _choose_joint(self) -> None:
-        for control in (self._reset_joint, *self._sliders):
-            control.visible = self._joint_index() is not None
-        self._show_angles(self.viewer.state)
-
-    def _show_angles(self, state: ViewState) -> None:
-        """Set the sliders to the chosen joint's angles."""
-        joint = self._joint_index()
-        for slider, angle in zip(self._sliders, self._angles(state, joint) if joint is not None else (), strict=False):
-            slider.value = angle
-        self._angles_of = joint, state.clip, state.step
-
-    def _angles(self, state: ViewState, joint: int) -> Angles:
-        """The angles that the viewer gave a joint, or those of the motion."""
-        clip = self._clips[state.clip]
-        return dict(state.turned).get(joint) or angles_of(clip.motion, clip.frames[state.step], joint)
-
-    def _turn(self, number: int, degrees: float) -> None:
-        joint = self._joint_index()
-        if joint is not None:
-            x, z, y = (degrees if i == number else a for i, a in enumerate(self._angles(self.viewer.state, joint)))
-            self.viewer.change(lambda state: state.with_joint(joint, (x, z, y)))
-
-    def _reset(self, joint: int | None) -> None:
-        self._show_angles(self.viewer.change(lambda state: state.without_joint(joint)))
-
     def _show_error(self, wanted: bool) -> None:
         self._error.value = wanted
         self._set(error=wanted)
-
-    def _darken(self, dark: bool) -> None:
-        self._dark.value = dark
-        self._gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False)
-        self._set(dark=dark)
 
     def _ask_truth(self) -> None:
         """Render the truth of what is seen, and put it beside the avatar."""
@@ -273,11 +184,9 @@ class Page:
     # ---------------------------------------------------------------------------------------------------------------
     # What the page says
 
-    def show_truth_progress(self, message: str, share: float | None) -> None:
-        """How far a picture of the truth is; None: it came or failed."""
+    def say_of_truth(self, message: str) -> None:
+        """Say what became of a picture of the truth."""
         with may_be_closed(self._client):
-            self._progress.visible = share is not None
-            self._progress.value = 100 * (share or 0.0)
             self._truth_message.content = message
 
     def show(self, state: ViewState, drawn: RenderedView | None, message: str) -> None:
@@ -291,10 +200,6 @@ class Page:
             self._numbers_at = now
             self._title.content = self._headline(state, drawn.score)
             self._numbers.content = _escaped(message) + (f"\n\n{drawn.note}" if drawn.note else "")
-        joint = self._joint_index()
-        is_new = self._angles_of != (joint, state.clip, state.step)
-        if not state.playing and is_new and joint not in dict(state.turned):
-            self._show_angles(state)
 
     def _headline(self, state: ViewState, score: str) -> str:
         clip = self._clips[state.clip]
@@ -321,14 +226,9 @@ class CameraControl:
         self._client.camera.on_update(self._moved)
         first = viewpoint_of(self._client.camera)  # Sent before anybody listened; it may never be sent again.
         viewer.change(lambda state: replace(state, viewpoint=state.viewpoint or first))
-        if first is not None and first.width < NARROW * first.height:  # The arms stay in a narrow picture.
-            middle, start = middle_of(capture), start_position(capture)
-            with self._client.atomic():
-                self._client.camera.position = middle + (start - middle) * NARROW * first.height / first.width
-                self._client.camera.look_at = middle
 
     def jump(self, name: str) -> None:
-        """Look through one of the capture's cameras, follow the spiral, or look around freely from here."""
+        """Look through one of the capture's cameras, or look around freely from here."""
         own, window = self._capture.cameras.get(name), self._viewer.state.viewpoint
         if own is not None and window is not None:
             self._place_browser(resized(own, width=window.width, height=window.height))
@@ -355,7 +255,7 @@ class CameraControl:
         state = self._viewer.change(lambda s: replace(s, viewpoint=now, camera=s.camera if stays else FREE))
         self._on_choice(state.camera)
 
-    def _is_where_it_jumped(self, now: Viewpoint) -> bool:
+    def _is_where_it_jumped(self, now: Camera) -> bool:
         if self._jumped is None or self._viewer.state.camera not in self._capture.cameras:
             return False
         when, viewmat = self._jumped
@@ -363,14 +263,16 @@ class CameraControl:
         return time.perf_counter() - when < SETTLE_SECONDS or (moved < SAME_M and turned < SAME_RAD)
 
 
-def viewpoint_of(camera: viser.CameraHandle) -> Viewpoint | None:
-    """The view of a browser's camera; None for numbers that no camera has."""
+def viewpoint_of(camera: viser.CameraHandle) -> Camera | None:
+    """A browser's camera, in pixels of its window; None for numbers that no camera has."""
     if camera.image_width < 16 or camera.image_height < 16 or not 0.01 < camera.fov < 3.0:
         return None
     if not (np.isfinite(camera.position).all() and np.isfinite(camera.wxyz).all() and np.linalg.norm(camera.wxyz) > 0):
         return None
-    rotation = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix().T
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ camera.position
     width, height = min(int(camera.image_width), 8192), min(int(camera.image_height), 8192)
-    return Viewpoint(viewmat=viewmat, fov=float(camera.fov), width=width, height=height)
+    focal = height / 2 / np.tan(camera.fov / 2)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix().T
+    viewmat[:3, 3] = -viewmat[:3, :3] @ camera.position
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    return Camera(name=FREE, width=width, height=height, K=K, viewmat=viewmat)

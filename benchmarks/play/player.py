@@ -11,19 +11,18 @@ import numpy as np
 import torch
 import viser
 
-from benchmarks.cell import metrics
+from ash.files import InputError
 from benchmarks.play.auth import AuthOptions, close_server, open_server
 from benchmarks.play.avatars import AvatarSet, open_avatars
-from benchmarks.play.cameras import first_camera, fov_of, middle_of, start_position
+from benchmarks.play.cameras import START, camera_distance, first_camera, fov_of, middle_of, resized
 from benchmarks.play.motions import first_clip, motion_clips
 from benchmarks.play.page import LABEL, Page
 from benchmarks.play.rendering import ViewRenderer, ViewState
-from benchmarks.play.truth import TruthCache, TruthPicture, TruthRenderer, TruthRequest
+from benchmarks.play.truth import TruthCache, TruthPicture, TruthRenderer
 from benchmarks.play.viewer import DrawingThread, Viewer
 from benchmarks.provenance import cores
 
 TRUTH_PIXELS = 384 * 384  # of a rendered truth: some seconds on two cores
-PROGRESS = {"starting the renderer": 0.1, "posing the body and its clothes": 0.3, "tracing light": 0.6}
 
 
 class PlayServer:
@@ -37,8 +36,8 @@ class PlayServer:
         self.pages: dict[int, Page] = {}
         self._lock = threading.Lock()
         self.server, self.url, self.auth = open_server(options, label=LABEL)
-        start = self.server.initial_camera
-        start.position, start.look_at = start_position(avatars.capture), middle_of(avatars.capture)
+        start, middle = self.server.initial_camera, middle_of(avatars.capture)
+        start.position, start.look_at = middle + camera_distance(avatars.capture) * np.array(START), middle
         start.up, start.fov = np.array([0.0, 1.0, 0.0]), fov_of(first_camera(avatars.capture))
         self.server.scene.set_up_direction("+y")
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -71,27 +70,27 @@ class PlayServer:
         state, page = viewer.state, self.pages.get(viewer.client.client_id)
         if state.viewpoint is None or page is None:
             return ""
+        if self._truth_renderer.is_busy:
+            return "Another truth is being rendered; try again in a moment."
+        seen = self.renderer.camera(state)
         window = state.viewpoint
         shrink = min(1.0, (TRUTH_PIXELS / (window.width * window.height)) ** 0.5)
-        size = {"width": round(shrink * window.width), "height": round(shrink * window.height)}
-        camera, pose, start = self.renderer.camera(state, **size), self.renderer.pose(state), time.perf_counter()
-        captured = self.clips[state.clip].captured and not state.turned
+        camera = resized(seen, width=round(shrink * window.width), height=round(shrink * window.height))
+        clip, pose = self.clips[state.clip], self.renderer.pose(state.clip, state.step)
 
-        def on_progress(stage: str) -> None:
-            page.show_truth_progress(f"Truth: {stage} ...", PROGRESS.get(stage, 0.5))
-
-        def on_done(straight: np.ndarray | None, problem: str) -> None:
-            if straight is not None:
-                picture = TruthPicture(camera=camera, on_black=metrics.on_black(straight))
-                self.truths.put(self.renderer.pose_key(state), picture)
-            took = f"Truth rendered in {time.perf_counter() - start:.0f} s."
-            page.show_truth_progress(problem or took, None)
+        def render() -> None:
+            start = time.perf_counter()
+            try:
+                picture = self._truth_renderer.render(pose, camera, captured=clip.captured)
+            except InputError as error:
+                page.say_of_truth(str(error))
+                return
+            self.truths.put(clip, pose.frame, TruthPicture(camera=camera, on_black=picture))
+            page.say_of_truth(f"Truth rendered in {time.perf_counter() - start:.0f} s.")
             viewer.change(replace)  # Drawn again, for the truth is known now.
 
-        request = TruthRequest(motion=pose.motion, frame=pose.frame, camera=camera, captured=captured)
-        if not self._truth_renderer.start(request, on_progress=on_progress, on_done=on_done):
-            return "Another truth is being rendered; try again in a moment."
-        return "Truth: waiting for the renderer ..."
+        threading.Thread(target=render, daemon=True, name="truth").start()
+        return "Truth: is being rendered ..."
 
 
 @contextmanager

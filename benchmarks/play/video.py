@@ -14,12 +14,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ash.capture.dataset import Camera, Capture, Pose
 from ash.files import InputError
-from ash.protocol import StageClock
-from benchmarks.cell import metrics
 from benchmarks.play.avatars import AvatarSet
 from benchmarks.play.cameras import RIG, SPIRAL, camera_named, first_camera, resized, spiral_camera
 from benchmarks.play.motions import MotionClip
-from benchmarks.play.truth import TruthRenderer, TruthRequest, capture_image
+from benchmarks.play.truth import TruthCache, TruthRenderer
 from benchmarks.report.pictures import PAPER, on_paper
 
 RIG_CAMERAS = 4
@@ -48,19 +46,18 @@ def render_video(avatars: AvatarSet, spec: VideoSpec, on_progress: Callable[[str
     """
     cameras_of(avatars.capture, spec, 0)  # An unknown camera is refused before avatars are loaded.
     clip, titles = spec.clip, (*(["Truth"] if spec.truth else []), *avatars.titles)
-    loaded = {title: avatars[title] for title in avatars.titles}
+    loaded, truths = {title: avatars[title] for title in avatars.titles}, TruthCache(avatars.capture)
     with closing(TruthRenderer(avatars.capture.folder)) as truth:
 
         def picture(title: str, frame: int, camera: Camera) -> np.ndarray:
+            pose = Pose(clip.motion, frame)
             if title in loaded:
-                drawn = loaded[title].premultiplied(Pose(clip.motion, frame), camera, StageClock())
-                return on_paper(metrics.quantise(drawn))
-            known = capture_image(avatars.capture, clip, frame, camera)
-            if known is None:
-                on_progress(f"truth of frame {frame}, camera {camera.name}")
-                request = TruthRequest(motion=clip.motion, frame=frame, camera=camera, captured=clip.captured)
-                known = metrics.on_black(truth.render(request))
-            return on_paper(known)
+                return on_paper(loaded[title].on_black(pose, camera))
+            known = truths.find(clip, frame, camera)
+            if known is not None and (known.camera.width, known.camera.height) == (camera.width, camera.height):
+                return on_paper(known.on_black)
+            on_progress(f"truth of frame {frame}, camera {camera.name}")
+            return on_paper(truth.render(pose, camera, captured=clip.captured))
 
         for step, frame in enumerate(spec.frames):
             cameras = cameras_of(avatars.capture, spec, step)
@@ -75,7 +72,7 @@ def cameras_of(capture: Capture, spec: VideoSpec, step: int) -> list[Camera]:
     first = first_camera(capture)
     size = {"height": spec.height, "width": round(spec.height * first.width / first.height)}
     if spec.camera == SPIRAL:
-        return [spiral_camera(capture, float(step), **size)]
+        return [spiral_camera(capture, step, **size)]
     if spec.camera == RIG:
         split = capture.splits.get("novel_view", capture.splits["train"])
         return [resized(capture.cameras[name], **size) for name in split.cameras[:RIG_CAMERAS]]

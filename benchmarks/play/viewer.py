@@ -3,14 +3,12 @@
 import math
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
 import viser
 
-from benchmarks.play.cameras import SPIRAL, SPIRAL_STEPS_PER_SECOND
 from benchmarks.play.motions import MotionClip
 from benchmarks.play.rendering import RenderedView, ViewRenderer, ViewState
 
@@ -23,35 +21,11 @@ MOVING_QUALITY, STILL_QUALITY = 45, 80  # of JPEG
 NEVER = float("inf")
 
 
-class AdaptiveResolution:
-    """As many pixels as keep motion smooth, from what drawing took; all of them for a viewer who stands still.
-
-    Sizes change by small steps, so that a single slow picture does not show.
-    """
-
-    def __init__(self) -> None:
-        self.pixels = 384.0 * 384.0
-
-    def size(self, *, width: int, height: int, sharp: bool) -> tuple[int, int]:
-        """Width and height of the picture for a window of that size."""
-        wanted = min(width * height, MAX_PIXELS if sharp else self.pixels)
-        scale = math.sqrt(wanted / (width * height))
-        return max(2, round(width * scale)), max(2, round(height * scale))
-
-    def update(self, *, drawn: int, ms: float, allowed_ms: float) -> None:
-        """So many pixels took `ms`, and might have taken `allowed_ms`."""
-        wanted = drawn * min(1.25, max(0.5, allowed_ms / ms))
-        self.pixels = min(max(wanted, MIN_PIXELS), MAX_PIXELS)
-
-
-def allowed_ms(*, playing_fps: float | None, viewers: int) -> float:
-    """Milliseconds that a picture may take, while so many viewers are being drawn for."""
-    alone = SMOOTH_MS if playing_fps is None else max(SMOOTH_MS, PLAYING_SHARE * 1000 / playing_fps)
-    return max(8.0, alone / viewers)
-
-
 class Viewer:
-    """What a browser looks at, and when it is drawn. Changed from the server's threads, drawn from one other."""
+    """What a browser looks at, and when it is drawn. Changed from the server's threads, drawn from one other.
+
+    While something moves, a picture has as many pixels as can be drawn in time; once all stands still, it is sharp.
+    """
 
     def __init__(
         self, client: viser.ClientHandle, clips: Sequence[MotionClip], state: ViewState, wake: Callable[[], None]
@@ -59,12 +33,11 @@ class Viewer:
         self.client, self._clips, self._wake = client, clips, wake
         self.served = 0.0  # when its last picture was sent
         self.show: Callable[[ViewState, RenderedView | None, str], None] = lambda state, drawn, message: None
-        self._resolution = AdaptiveResolution()
+        self._pixels = 384.0 * 384.0  # of a picture while something moves
         self._state, self._lock = state, threading.Lock()
         self._dirty, self._sharp = True, False
         self._changed = self._advanced = time.perf_counter()
         self._owed = 0.0  # frames of the motion that are not shown yet, a fraction
-        self._sent: deque[float] = deque(maxlen=30)
 
     @property
     def state(self) -> ViewState:
@@ -83,7 +56,7 @@ class Viewer:
         """When the next picture is wanted, on `time.perf_counter`'s clock."""
         if self._state.viewpoint is None:
             return NEVER
-        if self._dirty or self._state.camera == SPIRAL:
+        if self._dirty:
             return self.served + MIN_INTERVAL
         if self._state.playing:
             return self.served + self._frame_seconds
@@ -98,12 +71,12 @@ class Viewer:
         start = time.perf_counter()
         state = self._advance(start)
         assert state.viewpoint is not None
-        moving = self._dirty or state.playing or state.camera == SPIRAL
         with self._lock:
-            self._dirty = False
+            moving, self._dirty = self._dirty or state.playing, False
+        resting = start - self._changed > STILL_SECONDS  # Apart from the motion, if that is played.
         window = state.viewpoint
-        width, height = self._resolution.size(width=window.width, height=window.height, sharp=not moving)
-        resting = start - self._changed > STILL_SECONDS
+        scale = min(1.0, math.sqrt((self._pixels if moving else MAX_PIXELS) / (window.width * window.height)))
+        width, height = max(2, round(window.width * scale)), max(2, round(window.height * scale))
         with_scores = not moving or (resting and viewers == 1)
         try:
             drawn = renderer.render(state, width=width, height=height, with_scores=with_scores)
@@ -118,39 +91,31 @@ class Viewer:
         with may_be_closed(self.client):
             self.client.scene.set_background_image(drawn.pixels, format="jpeg", jpeg_quality=quality)
         self.served = time.perf_counter()
-        self._sent.append(self.served)
         ms = 1000 * (self.served - start)
         if moving:
-            fps = 1 / self._frame_seconds if state.playing and resting and state.camera != SPIRAL else None
-            allowed = allowed_ms(playing_fps=fps, viewers=viewers)
-            self._resolution.update(drawn=width * height, ms=ms, allowed_ms=allowed)
+            alone = (
+                max(SMOOTH_MS, PLAYING_SHARE * 1000 * self._frame_seconds) if state.playing and resting else SMOOTH_MS
+            )
+            allowed_ms = max(8.0, alone / viewers)
+            # By small steps, so that a single slow picture does not show.
+            wanted = width * height * min(1.25, max(0.5, allowed_ms / ms))
+            self._pixels = min(max(wanted, MIN_PIXELS), MAX_PIXELS)
         else:
             self._sharp = not self._dirty
         with may_be_closed(self.client):
-            self.show(state, drawn, self._describe(drawn, ms, moving=moving))
+            self.show(state, drawn, f"{width} x {height}, {ms:.0f} ms")
 
     def _advance(self, now: float) -> ViewState:
-        """Advance the motion and the spiral by the time that has passed."""
+        """Advance the motion by the time that has passed."""
         elapsed, self._advanced = min(now - self._advanced, 0.5), now
         with self._lock:
-            state = self._state
-            if state.camera == SPIRAL:
-                state = replace(state, spiral_step=state.spiral_step + SPIRAL_STEPS_PER_SECOND * elapsed)
-            if state.playing:
+            if self._state.playing:
                 self._owed += elapsed / self._frame_seconds
                 steps = int(self._owed + 0.25)  # The timer is a little early as often as late.
                 self._owed -= steps
-                state = state.advanced(steps, len(self._clips[state.clip])) if steps else state
-            self._state = state
-        return state
-
-    def _describe(self, drawn: RenderedView, ms: float, *, moving: bool) -> str:
-        height, width = drawn.pixels.shape[:2]
-        times = [t for t in self._sent if self.served - t < 1.5]
-        rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 2 else 0.0
-        stages = " · ".join(f"{name.replace('stg', 'Stg.')} {t:.0f}" for name, t in sorted(drawn.stage_ms.items()))
-        speed = f"{rate:.0f} pictures a second, " if moving and rate >= 2 else ""
-        return f"{speed}{width} x {height}, {ms:.0f} ms" + (f" ({stages})" if stages else "")
+                step = (self._state.step + steps) % len(self._clips[self._state.clip])
+                self._state = replace(self._state, step=step)
+            return self._state
 
 
 @contextmanager

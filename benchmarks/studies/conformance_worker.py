@@ -7,12 +7,13 @@ which the method runs: a check for authors, no defence.
 
 import hashlib
 import os
+import pickle
 import sys
 import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -116,9 +117,9 @@ def perform(trial: Trial, folder: Path) -> Outcome:
     outcome = Outcome()
     try:
         closed = [] if trial.oracle else [trial.capture]
-        with watched_folders(closed, seen.folder), _untouched(seen, "capture"):
+        with watched_folders(closed, seen.folder), _untouched(seen):
             outcome = _performed(trial, folder, drawn, seen, factory)
-    except (Changed, InputModifiedError) as error:
+    except InputModifiedError as error:
         outcome = replace(outcome, input=str(error))
     except TruthAccessError as error:
         outcome = replace(outcome, held_out=str(error))
@@ -134,14 +135,10 @@ def few_views(capture: Capture) -> list[tuple[str, int]]:
 
 def _performed(trial: Trial, folder: Path, capture: Capture, seen: Capture, factory: Any) -> Outcome:
     views = list(trial.views)
-
-    def make() -> Avatar:
-        made: Avatar = factory(seen, seed=trial.seed, preset=trial.preset)
-        return made
-
-    avatar = make()
+    avatar = factory(seen, seed=trial.seed, preset=trial.preset)
     if not isinstance(avatar, Avatar):
-        missing = [name for name in _protocol_names() if not callable(getattr(avatar, name, None))]
+        functions = [name for name in vars(Avatar) if not name.startswith("_") and callable(getattr(Avatar, name))]
+        missing = [name for name in functions if not callable(getattr(avatar, name, None))]
         return Outcome(protocol=f"{type(avatar).__name__} lacks {', '.join(missing)} of ash.protocol.Avatar")
     weights = ""
     if trial.weights:
@@ -155,7 +152,7 @@ def _performed(trial: Trial, folder: Path, capture: Capture, seen: Capture, fact
     again, bad_poses = None, ""
     if trial.thorough:
         bad_poses = bad_pose_problem(avatar, capture, views[-1])
-        resumed = make()
+        resumed = factory(seen, seed=trial.seed, preset=trial.preset)
         resumed.fit(seen, folder=folder / "fit")
         again = tuple(_hash(image) for image in draw(resumed, capture, views)[0])
     return Outcome(
@@ -172,7 +169,7 @@ def _performed(trial: Trial, folder: Path, capture: Capture, seen: Capture, fact
 def draw(avatar: Avatar, capture: Capture, views: list[tuple[str, int]]) -> tuple[list[np.ndarray], str]:
     """The images of some views, and what is wrong with the first that is not as the protocol says."""
     images, problem = [], ""
-    with _untouched(capture, "motion or camera"):
+    with _untouched(capture):
         for name, frame in views:
             camera = capture.cameras[name]
             image = avatar.render(Pose(capture.motion, frame), camera, clock=StageClock())
@@ -206,31 +203,21 @@ def bad_pose_problem(avatar: Avatar, capture: Capture, view: tuple[str, int]) ->
     return ""
 
 
-class Changed(RuntimeError):
-    """An array that the method was given is not what it was."""
-
-
 @contextmanager
-def _untouched(capture: Capture, what: str) -> Iterator[None]:
+def _untouched(capture: Capture) -> Iterator[None]:
+    """Refuse a body that changes anything of a capture in memory."""
     before = _fingerprint(capture)
     yield
-    changed = [name for name, digest in _fingerprint(capture).items() if before.get(name) != digest]
-    if changed or len(before) != len(_fingerprint(capture)):
-        raise Changed(f"the method changed the {what} that it was given: {', '.join(changed) or 'a part is gone'}")
+    after = _fingerprint(capture)
+    if changed := [name for name in before | after if before.get(name) != after.get(name)]:
+        raise InputModifiedError(f"the method changed what it was given: {', '.join(changed)}")
 
 
-def _fingerprint(capture: Capture) -> dict[str, str]:
-    arrays = {
-        "motion.dofs": capture.motion.dofs,
-        "motion.sequence": capture.motion.sequence,
-        "skeleton.heads": capture.skeleton.heads,
-        "skeleton.parents": capture.skeleton.parents,
-        **{f"template.{field.name}": getattr(capture.template, field.name) for field in fields(capture.template)},
-    }
-    for name, camera in capture.cameras.items():
-        arrays |= {f"camera {name} K": camera.K, f"camera {name} viewmat": camera.viewmat}
-    digests = {name: hashlib.sha256(array.tobytes()).hexdigest() for name, array in arrays.items()}
-    return digests | {"splits": repr(capture.splits), "manifest": repr(capture.manifest)}
+def _fingerprint(capture: Capture) -> dict[str, bytes]:
+    names = ("motion", "skeleton", "template", "splits", "manifest")
+    parts = {name: getattr(capture, name) for name in names}
+    parts |= {f"camera {name}": camera for name, camera in capture.cameras.items()}
+    return {name: pickle.dumps(part) for name, part in parts.items()}
 
 
 def _image_problem(image: Any, camera: Camera) -> str:
@@ -261,10 +248,6 @@ def _count_problem(avatar: Avatar) -> str:
         if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 0:
             return f"{name} gave {count!r}, expected a whole number"
     return ""
-
-
-def _protocol_names() -> list[str]:
-    return [name for name in vars(Avatar) if not name.startswith("_") and callable(getattr(Avatar, name))]
 
 
 def _hash(image: np.ndarray) -> str:

@@ -119,10 +119,9 @@ def visit(chromium: Any) -> Iterator[Visitor]:
         *,
         size: tuple[int, int] = DESKTOP,
         scheme: Literal["light", "dark"] = "light",
-        touch: bool = False,
     ) -> Visit:
         viewport = {"width": size[0], "height": size[1]}
-        context = chromium.new_context(viewport=viewport, color_scheme=scheme, has_touch=touch)
+        context = chromium.new_context(viewport=viewport, color_scheme=scheme)
         contexts.append(context)
         found = Visit(page=context.new_page())
         found.page.on("console", lambda said: found.errors.append(said.text) if said.type == "error" else None)

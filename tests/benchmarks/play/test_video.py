@@ -1,6 +1,7 @@
 """`video`, and the truth of what was never rendered."""
 
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -13,13 +14,12 @@ from PIL import Image, ImageSequence
 from ash.capture.dataset import Capture, Pose
 from ash.capture.formats import load_capture
 from ash.files import InputError
-from ash.protocol import StageClock
 from benchmarks import cli
 from benchmarks.cell import metrics
 from benchmarks.play.avatars import open_avatars
 from benchmarks.play.cameras import resized, spiral_camera
-from benchmarks.play.motions import motion_clip, with_angles
-from benchmarks.play.truth import TruthRenderer, TruthRequest, capture_image
+from benchmarks.play.motions import motion_clip
+from benchmarks.play.truth import TruthRenderer
 from benchmarks.play.video import CAPTION
 from benchmarks.report.pictures import on_paper
 
@@ -50,12 +50,9 @@ def test_a_film_shows_the_truth_and_each_avatar_side_by_side(tube_run: Path, tmp
     with open_avatars(tube_run) as avatars:
         clip, camera = motion_clip(avatars.capture, "test"), avatars.capture.cameras["cam0"]
         for shown, frame in zip(frames, clip.frames, strict=True):
-            truth = capture_image(avatars.capture, clip, frame, camera)
-            assert truth is not None
-            drawn = [
-                avatars[title].premultiplied(Pose(clip.motion, frame), camera, StageClock()) for title in avatars.titles
-            ]
-            for number, picture in enumerate([truth, *map(metrics.quantise, drawn)]):
+            truth = metrics.on_black(avatars.capture.image("cam0", frame))
+            drawn = [avatars[title].on_black(Pose(clip.motion, frame), camera) for title in avatars.titles]
+            for number, picture in enumerate([truth, *drawn]):
                 request = on_paper(picture) / 255
                 assert psnr(panel(shown, number), request, np.ones((SIZE, SIZE))) > 22, "as far as a codec goes"
             assert np.ptp(shown[:CAPTION, :SIZE]) > 100, "the name is burnt in"
@@ -71,7 +68,7 @@ def test_a_rig_gives_a_row_per_avatar_and_a_spiral_turns(tube_run: Path, tmp_pat
     assert film(tube_run, spiral, *more, "--frames", "0:3") == cli.DONE
     with open_avatars(tube_run) as avatars, Image.open(spiral) as image:
         assert image.n_frames == 3
-        positions = [spiral_camera(avatars.capture, float(step), width=8, height=8).position for step in range(3)]
+        positions = [spiral_camera(avatars.capture, step, width=8, height=8).position for step in range(3)]
     assert np.linalg.norm(positions[1] - positions[0]) > 0.01 and np.linalg.norm(positions[2] - positions[0]) > 0.02
 
 
@@ -106,20 +103,18 @@ def test_the_truth_rendered_here_is_the_captures_own_image_where_that_exists(
     capture: Capture, truth: TruthRenderer
 ) -> None:
     camera, frame = capture.splits["novel_pose"].views[0]
-    request = TruthRequest(motion=capture.motion, frame=frame, camera=capture.cameras[camera], captured=True)
-    messages: list[str] = []
-    np.testing.assert_array_equal(truth.render(request, messages.append), capture.image(camera, frame))
-    assert "tracing light" in messages
+    drawn = truth.render(Pose(capture.motion, frame), capture.cameras[camera], captured=True)
+    np.testing.assert_array_equal(drawn, metrics.on_black(capture.image(camera, frame)))
 
 
 def test_the_truth_of_a_pose_that_was_never_rendered(capture: Capture, truth: TruthRenderer) -> None:
     camera, frame = capture.splits["novel_pose"].views[0]
-    small = resized(capture.cameras[camera], width=32, height=32)
-    own = truth.render(TruthRequest(motion=capture.motion, frame=frame, camera=small, captured=True))
-    again = truth.render(TruthRequest(motion=capture.motion, frame=frame, camera=small, captured=False), lambda _: None)
-    arm = capture.skeleton.names.index("upper_arm_left")
-    raised = with_angles(capture.motion, {arm: (0.0, 60.0, 0.0)})
-    other = truth.render(TruthRequest(motion=raised, frame=frame, camera=small, captured=False))
+    small, pose = resized(capture.cameras[camera], width=32, height=32), Pose(capture.motion, frame)
+    own, again = (truth.render(pose, small, captured=captured) for captured in (True, False))
+    raised = capture.motion.dofs.copy()
+    arm = 3 + 3 * capture.skeleton.names.index("upper_arm_left")
+    raised[:, arm : arm + 3] = 0, 0, np.pi / 3
+    other = truth.render(Pose(replace(capture.motion, dofs=raised), frame), small, captured=False)
     assert own.shape == other.shape == (32, 32, 4) and (own[..., 3] > 128).mean() > 0.03
     silhouettes = [picture[..., 3] > 128 for picture in (own, again, other)]
     assert (silhouettes[0] ^ silhouettes[1]).sum() <= 0.05 * silhouettes[0].sum(), "posed anew, it is the same person"
@@ -128,22 +123,8 @@ def test_the_truth_of_a_pose_that_was_never_rendered(capture: Capture, truth: Tr
 
 def test_a_renderer_that_cannot_says_why(tmp_path: Path, capture: Capture) -> None:
     truth = TruthRenderer(tmp_path)
-    request = TruthRequest(motion=capture.motion, frame=0, camera=next(iter(capture.cameras.values())), captured=True)
     try:
         with pytest.raises(InputError, match=r"manifest\.json: cannot be read"):
-            truth.render(request)
+            truth.render(Pose(capture.motion, 0), next(iter(capture.cameras.values())), captured=True)
     finally:
         truth.close()
-
-
-def test_one_truth_at_a_time(capture: Capture, truth: TruthRenderer) -> None:
-    camera, frame = capture.splits["novel_pose"].views[0]
-    small = resized(capture.cameras[camera], width=16, height=16)
-    request = TruthRequest(motion=capture.motion, frame=frame, camera=small, captured=True)
-    pictures: list[np.ndarray | None] = []
-    assert truth.start(request, on_progress=lambda _: None, on_done=lambda picture, problem: pictures.append(picture))
-    assert not truth.start(
-        request, on_progress=lambda _: None, on_done=lambda picture, problem: pictures.append(picture)
-    )
-    truth.render(request)  # Waits for its turn.
-    assert len(pictures) == 1 and pictures[0] is not None
