@@ -275,7 +275,7 @@ ELSEWHERE = {
         "training.fitted_steps": ("ash/training/test_warm_up.py", "test_a_fit_ends_where_nothing_is_gained"),
         "device": ("ash/test_devices.py", "test_a_training_step_stays_on_its_device"),
     },
-    "ddc_plus": {"device": ("baselines/test_baseline_devices.py", "test_a_training_step_stays_on_its_device")},
+    "ddc_plus": {"device": ("ash/test_devices.py", "test_a_training_step_stays_on_its_device")},
 }
 SHARED = {"template.kind", "template.error_mm", "template.supervision", "template.network", "template.steps"}
 HERE = {"ash_plus": set[str](), "ddc_plus": SHARED}  # `test_the_mesh_stands_on_the_template_that_ash_gets`
