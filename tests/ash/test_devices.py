@@ -1,76 +1,95 @@
-"""One code path for every device, proved without a GPU: see `helpers.devices`.
+"""One code path for every device and every method, proved without a GPU: see `helpers.devices`.
 
 The other way round, a step on the CPU runs while `meta` is the device of every tensor that does not say its own.
 """
 
 import re
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from helpers.devices import META, as_if_averaged, learning_without_numbers, step_of, tiny, without_numbers
 
 import ash.trained_avatar
-from ash.avatar import AshAvatar
+from ash import presets
 from ash.capture.dataset import Capture, Pose
-from ash.config import AshConfig, TemplateConfig
+from ash.config import TemplateConfig
 from ash.devices import CPU, cuda_error, device_named, moved
 from ash.files import InputError
-from ash.presets import named, plus
+from ash.presets import MethodFactory
 from ash.template.graph import NeighbourMean
 from ash.template.template import Template
 from ash.template_learning.deforming import LinearDeformation
 from ash.template_learning.graph_nets import GraphDeformation
 from ash.template_learning.learning import _learn, learned_template
 from ash.textures import TexelLattice, build_lattice
-from baselines.ddc import DdcAvatar, ddc
+from baselines import ablations, ddc, field, mlp, oracle_texture, static
 
-
-def refining() -> AshConfig:
-    """Vertices that learn with the avatar."""
-    config = plus("ci")
-    return replace(config, model=replace(config.model, refine=True))
-
-
-VARIANTS = {
-    "refining": (refining(), {}),
-    **{name: (named(name), {}) for name in ("ci", "paper", "official")},  # The others are `ci` of other lengths.
-    "exact": (plus("ci"), {"kind": "exact"}),
-    "planted_error": (plus("ci"), {"kind": "exact", "error_mm": 4.0}),
+on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
+OF_ASH: dict[str, tuple[str, dict[str, Any]]] = {  # preset and template; the other presets are `ci` of other lengths
+    "ci": ("ci", {}),
+    "paper": ("paper", {}),
+    "official": ("official", {}),
+    "exact": ("ci", {"kind": "exact"}),
+    "planted_error": ("ci", {"kind": "exact", "error_mm": 4.0}),
+}
+OTHERS: dict[str, MethodFactory[Any]] = {
+    "refining": presets.ash_plus.with_overrides({"model.refine": True}),  # Vertices that learn with the avatar.
+    "ddc": ddc.ddc,
+    "ddc_plus": ddc.ddc_plus,
+    "ddc_moves": ddc.ddc.with_overrides({"refine": "motion"}),
+    "ddc_still": ddc.ddc.with_overrides({"refine": "none"}),
+    "oracle_texture": oracle_texture.oracle_texture,
+    "static": static.static,
+    "wo_mot": ablations.wo_mot,
+    "wo_disp": ablations.wo_disp,
+    "wo_mot_plus": ablations.wo_mot_plus,
+    "mlp": mlp.mlp,
+    "mlp_base": mlp.mlp_base,
+}
+FIELDS: dict[str, MethodFactory[Any]] = {  # Their step on `meta` is that of the published size, in `test_field.py`.
+    "tava": field.tava,
+    "neural_actor": field.neural_actor.with_overrides({"field.surface": "template"}),
+    "hdhumans": field.hdhumans,
 }
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_a_training_step_stays_on_its_device(variant: str, capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def avatar_of(name: str, capture: Capture, device: str = "cpu") -> Any:
+    factory = (OTHERS | FIELDS).get(name, presets.ash)
+    preset, template = OF_ASH.get(name, ("ci", {}))
+    return factory.build(replace(tiny(factory.config(preset), **template), device=device), capture)
+
+
+@pytest.mark.parametrize("name", OF_ASH | OTHERS)
+def test_a_training_step_stays_on_its_device(name: str, capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     without_numbers(monkeypatch)
-    config, template = VARIANTS[variant]
-    avatar = AshAvatar.from_capture(tiny(config, **template), capture)
+    avatar = avatar_of(name, capture)
     learned = step_of(avatar, capture, META)
     assert learned and all(parameter.device == META for parameter in learned)
     assert {tensor.device for tensor in (*avatar.module.buffers(), *avatar.module.parameters())} == {META}
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_nothing_of_a_step_is_made_on_the_default_device(variant: str, capture: Capture) -> None:
-    config, template = VARIANTS[variant]
-    avatar = AshAvatar.from_capture(tiny(config, **template), capture)
+@pytest.mark.parametrize("name", ["ci", "refining", "ddc", "ddc_moves", *FIELDS])
+def test_nothing_of_a_step_is_made_on_the_default_device(name: str, capture: Capture) -> None:
+    """Nor of what `without_numbers` replaces: drawing, outlines and graph networks."""
+    avatar = avatar_of(name, capture)
     with META:
         learned = step_of(avatar, capture, CPU)
     assert learned and all(bool(torch.isfinite(parameter).all()) for parameter in learned)
 
 
-@pytest.mark.parametrize("kind", [LinearDeformation, GraphDeformation])
-def test_a_learned_template_is_posed_on_its_device(
-    kind: type, capture: Capture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = tiny(plus("ci")).template
-    template = Template(capture.template, capture.skeleton, kind(config, capture.template, capture.skeleton))
-    monkeypatch.setattr(NeighbourMean, "__call__", as_if_averaged)  # `meta` has no sparse product.
-    posed = template.to(META).pose(Pose(capture.motion, 2))
-    assert {posed.vertices.device, posed.normals.device, posed.transforms.quats.device} == {META}
+@on_gpu
+@pytest.mark.parametrize("name", OF_ASH | OTHERS | FIELDS)
+def test_a_gpu_learns_what_the_cpu_learns(name: str, capture: Capture) -> None:
+    there = step_of(avatar_of(name, capture, "cuda"), capture, torch.device("cuda"))
+    for learned, expected in zip(there, step_of(avatar_of(name, capture), capture, CPU), strict=True):
+        torch.testing.assert_close(learned.grad.cpu(), expected.grad, rtol=1e-2, atol=1e-2 * expected.grad.abs().max())
 
 
-LEARNED = [("linear", "images"), ("linear", "scans"), ("graph", "scans")]
+LEARNED = pytest.mark.parametrize(
+    ("network", "supervision"), [("linear", "images"), ("linear", "scans"), ("graph", "scans")]
+)
 
 
 def learning(network: str, supervision: str) -> TemplateConfig:
@@ -86,11 +105,23 @@ def with_few_views(capture: Capture) -> Capture:
 
 
 def unlearned(config: TemplateConfig, capture: Capture) -> LinearDeformation | GraphDeformation:
+    """What `learned_template` starts from with the seed 0."""
+    torch.manual_seed(0)
     kind = LinearDeformation if config.network == "linear" else GraphDeformation
     return kind(config, capture.template, capture.skeleton)
 
 
-@pytest.mark.parametrize(("network", "supervision"), LEARNED)
+@pytest.mark.parametrize("network", ["linear", "graph"])
+def test_a_learned_template_is_posed_on_its_device(
+    network: str, capture: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    template = Template(capture.template, capture.skeleton, unlearned(learning(network, "scans"), capture))
+    monkeypatch.setattr(NeighbourMean, "__call__", as_if_averaged)  # `meta` has no sparse product.
+    posed = template.to(META).pose(Pose(capture.motion, 2))
+    assert {posed.vertices.device, posed.normals.device, posed.transforms.quats.device} == {META}
+
+
+@LEARNED
 def test_a_template_is_learned_on_its_device(
     network: str, supervision: str, capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -101,28 +132,21 @@ def test_a_template_is_learned_on_its_device(
     assert {value.device for value in deformation.state_dict().values()} == {META}
 
 
-@pytest.mark.parametrize(("network", "supervision"), LEARNED)
+@LEARNED
 def test_nothing_of_learning_a_template_is_made_on_the_default_device(
     network: str, supervision: str, capture: Capture
 ) -> None:
     config, seen = learning(network, supervision), with_few_views(capture)
-    deformation, expected = unlearned(config, capture), learned_template(config, seen, seed=0).deformation
-    deformation.load_state_dict(started(config, capture))
+    expected, deformation = learned_template(config, seen, seed=0).deformation, unlearned(config, capture)
     with META:
         _learn(deformation, config, seen, 0, CPU)
     for found, wanted in zip(deformation.parameters(), expected.parameters(), strict=True):
         assert torch.equal(found, wanted)
 
 
-def started(config: TemplateConfig, capture: Capture) -> dict[str, torch.Tensor]:
-    """What `learned_template` starts from."""
-    torch.manual_seed(0)
-    return unlearned(config, capture).state_dict()
-
-
-@pytest.mark.parametrize("kind", [AshAvatar, DdcAvatar])
+@pytest.mark.parametrize("factory", [presets.ash_plus, ddc.ddc], ids=["ash_plus", "ddc"])
 def test_an_avatar_learns_its_template_on_its_own_device(
-    kind: type, capture: Capture, monkeypatch: pytest.MonkeyPatch
+    factory: MethodFactory[Any], capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Asked(Exception):
         """For a template, on a device."""
@@ -132,13 +156,12 @@ def test_an_avatar_learns_its_template_on_its_own_device(
 
     monkeypatch.setattr(ash.trained_avatar, "device_named", lambda name: META)
     monkeypatch.setattr(ash.trained_avatar, "template_of", ask)
-    config = plus("ci") if kind is AshAvatar else ddc.config("ci")
     with pytest.raises(Asked, match="meta"):
-        kind.from_capture(config, capture)
+        factory(capture, seed=0, preset="ci")
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
-@pytest.mark.parametrize(("network", "supervision"), LEARNED)
+@on_gpu
+@LEARNED
 def test_a_gpu_learns_the_template_that_the_cpu_learns(network: str, supervision: str, capture: Capture) -> None:
     config = learning(network, supervision)
     there, here = (learned_template(config, capture, seed=0, device=torch.device(name)) for name in ("cuda", "cpu"))
@@ -161,18 +184,6 @@ def test_a_device_that_is_not_there_is_refused_with_the_reason(capture: Capture)
     with pytest.raises(InputError, match=re.escape(f"device cuda:1: {cuda_error('cuda:1')}")):
         device_named("cuda:1")
     with pytest.raises(InputError, match=r"^device cuda: torch"):
-        AshAvatar.from_capture(replace(tiny(plus("ci")), device="cuda"), capture)
+        avatar_of("ci", capture, "cuda")
     with pytest.raises(InputError, match="expected cpu, cuda or cuda:N, got 'gpu'"):
-        replace(plus("ci"), device="gpu")
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
-@pytest.mark.parametrize("preset", ["ci", "paper", "official"])
-def test_a_gpu_learns_what_the_cpu_learns(preset: str, capture: Capture) -> None:
-    there, here = (
-        AshAvatar.from_capture(replace(tiny(named(preset)), device=name), capture) for name in ("cuda", "cpu")
-    )
-    for learned, expected in zip(
-        step_of(there, capture, torch.device("cuda")), step_of(here, capture, CPU), strict=True
-    ):
-        torch.testing.assert_close(learned.grad.cpu(), expected.grad, rtol=1e-2, atol=1e-2 * expected.grad.abs().max())
+        replace(presets.ci(), device="gpu")

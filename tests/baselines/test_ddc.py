@@ -3,22 +3,19 @@ from dataclasses import fields, replace
 import pytest
 import torch
 from helpers.figures import front_camera, tube_motion
+from helpers.learning import tiny_mesh
 
-from ash.capture.dataset import Pose
+from ash.capture.dataset import Capture, Pose
 from ash.config import TemplateConfig
 from ash.fields import apply_overrides
 from ash.files import InputError
 from ash.mesh.drawing import SUPERSAMPLING, sample_texture
-from ash.presets import named, plus
-from baselines.ddc import DdcAvatar, ddc_config
+from ash.presets import named
+from baselines.ddc import DdcAvatar, DdcModel, ddc_config
 
 
-def avatar(capture, *, steps: int = 120) -> DdcAvatar:
-    ash = plus("ci")
-    small = replace(ash.model, texels=16, width=4, levels=2, window=2)
-    training = replace(ash.training, steps=steps, warmup_steps=steps // 2)
-    config = ddc_config(replace(ash, model=small, training=training), seed=0, template=TemplateConfig())
-    return DdcAvatar.from_capture(replace(config, texture=32), capture)
+def model_of(capture: Capture) -> DdcModel:
+    return DdcAvatar.from_capture(tiny_mesh(steps=4, warmup_steps=2), capture).module
 
 
 def test_samples_hit_texture_pixels_where_the_atlas_says():
@@ -30,7 +27,7 @@ def test_samples_hit_texture_pixels_where_the_atlas_says():
 
 
 def test_a_constant_texture_draws_a_flat_silhouette_over_the_background(capture):
-    model = avatar(capture).module
+    model = model_of(capture)
     posed = model.template.pose(Pose(tube_motion(), 0))
     colour, background = torch.tensor([0.2, 0.5, 0.8]), torch.tensor([1.0, 0.0, 0.0])
     texture = colour[:, None, None].expand(3, 32, 32)
@@ -44,7 +41,7 @@ def test_a_constant_texture_draws_a_flat_silhouette_over_the_background(capture)
 
 
 def test_gradients_reach_exactly_the_texture_pixels_that_are_seen(capture):
-    model = avatar(capture).module
+    model = model_of(capture)
     posed = model.template.pose(Pose(tube_motion(), 0))
     texture = torch.full((3, 32, 32), 0.5, requires_grad=True)
     model.rasterize(texture, posed, model.see(posed, [front_camera()]), torch.zeros(3))[..., 1].sum().backward()

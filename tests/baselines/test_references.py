@@ -3,22 +3,26 @@
 import shutil
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from helpers.captures import tiny_preset
+from helpers.captures import tiny_plus, tiny_preset
 from helpers.figures import tube_mesh
 from helpers.scoring import draw, foreground_psnr
 
 from ash import presets
-from ash.capture.dataset import Camera, Motion, Pose, image_path
+from ash.capture.dataset import Camera, Capture, Motion, Pose, image_path
 from ash.capture.formats import load_capture, write_template
 from ash.files import InputError, write_image
+from ash.presets import ash_plus
 from ash.protocol import Avatar, StageClock
 from baselines.ablations import smpl
+from baselines.field import neural_actor
 from baselines.nearest import central_frame, move_image, nearest, see_root
 from baselines.oracle_texture import oracle_texture
+from baselines.per_frame import PerFrameAvatar, per_frame
 from baselines.static import of_one_frame, static
 from benchmarks.cell.registry import WRONG_BY_MM, find_method
 
@@ -114,17 +118,59 @@ def test_what_is_wrong_by_so_much_is_wrong_by_so_much_whoever_draws_it(capture):
             assert (avatar.config.template.kind, avatar.config.template.error_mm) == ("exact", error_mm), method
 
 
-def test_the_bare_body_is_the_template_and_a_capture_without_one_is_refused(capture, tmp_path):
+@pytest.mark.parametrize("method", [smpl, neural_actor], ids=["smpl", "neural_actor"])
+def test_the_bare_body_is_the_template_and_a_capture_without_one_is_refused(method, capture, tmp_path):
     with pytest.raises(InputError, match="no bare body"):
-        smpl(capture.training_only(), seed=0, preset="ci")
+        method(capture.training_only(), seed=0, preset="ci")
     mesh = tube_mesh()
     thin = replace(mesh, vertices=mesh.vertices * [0.5, 1.0, 0.5])
     write_template(tmp_path / "body.npz", thin)
     for name in ("frames", "manifest.json"):
         (tmp_path / name).symlink_to(capture.folder / name)
-    dressed = replace(capture.training_only(), folder=tmp_path)
-    made = smpl(dressed, seed=0, preset="ci")
+    made = method(replace(capture.training_only(), folder=tmp_path), seed=0, preset="ci")
     posed = made.template.pose(Pose(capture.motion, 0)).vertices.numpy()
     radius = np.linalg.norm(posed[:12, [0, 2]] - posed[:12, [0, 2]].mean(0), axis=1)
     assert radius.mean() == pytest.approx(0.05, rel=0.2)
     assert made.template_vertices(Pose(capture.motion, 0)).shape == (0, 3), "as many vertices, but others"
+
+
+# --- Gaussians that are free in every training frame: each learns its own, and new poses get the nearest ones ---------
+
+
+def own_gaussians(capture: Capture) -> PerFrameAvatar:
+    config = tiny_plus({"training.learning_rate": 0.02}, steps=12, warmup_steps=2)
+    return PerFrameAvatar.from_capture(config, capture)
+
+
+def test_a_frame_draws_its_own_gaussians_and_another_pose_those_of_the_nearest(capture: Capture) -> None:
+    avatar = own_gaussians(capture)
+    table = avatar.module.decoders
+    for row, frame in enumerate(table.frames):
+        frame.data.fill_(float(row))
+    frames = capture.splits["train"].frames
+    decoded = [table([avatar._inputs_of(frame)])[0].mean().item() for frame in frames]
+    assert decoded == [0.0, 1.0, 2.0, 3.0]
+    moved = replace(capture.motion, dofs=capture.motion.dofs.copy())
+    moved.dofs[2, :3] += 1.0  # Elsewhere in the room it is the same pose,
+    moved.dofs[2, 8] += 1e-3  # and nearly the same one a little bent.
+    assert table([avatar.module.frame_inputs(Pose(moved, 2))])[0].mean().item() == 2.0
+
+
+def test_a_step_moves_the_frame_that_was_drawn_and_training_is_resumed(capture: Capture, tmp_path: Path) -> None:
+    avatar = own_gaussians(capture)
+    avatar.fit(capture.training_only(), folder=tmp_path / "run")
+    assert all(bool(frame.any()) for frame in avatar.module.decoders.frames)
+    again = own_gaussians(capture)
+    again.fit(capture.training_only(), folder=tmp_path / "run")
+    np.testing.assert_array_equal(*(draw(one, capture, "cam0", 5) for one in (avatar, again)))
+    alone = own_gaussians(capture)
+    inputs = [alone._inputs_of(1)]
+    alone.module.decoders(inputs).sum().backward()
+    grads = [frame.grad is not None for frame in alone.module.decoders.frames]
+    assert grads == [False, True, False, False]
+
+
+def test_it_learns_as_fast_as_static_texels_and_is_else_as_ash_plus() -> None:
+    config, plus = per_frame.config("cpu"), ash_plus.config("cpu")
+    assert config.training.learning_rate == plus.training.base_learning_rate
+    assert replace(config, training=replace(config.training, learning_rate=plus.training.learning_rate)) == plus

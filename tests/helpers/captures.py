@@ -1,7 +1,9 @@
 """A small capture for tests: a bending tube with known texel Gaussians, drawn by the splatter itself."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,8 +13,10 @@ from ash import presets
 from ash.capture.dataset import Capture, Pose, image_path, scan_path, surface_path
 from ash.capture.formats import load_capture, write_cameras, write_motion, write_skeleton, write_template
 from ash.config import AshConfig, ModelConfig, TemplateConfig
+from ash.fields import apply_overrides
 from ash.files import sha256_of, write_arrays, write_image, write_json
 from ash.gaussians.initialising import blank_gaussians
+from ash.mesh.drawing import draw_mesh, textured, topology_of
 from ash.model import AshModel
 from ash.template.template import RestDeformation, Template
 from ash.textures import build_lattice
@@ -32,9 +36,10 @@ def tiny_preset(*, steps: int, warmup_steps: int) -> AshConfig:
     return _tiny(replace(presets.ci(), template=TemplateConfig(nodes=20, steps=3)), steps, warmup_steps)
 
 
-def tiny_plus(*, steps: int, warmup_steps: int) -> AshConfig:
-    """The same with all additions; the warm-up is static."""
-    return _tiny(replace(presets.plus("ci"), template=TemplateConfig(nodes=20, steps=3)), steps, warmup_steps)
+def tiny_plus(changes: Mapping[str, Any] | None = None, *, steps: int, warmup_steps: int) -> AshConfig:
+    """The same with all additions, and other values at dotted keys; the warm-up is static."""
+    base = replace(presets.plus("ci"), template=TemplateConfig(nodes=20, steps=3))
+    return apply_overrides(_tiny(base, steps, warmup_steps), changes or {}, of="tiny")
 
 
 def _tiny(config: AshConfig, steps: int, warmup_steps: int) -> AshConfig:
@@ -43,15 +48,19 @@ def _tiny(config: AshConfig, steps: int, warmup_steps: int) -> AshConfig:
     return replace(config, model=model, training=training)
 
 
+def tube_template() -> Template:
+    """The tube's mesh as it is, skinned."""
+    return Template(tube_mesh(), tube_skeleton(), RestDeformation(tube_mesh()))
+
+
 def known_model() -> AshModel:
     """Texel Gaussians with random colours that no training has touched."""
     config = tube_model_config(motion=False)
-    template = Template(tube_mesh(), tube_skeleton(), RestDeformation(tube_mesh()))
     lattice = build_lattice(tube_mesh(), TEXELS)
     raw = blank_gaussians(config, len(lattice.texels), 0.06)
     raw[:, 10] = 3.0
     raw[:, 11:14] = torch.randn(len(raw), 3, generator=torch.Generator().manual_seed(1))
-    return AshModel(config, template, lattice, raw, None)
+    return AshModel(config, tube_template(), lattice, raw, None)
 
 
 def write_tube_capture(folder: Path) -> Capture:
@@ -86,6 +95,17 @@ def write_tube_capture(folder: Path) -> Capture:
     manifest = {"schema": 1, "scene": "tube", "seed": 0, "splits": splits, "files": files, "complete": True}
     write_json(folder / "manifest.json", manifest)
     return load_capture(folder)
+
+
+def paint_tube(capture: Capture, texture: torch.Tensor, vertices: Callable[[Pose], torch.Tensor]) -> None:
+    """Write all images anew: the tube's mesh with its vertices there, under a texture `[3, h, w]`."""
+    mesh, topology = tube_mesh(), topology_of(torch.from_numpy(tube_mesh().faces))
+    uvs, uv_faces = torch.from_numpy(mesh.uvs).float(), torch.from_numpy(mesh.uv_faces)
+    shade = textured(texture, uvs, uv_faces, torch.zeros(len(mesh.vertices), 3), topology.faces, None)
+    for camera, frame in {view for split in capture.splits.values() for view in split.views}:
+        at = vertices(Pose(capture.motion, frame))
+        drawn = draw_mesh(at, topology, capture.cameras[camera], shade, torch.zeros(3))
+        write_image(image_path(capture.folder, camera, frame), _straight_rgba(drawn[..., :3], drawn[..., 3]))
 
 
 def _straight_rgba(premultiplied: torch.Tensor, alpha: torch.Tensor) -> np.ndarray:

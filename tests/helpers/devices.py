@@ -66,6 +66,7 @@ def without_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ash.mesh.drawing, "_view_of", _some_samples)
     monkeypatch.setattr(ash.mesh.drawing, "_outlines", _no_outlines)
     monkeypatch.setattr(ash.training.adam, "_all_finite", lambda gradients: True)
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: torch.enable_grad())  # `meta` has none.
     equal = torch.equal
     monkeypatch.setattr(torch, "equal", lambda a, b: a.device == b.device == META or equal(a, b))
 

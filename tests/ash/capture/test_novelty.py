@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ash.capture.dataset import Motion
 from ash.capture.novelty import novelty_deg, pose_distances, pose_quats
@@ -30,9 +31,8 @@ def test_a_pose_of_training_is_no_news(motion):
 @pytest.mark.parametrize("angle", [1e-7, 0.3, 2.5, np.pi])
 def test_one_turned_joint_counts_as_its_share_of_all(motion, angle):
     axis = np.array([0.6, 0.0, 0.8])
-    still = moved(motion, 0, 4, 0.2 * axis)
-    still = replace(still, dofs=np.concatenate([still.dofs[:1], still.dofs[:1]]), sequence=still.sequence[:2])
-    turned = moved(still, 1, 4, (0.2 + angle) * axis)
+    still = replace(motion, dofs=motion.dofs[[0, 0]], sequence=motion.sequence[:2])
+    turned = moved(moved(still, 0, 4, 0.2 * axis), 1, 4, (0.2 + angle) * axis)
     np.testing.assert_allclose(novelty_deg(turned, train=(0,), test=(1,)), [np.rad2deg(angle) / JOINTS], rtol=1e-6)
 
 
@@ -40,14 +40,8 @@ def test_neither_place_nor_heading_is_pose_but_leaning_is(motion):
     dofs = motion.dofs.copy()
     dofs[1:3] = dofs[0]
     dofs[1, :3] += 1.0
-    yaw = np.array([np.cos(0.7), 0, np.sin(0.7), 0])  # of the world, after the root's own rotation
-    rotvec = dofs[0, 3:6]
-    angle = np.linalg.norm(rotvec)
-    w, (x, y, z) = np.cos(angle / 2), np.sin(angle / 2) * rotvec / angle
-    a, c = yaw[0], yaw[2]
-    quat = np.array([a * w - c * y, a * x + c * z, a * y + c * w, a * z - c * x])
-    turn = 2 * np.arctan2(np.linalg.norm(quat[1:]), quat[0])
-    dofs[1, 3:6] = turn * quat[1:] / np.linalg.norm(quat[1:])
+    turned = Rotation.from_rotvec([0, 1.4, 0]) * Rotation.from_rotvec(dofs[0, 3:6])  # of the world, after its own
+    dofs[1, 3:6] = turned.as_rotvec()
     same = replace(motion, dofs=dofs)
     np.testing.assert_allclose(novelty_deg(same, train=(0,), test=(1,)), [0.0], atol=1e-6)
     upright, leaning = np.zeros((1, 3 + 3 * JOINTS)), np.zeros((1, 3 + 3 * JOINTS))

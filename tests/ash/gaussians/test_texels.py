@@ -4,15 +4,15 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from helpers.captures import tube_model_config
-from helpers.figures import tube_mesh, tube_motion, tube_skeleton
+from helpers.captures import tube_model_config, tube_template
+from helpers.figures import tube_mesh, tube_motion
 
 from ash.capture.dataset import Motion, Pose
 from ash.gaussians import texels
 from ash.gaussians.gaussians import Gaussians, raw_channels
 from ash.gaussians.texels import Placed, pose, pose_naive, sample_surface, sample_surface_naive
 from ash.rotations import RigidTransforms
-from ash.template.template import PosedTemplate, RestDeformation, Template
+from ash.template.template import PosedTemplate
 from ash.textures import FrameInputs, TexelLattice, build_lattice
 
 pytestmark = pytest.mark.usefixtures("instructions")
@@ -21,7 +21,7 @@ LATTICE = build_lattice(tube_mesh(), 70)  # 3,969 texels: two ranges, and no mul
 
 
 def posed_tube(motion: Motion | None = None) -> PosedTemplate:
-    return Template(tube_mesh(), tube_skeleton(), RestDeformation(tube_mesh())).pose(Pose(motion or tube_motion(), 4))
+    return tube_template().pose(Pose(motion or tube_motion(), 4))
 
 
 def frame_inputs(lattice: TexelLattice = LATTICE) -> FrameInputs:
@@ -103,21 +103,17 @@ def test_gaussians_are_posed_as_defined(sh_degree, lit, changes):
     raw, light = raw_and_light(sh_degree)
     results = []
     for function, dtype in ((pose, torch.float32), (pose_naive, torch.float32), (pose_naive, torch.float64)):
-        leaves = [raw.to(dtype, copy=True).requires_grad_(), light.to(dtype, copy=True).requires_grad_()]
+        leaves = [leaf.to(dtype, copy=True).requires_grad_() for leaf in ((raw, light) if lit else (raw,))]
         here = frame_inputs()
-        if dtype == torch.float64:
-            turned = RigidTransforms(
-                quats=here.transforms.quats.double(), translations=here.transforms.translations.double()
-            )
-            here = replace(here, canonical=here.canonical.double(), normals=here.normals.double(), transforms=turned)
+        turned = RigidTransforms(
+            quats=here.transforms.quats.to(dtype), translations=here.transforms.translations.to(dtype)
+        )
+        here = replace(here, canonical=here.canonical.to(dtype), normals=here.normals.to(dtype), transforms=turned)
         posed = function(leaves[0], here, config, leaves[1] if lit else None)
         values = [getattr(posed, field.name) for field in fields(Gaussians)]
         generator = torch.Generator().manual_seed(2)
-        weights = [torch.randn(value.shape, generator=generator).to(dtype) for value in values]
-        sum((value * weight).sum() for value, weight in zip(values, weights, strict=True)).backward()
-        results.append(
-            [value.detach().double() for value in values] + [leaf.grad.double() for leaf in leaves[: 1 + lit]]
-        )
+        sum((value * torch.randn(value.shape, generator=generator).to(dtype)).sum() for value in values).backward()
+        results.append([value.detach().double() for value in (*values, *(leaf.grad for leaf in leaves))])
     for native, float32, truth in zip(*results, strict=True):
         scale = truth.abs().max()
         assert (native - truth).abs().max() <= max(2 * (float32 - truth).abs().max(), 2e-6 * scale)

@@ -1,18 +1,14 @@
-"""`rasterize_mesh` against its definition, against geometry that is known, and against another renderer."""
+"""`rasterize_mesh` against its definition, and against geometry that is known; OpenGL: `baselines/test_display.py`."""
 
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 import torch
-import trimesh
 from torch import Tensor
 
 from ash.files import InputError
 from ash.mesh.rasterizing import Rasterized, project_vertices, rasterize_by_warp, rasterize_mesh, rasterize_mesh_naive
 from ash.native.library import use_instruction_set
-
-WIDTH, HEIGHT = 96, 80
 
 
 def by_warp(vertices: Tensor, faces: Tensor, *, width: int, height: int, near: float = 0.01) -> Rasterized:
@@ -154,60 +150,3 @@ def test_wrong_input_is_named() -> None:
         rasterize_mesh(vertices, faces, width=0, height=5)
     with pytest.raises(InputError, match="threads"):
         rasterize_mesh(vertices, faces, width=5, height=5, threads=0)
-
-
-# --- another renderer ------------------------------------------------------------------------------------------------
-
-
-def interlocking_shapes() -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Vertices, faces, viewmat and K of two interlocking shapes, one of them smooth and finely meshed."""
-    ring = trimesh.creation.torus(major_radius=0.7, minor_radius=0.25, major_sections=40, minor_sections=20)
-    box = trimesh.creation.box(extents=(0.5, 1.6, 0.5))
-    mesh = trimesh.util.concatenate([ring, box])
-    turn = trimesh.transformations.euler_matrix(0.5, 0.4, 0.2)
-    turn[:3, 3] = (0.1, -0.05, 2.6)
-    K = torch.tensor([[100.0, 0, 45.3], [0, 100, 41.7], [0, 0, 1]], dtype=torch.float64)
-    return torch.from_numpy(np.array(mesh.vertices)), torch.from_numpy(np.array(mesh.faces)), torch.from_numpy(turn), K
-
-
-def edge_distance(drawn: Rasterized, vertices: Tensor, faces: Tensor) -> Tensor:
-    """Pixels to the nearest edge of the triangle that each pixel sees; 0 where it sees none."""
-    corners = (vertices[:, :2] / vertices[:, 2:])[faces[drawn.triangle.clamp_min(0).long()]]
-    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
-    pixel = torch.stack([x, y], -1)
-    distances = []
-    for i in range(3):
-        a, b = corners[..., i, :], corners[..., (i + 1) % 3, :]
-        along, across = b - a, pixel - a
-        distances.append((along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0]).abs() / along.norm(dim=-1))
-    return torch.where(drawn.triangle >= 0, torch.stack(distances).amin(0), 0.0)
-
-
-def test_ids_are_those_of_mitsubas_ray_cast() -> None:
-    mitsuba = pytest.importorskip("mitsuba")
-    mitsuba.set_variant("scalar_rgb")
-    shapes = interlocking_shapes()
-    points, faces, viewmat, K = (tensor.numpy() for tensor in shapes)
-    mesh = mitsuba.Mesh("mesh", vertex_count=len(points), face_count=len(faces))
-    parameters = mitsuba.traverse(mesh)
-    parameters["vertex_positions"] = points.astype(np.float32).ravel()
-    parameters["faces"] = faces.astype(np.uint32).ravel()
-    parameters.update()
-    world = mitsuba.load_dict({"type": "scene", "mesh": mesh})
-    origin = -viewmat[:3, :3].T @ viewmat[:3, 3]
-    ids = np.full((HEIGHT, WIDTH), -1)
-    inverse = viewmat[:3, :3].T @ np.linalg.inv(K)
-    for y in range(HEIGHT):
-        for x in range(WIDTH):
-            direction = inverse @ [x + 0.5, y + 0.5, 1]
-            ray = mitsuba.Ray3f(mitsuba.Point3f(origin), mitsuba.Vector3f(direction / np.linalg.norm(direction)))
-            hit = world.ray_intersect_preliminary(ray)
-            if hit.is_valid():
-                ids[y, x] = hit.prim_index
-    vertices = project_vertices(shapes[0], *shapes[2:])
-    drawn = rasterize_mesh(vertices, shapes[1], width=WIDTH, height=HEIGHT)
-    different = drawn.triangle.numpy() != ids
-    # On the silhouette one of the two sees nothing, or what lies behind: a neighbour of a pixel at an edge.
-    near_edge = (edge_distance(drawn, vertices, shapes[1]) < 0.01).numpy()
-    assert (drawn.triangle >= 0).float().mean() > 0.25
-    assert different.mean() < 0.005 and not (different & ~near_edge).any()

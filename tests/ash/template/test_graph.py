@@ -97,34 +97,29 @@ def test_learned_deformation_sees_the_past():
     changed.dofs[2, 6:] += 0.5
     deformation = learned()
     unused = RigidTransforms(quats=torch.zeros(0, 4), translations=torch.zeros(0, 3))
-    assert not torch.allclose(
-        deformation.canonical(Pose(motion, 4), unused), deformation.canonical(Pose(changed, 4), unused)
-    )
-    torch.testing.assert_close(
-        deformation.canonical(Pose(motion, 1), unused), deformation.canonical(Pose(changed, 1), unused)
-    )
+    for frame, sees in ((4, True), (1, False)):
+        before, after = (deformation.canonical(Pose(each, frame), unused) for each in (motion, changed))
+        assert torch.allclose(before, after) != sees
 
 
-def test_weights_per_node_tell_nodes_apart_that_shared_weights_cannot(graph):
+@pytest.mark.parametrize("released", [False, True])
+def test_weights_per_node_tell_nodes_apart_that_shared_weights_cannot(released, graph):
     """Equal inputs at all nodes: shared weights give equal outputs, weights per node do not."""
-    equal = torch.ones(len(graph.nodes), 4)
-    for released in (False, True):
-        torch.manual_seed(0)
-        net = GraphNet(4, 2, TemplateConfig(blocks=1, released=released), nodes=len(graph.nodes))
-        torch.nn.init.normal_(net.head.weight)
-        out = net(equal, graph.adjacency)
-        assert (out.std(0).max() > 1e-3) == released
+    torch.manual_seed(0)
+    net = GraphNet(4, 2, TemplateConfig(blocks=1, released=released), nodes=len(graph.nodes))
+    torch.nn.init.normal_(net.head.weight)
+    out = net(torch.ones(len(graph.nodes), 4), graph.adjacency)
+    assert (out.std(0).max() > 1e-3) == released
 
 
-def test_the_dense_layer_alone_carries_news_across_the_whole_mesh(graph):
+@pytest.mark.parametrize("dense", [False, True])
+def test_the_dense_layer_alone_carries_news_across_the_whole_mesh(dense, graph):
     """One block reaches three hops; what a node says farther away can only come through the full matrix."""
-    for dense in (False, True):
-        torch.manual_seed(0)
-        net = GraphNet(3, 3, TemplateConfig(blocks=1), nodes=len(rest()), dense=dense)
-        torch.nn.init.normal_(net.head.weight)
-        if net.across is not None:
-            torch.nn.init.normal_(net.across.weight)
-        x = rest().clone()
-        before = net(x, graph.vertex_adjacency)
-        x[0] += 1.0  # The lowest ring; the highest is eight edges away.
-        assert (not torch.equal(net(x, graph.vertex_adjacency)[-1], before[-1])) == dense
+    torch.manual_seed(0)
+    net = GraphNet(3, 3, TemplateConfig(blocks=1), nodes=len(rest()), dense=dense)
+    for layer in (net.head, net.across) if dense else (net.head,):
+        torch.nn.init.normal_(layer.weight)
+    x = rest().clone()
+    before = net(x, graph.vertex_adjacency)
+    x[0] += 1.0  # The lowest ring; the highest is eight edges away.
+    assert (not torch.equal(net(x, graph.vertex_adjacency)[-1], before[-1])) == dense

@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.captures import tube_model_config, write_tube_capture
+from helpers.captures import paint_tube, tube_model_config, write_tube_capture
 from helpers.figures import tube_mesh
+from helpers.learning import tiny_mesh
 
 from ash.avatar import AshAvatar
-from ash.capture.dataset import Capture, Pose, image_path
+from ash.capture.dataset import Capture, Pose
 from ash.config import TemplateConfig
-from ash.files import write_image
-from ash.mesh.drawing import blend, draw_mesh, sample_texture, topology_of
 from ash.presets import plus
 from ash.template.template import skinned_template
 from ash.template_learning.refining import UNIT_M, MotionRefinement, Refinement, refined_template
@@ -24,15 +23,9 @@ def capture(tmp_path_factory) -> Capture:
     """Pictures of a textured tube, for methods whose template is 15 mm too thick from its waist up."""
     made = write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")
     true = skinned_template(made)
-    texture = torch.rand(3, 8, 8, generator=torch.Generator().manual_seed(0)).repeat_interleave(4, 1)
-    texture, mesh, topology = texture.repeat_interleave(4, 2), made.template, topology_of(true.faces)
-    uvs, uv_faces = torch.from_numpy(mesh.uvs).float(), torch.from_numpy(mesh.uv_faces)
-    for camera, frame in [view for split in made.splits.values() for view in split.views]:
-        posed = true.pose(Pose(made.motion, frame))
-        shade = lambda t, w: sample_texture(texture, blend(uvs, uv_faces[t], w))  # noqa: E731
-        drawn = draw_mesh(posed.vertices, topology, made.cameras[camera], shade, torch.zeros(3))
-        straight = torch.cat([drawn[..., :3] / drawn[..., 3:].clamp(min=0.25), drawn[..., 3:]], -1)
-        write_image(image_path(made.folder, camera, frame), (255 * straight).round().to(torch.uint8).numpy())
+    texture = torch.rand(3, 8, 8, generator=torch.Generator().manual_seed(0))
+    texture, mesh = texture.repeat_interleave(4, 1).repeat_interleave(4, 2), made.template
+    paint_tube(made, texture, lambda pose: true.pose(pose).vertices)
     thicker = mesh.vertices * np.where(mesh.vertices[:, 1:2] > 0.4, [1.15, 1, 1.15], 1.0)
     return replace(made, template=replace(mesh, vertices=thicker))
 
@@ -55,13 +48,11 @@ def test_a_refinement_starts_at_nothing_and_is_smooth():
     assert (refinement.rough.grad > 0).all()
 
 
-def moving(capture: Capture) -> MotionRefinement:
-    """A refinement whose networks say something."""
-    refinement = MotionRefinement(TemplateConfig(nodes=30), capture.template, capture.skeleton)
+def let_it_move(refinement: MotionRefinement, spread: float) -> None:
+    """Let the heads of its networks say something."""
     torch.manual_seed(0)
     for net in (refinement.nets.graph_net, refinement.nets.displacement_net):
-        torch.nn.init.normal_(net.head.weight, std=0.01)
-    return refinement
+        torch.nn.init.normal_(net.head.weight, std=spread)
 
 
 def test_a_refined_template_is_the_old_one_moved_and_all_that_is_drawn_from_it_follows(capture):
@@ -69,7 +60,7 @@ def test_a_refined_template_is_the_old_one_moved_and_all_that_is_drawn_from_it_f
     refined, refinement = refined_template(old, TemplateConfig(nodes=30))
     pose = Pose(capture.motion, 2)
     torch.testing.assert_close(refined.pose(pose).vertices, old.pose(pose).vertices, atol=1e-6, rtol=0)
-    refinement.load_state_dict(moving(capture).state_dict())
+    let_it_move(refinement, 0.01)
     refined.clear_cache()
     shift, other = (refinement(refinement.window(Pose(capture.motion, frame))).detach() for frame in (2, 3))
     assert float(shift.norm(dim=1).max()) > 1e-4 and not torch.equal(shift, other)
@@ -86,25 +77,15 @@ def test_splats_of_a_refined_template_see_textures_redrawn_from_it(capture):
     avatar = AshAvatar.from_capture(replace(plus("ci"), model=tube_model_config(refine=True)), capture)
     before = avatar._inputs_of(1)
     assert before.canonical.requires_grad and before.normals.requires_grad and not before.textures.requires_grad
-    avatar.module.refinement.load_state_dict(moving_like(avatar, capture))
+    let_it_move(avatar.module.refinement, 0.05)
     after = avatar._inputs_of(1)
     assert not torch.allclose(after.textures, before.textures, atol=1e-4)
     assert not torch.allclose(after.canonical, before.canonical, atol=1e-5)
 
 
-def moving_like(avatar: AshAvatar, capture: Capture) -> dict[str, torch.Tensor]:
-    """The weights of the avatar's refinement, with heads that say something."""
-    state = avatar.module.refinement.state_dict()
-    torch.manual_seed(0)
-    return {name: torch.randn_like(v) * 0.05 if ".head.weight" in name else v for name, v in state.items()}
-
-
 def ddc(capture: Capture, *, refine: str) -> DdcAvatar:
-    ash = plus("ci")
-    model = replace(ash.model, texels=16, width=4, levels=2, window=2)
-    training = replace(ash.training, steps=120, warmup_steps=60, base_learning_rate=0.1)
-    config = ddc_config(replace(ash, model=model, training=training), seed=0, template=TemplateConfig())
-    return DdcAvatar.from_capture(replace(config, refine=refine), capture)
+    config = tiny_mesh({"training.base_learning_rate": 0.1}, refine=refine, steps=80, warmup_steps=40)
+    return DdcAvatar.from_capture(config, capture)
 
 
 def test_ddc_moves_its_vertices_to_where_the_images_show_them(capture, tmp_path):
@@ -136,7 +117,7 @@ def test_an_exact_surface_is_not_refined():
 
 def test_splats_pull_at_the_template_where_refine_is_on(capture, tmp_path):
     ash = plus("ci")
-    training = replace(ash.training, steps=100, warmup_steps=50, base_learning_rate=0.05)
+    training = replace(ash.training, steps=24, warmup_steps=16, base_learning_rate=0.15)
     config = replace(ash, model=tube_model_config(refine=True, offset=False), training=training)
     learner = AshAvatar.from_capture(config, capture)
     rest = torch.from_numpy(capture.template.vertices).float()
@@ -148,6 +129,4 @@ def test_splats_pull_at_the_template_where_refine_is_on(capture, tmp_path):
     learner.save(tmp_path / "model.safetensors")
     again = AshAvatar.from_capture(config, capture)
     again.load(tmp_path / "model.safetensors")
-    assert np.array_equal(
-        again.template_vertices(Pose(capture.motion, 1)), learner.template_vertices(Pose(capture.motion, 1))
-    )
+    np.testing.assert_array_equal(*(each.template_vertices(Pose(capture.motion, 1)) for each in (again, learner)))

@@ -1,7 +1,6 @@
 """The paper's warm-up: some frames are fitted one by one, each for as long as it gains, and decoders learn the fits."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +24,9 @@ def capture(capture: Capture) -> Capture:
 
 
 def avatar(capture: Capture, **training: Any) -> AshAvatar:
-    config = tiny_plus(steps=2, warmup_steps=2)
-    settings = {"warmup": "fitted", **training}
-    return AshAvatar.from_capture(replace(config, training=replace(config.training, **settings)), capture)
+    changes = {"warmup": "fitted", **training}
+    config = tiny_plus({f"training.{key}": value for key, value in changes.items()}, steps=2, warmup_steps=2)
+    return AshAvatar.from_capture(config, capture)
 
 
 @pytest.mark.parametrize(("every", "fitted"), [(1, (0, 1, 2, 3)), (2, (0, 2)), (3, (0, 3)), (FITTED_EVERY, (0,))])
