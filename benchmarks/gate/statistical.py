@@ -63,12 +63,12 @@ def judge_quality(pairs: Pairs, *, looks: int) -> tuple[list[Check], list[str]]:
                     tests.append(replace(test, p=min(1.0, looks * test.p)))
                     change = f"{old.mean():.4g} -> {new.mean():.4g}{metric.unit and ' ' + metric.unit}"
                     asked.append((row, "/".join(name), change))
-    for (row, name, change), test in zip(asked, corrected(tests), strict=True):
+    for (row, quality, change), test in zip(asked, corrected(tests), strict=True):
         detail = (
             f"{change} ({test.mean:+.4g} [{test.low:+.4g}, {test.high:+.4g}], p {test.p:.2g}, {test.verdict}; "
             f"a change of {max(test.margin, test.detectable):.2g} would have been seen)"
         )
-        checks.append(Check(row, "quality", OF_VERDICT[test.verdict], detail, name))
+        checks.append(Check(row, "quality", OF_VERDICT[test.verdict], detail, quality))
         if test.verdict == "unclear" and row not in undecided:
             undecided.append(row)
     return checks, undecided

@@ -248,8 +248,8 @@ def _marks(tables: RunTables, spec: TableSpec, rows: Sequence[TableRow]) -> dict
         tests.append((k, order, [each for each in pairs if each is not None]))
     adjusted = iter(corrected([pair for _, _, pairs in tests for pair in pairs]))
     marks: dict[tuple[int, int], Mark] = {}
-    for k, order, pairs in tests:
-        verdicts = [next(adjusted).verdict for _ in pairs]
+    for k, order, compared in tests:
+        verdicts = [next(adjusted).verdict for _ in compared]
         if verdicts and all(verdict == "better" for verdict in verdicts):
             marks |= {(places[order[0]], k): "best", (places[order[1]], k): "second"}
     return marks

@@ -231,7 +231,7 @@ def graph_nodes(template: TemplateMesh) -> np.ndarray:
         covered, before = near[np.array(nodes, dtype=np.int64)].sum(axis=0) > 0, len(nodes)
         for vertex in far:
             if not covered[vertex]:
-                nodes.append(vertex)
+                nodes.append(int(vertex))
                 covered[near.indices[near.indptr[vertex] : near.indptr[vertex + 1]]] = True
         if len(nodes) == before:
             raise InputError(
