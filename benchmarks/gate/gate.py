@@ -232,14 +232,14 @@ def _cost_checks(
     for row, (before, after) in pairs.items():
         first, here = before[0], by_row[row][0]
         checks += count_checks(row, first.result, after[0].result)
-        in_turn = row in drawn and against is not None and first.cell.config.source in against.methods
-        if in_turn and against is not None:
-            timed, times[row] = interleaved(row, first, here, out, against)
+        in_turn = against if row in drawn and against and first.cell.config.source in against.methods else None
+        if in_turn is not None:
+            timed, times[row] = interleaved(row, first, here, out, in_turn)
             checks += timed
         if machine == baseline.file.machine:
             checks.append(memory_check(row, before, after))
             old, training = baseline.file.times.get(row, {}), training_time(after)
-            if row in drawn and not in_turn:
+            if row in drawn and in_turn is None:
                 timed, times[row] = _times_again(row, old, training, _timings(drawn[row], first, here, out))
                 checks += timed
             else:

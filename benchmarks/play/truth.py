@@ -126,6 +126,6 @@ def _serve(folder: Path, connection: Connection) -> None:
             return
         try:
             truth = truth or PoseTruth(load_capture(folder))
-            connection.send(truth.picture(pose, camera, captured=captured, tell=lambda _: None))
+            connection.send(truth.picture(pose, camera, captured=captured))
         except Exception as error:  # The player goes on, and its page says what went wrong.
             connection.send(f"{type(error).__name__}: {error}")

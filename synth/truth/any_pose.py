@@ -1,6 +1,5 @@
 """The truth of a capture's person in any pose, seen by any camera: rendered when it is asked for."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -32,18 +31,13 @@ class PoseTruth:
             raise InputError(f"{capture.folder}: has no truth to render")
         self.renderer = probe()
 
-    def picture(self, pose: Pose, camera: Camera, *, captured: bool, tell: Callable[[str], None]) -> np.ndarray:
+    def picture(self, pose: Pose, camera: Camera, *, captured: bool) -> np.ndarray:
         """RGBA uint8 `[h, w, 4]`, straight alpha: exactly the capture's image where frame and camera are its own.
 
         `captured`: the frame is one of the capture's, whose surface is known; else the person is posed and dressed
-        anew, from `HISTORY` frames of the motion. `tell` hears what is being done.
+        anew, from `HISTORY` frames of the motion.
         """
-        if captured:
-            surface = read_surface_truth(self.capture.folder, pose.frame)
-        else:
-            tell("posing the body and its clothes")
-            surface = dressed(self.scene, pose)
-        tell("tracing light")
+        surface = read_surface_truth(self.capture.folder, pose.frame) if captured else dressed(self.scene, pose)
         studio = studio_of(self.scene, self.capture.folder, self.renderer)
         seed = stream(self.scene, "pixels", camera.name, pose.frame)
         return studio.render(surface, [camera], samples=self.scene.samples, seeds=[seed])[0].rgba
