@@ -296,7 +296,8 @@ def read_run(folder: Path) -> Run:
 def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
     """The finished cells of several runs as one, to be reported in `out`; a cell that several have is taken once.
 
-    Where one scene's name stands for different captures of a subject, each is called as its capture's folder is.
+    Where one scene's name stands for different captures of a subject, each is called as its capture's folder is. The
+    commands of the runs and then `command` are the command of the whole.
 
     Raises:
         InputError: a folder is no run, people for validation are among others, or two cells of one name were trained
@@ -321,7 +322,8 @@ def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
     table = next((run.table for run in runs if run.table), ())
     there = {cell.config.key for cell in cells}
     absent = tuple(dict.fromkeys(key for run in runs for key in run.absent if key not in there))
-    given: dict[str, Any] = {"suite": out.name, "about": about, "command": command, "titles": titles, "table": table}
+    commands = "; ".join(dict.fromkeys(filter(None, (*(run.command for run in runs), command))))
+    given: dict[str, Any] = {"suite": out.name, "about": about, "command": commands, "titles": titles, "table": table}
     return Run(folder=out, cells=tuple(named), absent=absent, **given)
 
 

@@ -93,7 +93,7 @@ def runs(made_once: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     for folder, made in zip(folders, read_run(made_once).cells, strict=True):
         row = {"method": "mine", "factory": made.config.method}
         cells = tuple(copied(made, folder, **row, seed=seed) for seed in range(2))
-        write_run(Run(folder=folder, suite=folder.name, about="", command="", cells=cells))
+        write_run(Run(folder=folder, suite=folder.name, about="", command=f"run {folder.name}", cells=cells))
     return folders
 
 
@@ -123,8 +123,9 @@ def test_a_report_over_runs_and_cells(runs: tuple[Path, Path], tmp_path: Path, n
     cells = [*(runs[0] / "cells").iterdir()]
     assert cli.main(["report", *map(str, cells), "--out", str(tmp_path / "both")]) == 0
     assert "boxes" in (tmp_path / "both" / "report.md").read_text()
-    run = gathered([runs[0], cells[0]], tmp_path, command="")
+    run = gathered([runs[0], cells[0]], tmp_path, command="report")
     assert len(run.cells) == 2 and len({each.config.key for each in run.cells}) == 2
+    assert run.command == "run before; report"
 
 
 def test_two_avatars_of_one_name_are_no_two_seeds(runs: tuple[Path, Path], tmp_path: Path) -> None:
