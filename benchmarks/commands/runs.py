@@ -247,7 +247,8 @@ class CompareCommand:
 class ClaimsCommand:
     """Judge claims by the rows of runs: what the ASH paper says, and what our README says.
 
-    A claim is a contrast of two rows on a scene, judged in pairs over people, within the run that has the most of them.
+    A claim is a contrast of two rows on a scene, judged in pairs over people. Runs that one report can hold are judged
+    as one run; of others, a claim is judged by the run that has the most people.
     Exit code 1 where a claim that held in an earlier judgement (--before) does not hold any more.
     """
 
@@ -260,13 +261,17 @@ class ClaimsCommand:
         """Print the verdicts, and write the page."""
         from benchmarks.analysis.claims import FILE, read_claims
         from benchmarks.report.claims import write_claims
-        from benchmarks.suites.runs import read_run
+        from benchmarks.suites.runs import gathered, read_run
 
         if not self.runs:
             raise InputError("expected the folder of a run")
-        lines, lost = write_claims(
-            [read_run(run) for run in self.runs], read_claims(self.claims or FILE), self.out, self.before
-        )
+        runs = [read_run(run) for run in self.runs]
+        if len(runs) > 1:
+            try:
+                runs = [gathered(self.runs, Path(", ".join(map(str, self.runs))), command="")]
+            except InputError as error:
+                print(f"each run is judged by itself ({error})", file=sys.stderr)
+        lines, lost = write_claims(runs, read_claims(self.claims or FILE), self.out, self.before)
         print("\n".join([*lines, str(self.out / "claims.html")]))
         for claim in lost:
             print(f"no longer holds: {claim}", file=sys.stderr)

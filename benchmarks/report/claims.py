@@ -61,7 +61,8 @@ def write_claims(
     blocks.append(Bullets(items=tuple(_told(claim, table[table["name"] == claim.name]) for claim in claims)))
     if lost:
         blocks.insert(0, Bullets(items=tuple(lost)))
-    if links := [os.path.relpath(path, out) for run in runs if (path := run.folder / "report.html").exists()]:
+    folders = dict.fromkeys(cell.folder.parents[1] for run in runs for cell in run.cells)
+    if links := [os.path.relpath(path, out) for folder in folders if (path := folder / "report.html").exists()]:
         blocks.append(Text(text=f"Reports of the runs: {', '.join(links)}."))
     groups = tuple(_pictures(claims, table, rows, album))
     page = [*blocks, *([Strips(file="", title="", groups=groups)] if groups else [])]

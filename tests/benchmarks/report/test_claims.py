@@ -13,11 +13,11 @@ from ash.files import InputError
 from benchmarks import cli
 from benchmarks.analysis.claims import Claim, broken, judge, read_claims
 from benchmarks.analysis.results import load
-from benchmarks.cell.schema import Cell, result_of, write_result
+from benchmarks.cell.schema import Cell, result_of, write_config, write_result
 from benchmarks.commands.arguments import FAILED
 from benchmarks.report.claims import write_claims
 from benchmarks.suites.files import find_suite, suite_files
-from benchmarks.suites.runs import Run, read_run
+from benchmarks.suites.runs import Run, read_run, write_run
 from benchmarks.suites.suites import Suite
 
 PAPER = {"view_psnr": ("novel_view", "psnr"), "pose_psnr": ("novel_pose", "psnr")}
@@ -214,6 +214,35 @@ def test_a_page_shows_what_was_judged(two_people: Run, tmp_path: Path) -> None:
     page = (tmp_path / "judged" / "claims.html").read_text()
     assert "the view of the median difference" in page and "run/report.html" in page
     assert "more detail is more accurate" in (tmp_path / "judged" / "claims.md").read_text()
+
+
+def part_of(run: Run, method: str, folder: Path, *, preset: str = "ci") -> Path:
+    """A run of one row of another, perhaps trained in another way."""
+    made = []
+    for cell in (cell for cell in run.cells if cell.config.method == method):
+        config, result = replace(cell.config, preset=preset), result_of(cell)
+        assert result is not None
+        made.append(replace(cell, config=config, folder=folder / "cells" / config.key))
+        write_config(made[-1])
+        write_result(made[-1].folder, replace(result, config=config))
+    write_run(replace(run, folder=folder, cells=tuple(made), absent=()))
+    return folder
+
+
+def test_rows_of_two_runs_are_compared_where_one_report_can_hold_them(
+    two_people: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not where a row was trained in two ways."""
+    file = tmp_path / "claims.toml"
+    file.write_text(BOXES)
+    good, bad = (part_of(two_people, f"fake_{name}", tmp_path / name) for name in ("good", "bad"))
+    other = part_of(two_people, "fake_good", tmp_path / "other_way", preset="brief")
+    asked = ["claims", str(good), str(bad), "--claims", str(file), "--out", str(tmp_path / "judged")]
+    assert cli.main(asked) == cli.DONE
+    assert "confirmed 1" in capsys.readouterr().out
+    assert cli.main([*asked, str(other)]) == cli.DONE
+    printed = capsys.readouterr()
+    assert "cannot be judged here 1" in printed.out and "each run is judged by itself" in printed.err
 
 
 def test_the_command(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
