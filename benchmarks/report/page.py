@@ -25,8 +25,8 @@ from benchmarks.report.vega import Figure
 from benchmarks.suites.archive import write_archive
 from benchmarks.suites.runs import Run, results_of
 
-PUBLISHED = ("report.md", "results.csv", "tables.tex", "chart_*.svg", "pictures_*.png", "worst_*.png")
-PICTURE_SUFFIXES = (".svg", ".png")
+PUBLISHED = ("report.md", "results.csv", "tables.tex", "chart_*.svg", "pictures_*.webp", "worst_*.webp")
+PICTURE_SUFFIXES = (".svg", ".webp")
 CELLS = "cells.zip"
 PICTURE_BYTES = 10_000_000  # of all pictures that are stepped through; worst frames come on top
 

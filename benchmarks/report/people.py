@@ -97,7 +97,7 @@ def pictured(
         groups.append((who, tuple(replace(row, title=f"{who}, {row.title}").strip(album) for row in rows)))
         columns.append([replace(rows[0].images[0], caption=who), *rows[0].images[1:]])
     lines = [Frames(title="", images=line) for line in zip(*columns, strict=True)]
-    file = f"pictures_people_{scene}.png"
+    file = f"pictures_people_{scene}.webp"
     strips = Strips(file=file, title=f"All subjects on {scene}", groups=tuple(groups))
     return strips, {file: pictures.sheet(lines, scale=1 if len(columns) > FEW_SUBJECTS else 2)}
 

@@ -42,7 +42,10 @@ def read_me(folder: Path = FOLDER) -> str:
 
 
 class Numbers:
-    """What a template may ask for; a quantity is named by split and metric (`benchmarks.cell.metrics`)."""
+    """What a template may ask for; a quantity is named by split and metric (`benchmarks.cell.metrics`).
+
+    Rows of several reports are those of "one+other".
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -125,14 +128,14 @@ class Numbers:
         return f"{table.loc[key, 'value']:.{measure.decimals}f}"
 
     def _read(self, report: str) -> pd.DataFrame:
-        rows = read_csv(self.folder / report / "results.csv")
+        rows = pd.concat([read_csv(self.folder / name / "results.csv") for name in report.split("+")])
         if set(rows["protocol"]) != {PROTOCOL}:
             raise InputError(f"{self.folder / report}: expected results of protocol {PROTOCOL}")
         return rows
 
 
 def _quantity(split: str, metric: str) -> Quantity:
-    if split in ("speed", "memory"):
+    if split in ("speed", "memory") or METRICS[metric].unit == "mm":
         return Quantity(split, "", metric)
     return Quantity(split, "full", metric) if metric in ON_WHOLE_FRAMES else foreground(split, metric)
 

@@ -269,7 +269,7 @@ def _picture_sections(
         subjects, subject_sheet = people.pictured(data.run, data.results, data.tables, data.scene, data.album)
         strips, worst_sheet = _worst(data, capture, shown)
     except InputError as error:
-        files = {f"{kind}_{data.scene}.png": name for kind, name in SHEETS.items()}  # of an earlier report
+        files = {f"{kind}_{data.scene}.webp": name for kind, name in SHEETS.items()}  # of an earlier report
         earlier = [Strips(file=f, title=name, groups=()) for f, name in files.items() if (data.run.folder / f).exists()]
         reason = Text(text=trouble if capture is None else _no_pictures(data, error), note=True)
         return [Section(title=title, blocks=(*earlier, reason))], {}
@@ -306,7 +306,7 @@ def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Fl
         panels=charts.frames(pd.DataFrame(points), series),
         series=series,
     )
-    file = f"pictures_{data.scene}.png"
+    file = f"pictures_{data.scene}.webp"
     wanted = [each for each in shown if not is_ours(each.cell.config.method)]
     wanted += [each for each in shown if each.cell.config.method in ON_SHEETS]
     sheet = pictures.sheet(pictures.comparisons(capture, (wanted or shown)[:AT_MOST_ON_SHEETS]))
@@ -319,7 +319,7 @@ def _worst(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Strip
     frames = {title: rows for title, rows in frames.items() if rows}
     if not frames:
         return None, {}
-    file = f"worst_{data.scene}.png"
+    file = f"worst_{data.scene}.webp"
     groups = tuple((title, tuple(row.strip(data.album) for row in rows)) for title, rows in frames.items())
     sheet = pictures.sheet(next(iter(frames.values())))
     return Strips(file=file, title="The worst frames", groups=groups), {file: sheet}

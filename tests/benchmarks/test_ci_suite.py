@@ -26,7 +26,7 @@ def run(ci_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def results(run: Path) -> list[CellResult]:
     assert (run / "report.html").stat().st_size > 100_000
-    assert (run / "worst_mannequin.png").exists()
+    assert (run / "worst_mannequin.webp").exists()
     assert "of the squared error on" in (run / "report.md").read_text()
     assert (run / "report.md").read_text().count("given the exact surface") == 2, "below the chart and below the table"
     return results_of(read_run(run))

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("installed_fakes")
 
 
 def test_a_run_leaves_its_report(finished: Path) -> None:
-    for name in ("report.html", "report.md", "results.csv", "tables.tex", "chart_boxes.svg", "pictures_boxes.png"):
+    for name in ("report.html", "report.md", "results.csv", "tables.tex", "chart_boxes.svg", "pictures_boxes.webp"):
         assert (finished / name).stat().st_size > 0, name
     (cell, _) = sorted((finished / "cells").iterdir())
     assert {"config.json", "result.json", "log.jsonl", "images"} <= {path.name for path in cell.iterdir()}

@@ -291,7 +291,7 @@ def test_what_is_published_replaces_what_was_before_and_is_a_run_again_which_doe
     shutil.unpack_archive(place / "cells.zip", again)
     assert not any(str(run.folder.parent) in path.read_text() for path in again.rglob("config.json"))
     assert results_of(read_run(again)) == results_of(run)
-    sheets = ("pictures_boxes.png", "worst_boxes.png")
+    sheets = ("pictures_boxes.webp", "worst_boxes.webp")
     for name in sheets:  # As an earlier report left them.
         shutil.copy(run.folder / name, again / name)
     command = ["report", str(again), "--publish", str(tmp_path / "second")]

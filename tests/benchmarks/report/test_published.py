@@ -43,6 +43,12 @@ def test_numbers_are_those_of_the_csv(numbers: Numbers) -> None:
     assert "| ASH | 27.00 | n/a |" in numbers.scores("mine", "loose")
 
 
+def test_rows_of_two_reports_are_compared(numbers: Numbers) -> None:
+    (numbers.folder / "other").mkdir()
+    (numbers.folder / "other" / "results.csv").write_text(csv_of(load(people({"smpl": (23.0, 25.0, 27.0)}))))
+    assert numbers.difference("mine+other", "loose", "smpl", "ash") == "-2.00 dB [-2.00, -2.00]"
+
+
 def test_rows_that_did_not_run_and_other_protocols_are_refused(numbers: Numbers) -> None:
     with pytest.raises(InputError, match="expected rows ash and wo_mot on loose"):
         numbers.difference("mine", "loose", "ash", "wo_mot")
