@@ -20,6 +20,10 @@ def test_the_readme_has_the_numbers_of_the_reports() -> None:
     for scene in ("loose", "tight"):
         assert numbers.difference("table", scene, "ash", "ddc") in text
         assert numbers.difference("table", scene, "ash_plus", "ash") in text
+    for ablation in ("wo_disp", "smpl"):
+        assert numbers.difference("table+ablations", "loose", ablation, "ash") in text
+    ash, ddc = (float(numbers.score("longer", "loose", method)) for method in ("ash", "ddc"))
+    assert f"ASH has {ash:.1f} dB and the mesh, at its plateau, {ddc:.1f}." in text
 
 
 def test_every_report_is_on_the_front_page() -> None:
