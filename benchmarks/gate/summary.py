@@ -82,7 +82,7 @@ def write_pictures(judged: Judgement, out: Path) -> list[Path]:
     paths = []
     for number, (row, worst) in enumerate(judged.worst.items()):
         path = out / f"rendering_{number}.png"
-        write_atomic(path, sheet([_frames(row, worst)]))
+        write_atomic(path, sheet([_frames(row, worst)], form="PNG"))
         paths.append(path)
     return paths
 

@@ -9,7 +9,7 @@ import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -143,8 +143,8 @@ def worst(capture: Capture, shown: Shown, *, count: int) -> list[Frames]:
     return frames
 
 
-def sheet(rows: Sequence[Frames], *, scale: int = 2) -> bytes:
-    """All rows in one WebP with captions, for Markdown and README; a PNG takes three times the bytes."""
+def sheet(rows: Sequence[Frames], *, scale: int = 2, form: Literal["WEBP", "PNG"] = "WEBP") -> bytes:
+    """All rows in one picture with captions, for Markdown and README; a PNG takes three times the bytes."""
     font = ImageFont.load_default(size=13)
     gap, caption = 10, 34
     lines = [line for row in rows for line in (row.images, row.errors) if line]
@@ -166,7 +166,7 @@ def sheet(rows: Sequence[Frames], *, scale: int = 2) -> bytes:
             pen.text((left, top + 16), frame.score, fill=(95, 105, 120), font=font)
         top += height
     buffer = io.BytesIO()
-    paper.save(buffer, format="WEBP", quality=90)
+    paper.save(buffer, format=form, quality=90)
     return buffer.getvalue()
 
 
