@@ -219,7 +219,7 @@ class CameraControl:
     """Moves a browser's camera, and follows it."""
 
     def __init__(self, viewer: Viewer, capture: Capture, on_choice: Callable[[str], None]) -> None:
-        """`on_choice` gets the name of the camera that the viewer looks through once the view was turned."""
+        """`on_choice` gets the name of the free camera once the view was turned."""
         self._viewer, self._capture, self._on_choice = viewer, capture, on_choice
         self._client = viewer.client
         self._jumped: tuple[float, np.ndarray] | None = None
@@ -252,8 +252,9 @@ class CameraControl:
             return
         resized_only = before is None or np.array_equal(now.viewmat, before.viewmat)
         stays = self._is_where_it_jumped(now) or resized_only
-        state = self._viewer.change(lambda s: replace(s, viewpoint=now, camera=s.camera if stays else FREE))
-        self._on_choice(state.camera)
+        self._viewer.change(lambda s: replace(s, viewpoint=now, camera=s.camera if stays else FREE))
+        if not stays:  # Else a choice that is under way would be taken back.
+            self._on_choice(FREE)
 
     def _is_where_it_jumped(self, now: Camera) -> bool:
         if self._jumped is None or self._viewer.state.camera not in self._capture.cameras:
