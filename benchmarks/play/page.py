@@ -56,7 +56,7 @@ class Page:
         script = f"const LABEL = {json.dumps(LABEL)};\n{SCRIPT.read_text()}"
         self._client._websock_connection.queue_message(messages.RunJavascriptMessage(script))
         viewer.show = self.show
-        self.cameras = CameraControl(viewer, self._capture, self._select_camera)
+        self.cameras = CameraControl(viewer, self._capture, self._select_free_camera)
 
     # ---------------------------------------------------------------------------------------------------------------
     # Controls
@@ -166,9 +166,9 @@ class Page:
         self._divider.visible = value != NOTHING
         self._set(right=value)
 
-    def _select_camera(self, name: str) -> None:
-        if self._camera.value != name:
-            self._camera.value = name
+    def _select_free_camera(self) -> None:
+        if self._camera.value != FREE:
+            self._camera.value = FREE
 
     def _show_error(self, wanted: bool) -> None:
         self._error.value = wanted
@@ -218,9 +218,9 @@ def _escaped(text: str) -> str:
 class CameraControl:
     """Moves a browser's camera, and follows it."""
 
-    def __init__(self, viewer: Viewer, capture: Capture, on_choice: Callable[[str], None]) -> None:
-        """`on_choice` gets the name of the free camera once the view was turned."""
-        self._viewer, self._capture, self._on_choice = viewer, capture, on_choice
+    def __init__(self, viewer: Viewer, capture: Capture, on_free: Callable[[], None]) -> None:
+        """`on_free` is called once the view was turned away from one of the capture's cameras."""
+        self._viewer, self._capture, self._on_free = viewer, capture, on_free
         self._client = viewer.client
         self._jumped: tuple[float, np.ndarray] | None = None
         self._client.camera.on_update(self._moved)
@@ -254,7 +254,7 @@ class CameraControl:
         stays = self._is_where_it_jumped(now) or resized_only
         self._viewer.change(lambda s: replace(s, viewpoint=now, camera=s.camera if stays else FREE))
         if not stays:  # Else a choice that is under way would be taken back.
-            self._on_choice(FREE)
+            self._on_free()
 
     def _is_where_it_jumped(self, now: Camera) -> bool:
         if self._jumped is None or self._viewer.state.camera not in self._capture.cameras:
