@@ -102,9 +102,10 @@ class Numbers:
         """How many of them had reached their plateau."""
         return int(self._plateaus(report).sum())
 
-    def people(self, report: str) -> int:
-        """How many people a report has."""
-        return self._rows(report)["subject"].nunique()
+    def people(self, report: str, scene: str = "") -> int:
+        """How many people a report has, or one of its scenes."""
+        rows = self._rows(report)
+        return int((rows[rows["scene"] == scene] if scene else rows)["subject"].nunique())
 
     def _plateaus(self, report: str) -> pd.Series:
         rows = self._rows(report)
