@@ -61,8 +61,7 @@ class Numbers:
     ) -> str:
         """Row `a` minus row `b` in pairs over people, with its 95 % interval. `region`: by default that of tables."""
         quantity = Quantity(split, region, metric) if region else _quantity(split, metric)
-        rows = self._rows(report)
-        of_scene = rows[rows["scene"] == scene]
+        of_scene = self._of_scene(report, scene)
         test = compare(of_scene, a, b, quantity)
         if test is None or not samples_of(of_scene, quantity).keys() >= {a, b}:
             raise InputError(f"{self.folder / report}: expected rows {a} and {b} on {scene}")
@@ -71,8 +70,7 @@ class Numbers:
     def scores(self, report: str, scene: str) -> str:
         """A table in Markdown: PSNR and LPIPS on all held-out splits, milliseconds and training seconds."""
         wanted = [*quality_columns(("psnr", "lpips")), *cost_columns(("frame_ms", "train_cpu_s"))]
-        rows = self._rows(report)
-        methods = list(dict.fromkeys(rows[rows["scene"] == scene]["method"]))
+        methods = list(dict.fromkeys(self._of_scene(report, scene)["method"]))
         cells = [
             [style_of(method).title, *(self._score(report, scene, method, quantity) for quantity in wanted)]
             for method in methods
@@ -104,8 +102,11 @@ class Numbers:
 
     def people(self, report: str, scene: str = "") -> int:
         """How many people a report has, or one of its scenes."""
+        return (self._of_scene(report, scene) if scene else self._rows(report))["subject"].nunique()
+
+    def _of_scene(self, report: str, scene: str) -> pd.DataFrame:
         rows = self._rows(report)
-        return int((rows[rows["scene"] == scene] if scene else rows)["subject"].nunique())
+        return rows[rows["scene"] == scene]
 
     def _plateaus(self, report: str) -> pd.Series:
         rows = self._rows(report)
