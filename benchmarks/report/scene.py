@@ -290,6 +290,12 @@ def _picture_sections(
     return sections, sheets | subject_sheet | worst_sheet
 
 
+def on_sheet(shown: list[Shown]) -> list[Shown]:
+    """Whose pictures come first: a user's rows, which may have the names of ours, then the main ones of ours."""
+    wanted = [each for each in shown if not is_ours(each.cell.config.method) or each.cell.config.method in ON_SHEETS]
+    return sorted(wanted, key=lambda each: is_ours(each.cell.config.method))
+
+
 def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Flipbook, dict[str, bytes]]:
     tracks = pictures.tracks(capture, shown, data.album, max_bytes=data.max_bytes)
     series = tuple(vega.series_of(each.cell.config.method for each in shown).values())
@@ -307,9 +313,7 @@ def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Fl
         series=series,
     )
     file = f"pictures_{data.scene}.webp"
-    wanted = [each for each in shown if not is_ours(each.cell.config.method)]
-    wanted += [each for each in shown if each.cell.config.method in ON_SHEETS]
-    sheet = pictures.sheet(pictures.comparisons(capture, (wanted or shown)[:AT_MOST_ON_SHEETS]))
+    sheet = pictures.sheet(pictures.comparisons(capture, (on_sheet(shown) or shown)[:AT_MOST_ON_SHEETS]))
     names = tuple(each.title for each in series)
     return Flipbook(file=file, tracks=tuple(tracks), names=names, chart=chart), {file: sheet}
 

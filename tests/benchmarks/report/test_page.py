@@ -19,8 +19,9 @@ from ash.protocol import TrainingOutcome
 from benchmarks import cli
 from benchmarks.analysis.differences import differences
 from benchmarks.analysis.results import Quantity, RunTables
+from benchmarks.analysis.style import titles_of
 from benchmarks.cell.metrics import PROTOCOL
-from benchmarks.cell.schema import CellResult, Summary, failed_result, result_of, write_config, write_result
+from benchmarks.cell.schema import Cell, CellResult, Summary, failed_result, result_of, write_config, write_result
 from benchmarks.commands import arguments
 from benchmarks.report import charts, sentences, tables, vega
 from benchmarks.report import page as page_module
@@ -28,7 +29,7 @@ from benchmarks.report import scene as scene_module
 from benchmarks.report.content import Text
 from benchmarks.report.figures import speed_figure
 from benchmarks.report.page import publish, write_report
-from benchmarks.report.pictures import Album
+from benchmarks.report.pictures import Album, Shown
 from benchmarks.report.scene import SceneData, scene_report
 from benchmarks.suites import runs
 from benchmarks.suites.runs import Run, read_run, results_of, write_run
@@ -489,3 +490,12 @@ def test_nothing_is_wrong_on_a_desktop_and_the_controls_work(run: Run, visit: Vi
     assert entry.get_attribute("aria-pressed") == "false"
     assert chart.evaluate(marks) < count, "an entry of the legend hides its series"
     assert seen.errors == []
+
+
+def test_a_sheet_shows_every_row_once_and_those_of_a_user_first() -> None:
+    """A user's row may have the name of one of ours."""
+    changed = replace(config("ddc"), changes={"training.seconds": 9.0})
+    cells = [Cell(config=each, folder=Path()) for each in (config("ash"), changed)]
+    shown = [Shown(cell=each, result=CellResult(config=each.config, status="done")) for each in cells]
+    with titles_of([each.config for each in cells]):
+        assert [each.cell.config.method for each in scene_module.on_sheet(shown)] == ["ddc", "ash"]
