@@ -18,7 +18,7 @@ from ash.textures import DecoderInputs, FrameInputs, TexelLattice
 GLOBAL_FEATURES = 16
 OCTAVES = 6
 TILED_CHANNELS = 16  # of which the native bfloat16 kernels take whole multiples
-NATIVE_CHANNELS = 256  # at the bottleneck: beyond, a layer's weights no longer fit the caches, and torch is faster
+NATIVE_CHANNELS = 1024  # at the bottleneck, at most: the width of preset `paper`
 
 
 class ConvBlock(nn.Sequential):

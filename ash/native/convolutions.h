@@ -3,6 +3,7 @@
 #pragma once
 #include <algorithm>
 #include <cstdint>
+#include <vector>
 
 #include "dispatch.h"
 #include "team.h"
@@ -27,7 +28,7 @@ struct Layer {  // weights and bias; a convolution's lie [out][tap][in], a trans
 
 // Where factors are put in the order that products want, one layer after the other.
 struct Scratch {
-    float* packed = nullptr;
+    float *packed = nullptr, *winograd = nullptr;
     bool halves = false;  // 3x3 convolutions in bfloat16, by the kernels of tiles.h
     Half *plane = nullptr, *weights = nullptr, *turned = nullptr, *pairs = nullptr;
 };
@@ -80,6 +81,74 @@ inline void convolve_in_tiles(const Plane& in, const TileConvolution& given, con
     in_ranges(threads, blocks, RANGE, [&](int64_t, int64_t first, int64_t last) { tiles()->convolve(work, first, last); });
 }
 
+// Whether 3x3 convolutions between two planes are done by Winograd's algorithm (winograd.inc): 4x4 pixels at a time, whole vectors.
+inline bool in_winograd(const Plane& in, const Plane& out) {
+    return in.height % 4 == 0 && in.width % 4 == 0 && in.channels % PRODUCT_COLUMNS == 0 && out.channels % PRODUCT_COLUMNS == 0;
+}
+
+// The next address at which a line of the cache begins, at most 15 floats on.
+inline float* aligned(float* p) { return reinterpret_cast<float*>((reinterpret_cast<uintptr_t>(p) + 63) / 64 * 64); }
+
+constexpr int64_t WINOGRAD_TILES = 32, WINOGRAD_CORRELATED = 64;  // done at once: in a convolution, in the gradient of its weights
+
+// `count` tiles of a plane from `first` on. The odd stride keeps the factors of a tile in different sets of the cache.
+inline WinogradTiles winograd_tiles(const Plane& p, int64_t first, int64_t count) {
+    return {p.first, p.row(), p.step, p.width / 4, p.channels, first, count, WINOGRAD_CORRELATED * p.channels + PRODUCT_COLUMNS};
+}
+
+// Room for the factors of tiles of `channels`, of this thread; `which`: the first or the second.
+inline float* winograd_room(int which, int64_t channels) {
+    thread_local std::vector<float> rooms[2];
+    const size_t size = 36 * (WINOGRAD_CORRELATED * channels + PRODUCT_COLUMNS) + PRODUCT_COLUMNS;
+    if (rooms[which].size() < size) rooms[which].resize(size);
+    return aligned(rooms[which].data());
+}
+
+// As `convolve` with nine taps and the weights that are packed; `flipped`: of the last tap first.
+inline void convolve_in_winograd(const Plane& in, const Plane& out, bool flipped, const float* start, bool relu, const Plane* active,
+                                 const Scratch& scratch, int threads) {
+    const int64_t steps = in.channels, of_block = steps * PRODUCT_COLUMNS;
+    kernels().winograd_weights(scratch.packed, out.channels / PRODUCT_COLUMNS, steps, flipped, scratch.winograd);
+    const int64_t tiles = int64_t(in.height) * in.width / 16, zero = 0;
+    in_ranges(threads, tiles, WINOGRAD_TILES, [&](int64_t, int64_t first, int64_t last) {
+        const WinogradTiles from = winograd_tiles(in, first, last - first), to = winograd_tiles(out, first, last - first);
+        float *factors = winograd_room(0, in.channels), *products = winograd_room(1, out.channels);
+        kernels().winograd_input(from, factors);
+        Product product{};
+        product.a_step = product.steps = steps, product.a_inner = 1;
+        product.b_inner = PRODUCT_COLUMNS, product.b_block = 36 * of_block;
+        product.a_at = product.b_at = &zero, product.segments = 1;
+        product.rows = last - first, product.columns = product.c_step = out.channels;
+        for (int place = 0; place < 36; ++place) {
+            product.a = factors + place * from.stride, product.b = scratch.winograd + place * of_block, product.c = products + place * to.stride;
+            kernels().multiply(product);
+        }
+        kernels().winograd_output(to, products, start, relu, active ? active->first : nullptr, active ? active->row() : 0, active ? active->step : 0);
+    });
+}
+
+// The gradient of the weights [out][tap][in].
+inline void correlate_in_winograd(const Plane& grad, const Plane& in, float* grad_weights, const Scratch& scratch, int threads) {
+    const int64_t tiles = int64_t(in.height) * in.width / 16, size = int64_t(grad.channels) * in.channels, zero = 0;
+    float *factors = winograd_room(0, in.channels), *products = winograd_room(1, grad.channels);
+    for (int64_t first = 0; first < tiles; first += WINOGRAD_CORRELATED) {
+        const int64_t count = std::min(WINOGRAD_CORRELATED, tiles - first);
+        const WinogradTiles of_in = winograd_tiles(in, first, count), of_grad = winograd_tiles(grad, first, count);
+        kernels().winograd_input(of_in, factors);
+        kernels().winograd_output_backward(of_grad, products);
+        in_parallel(threads, 36, [&](int64_t place) {
+            Product product{};
+            product.a = products + place * of_grad.stride, product.a_step = 1, product.a_inner = grad.channels;
+            product.b = factors + place * of_in.stride, product.b_inner = in.channels, product.b_block = PRODUCT_COLUMNS;
+            product.a_at = product.b_at = &zero, product.segments = 1, product.steps = count;
+            product.rows = grad.channels, product.columns = product.c_step = in.channels;
+            product.c = scratch.winograd + place * size, product.add = first > 0;
+            kernels().multiply(product);
+        });
+    }
+    kernels().winograd_weights_backward(scratch.winograd, size, grad.channels, in.channels, grad_weights);
+}
+
 inline void sum_pixels(const float* from, int64_t row, int64_t pixel, int height, int width, int channels, float* to) {
     std::fill(to, to + channels, 0.0f);
     for (int y = 0; y < height; ++y)
@@ -96,6 +165,7 @@ inline void forward(const Layer& layer, const Plane& in, const Plane& out, const
     }
     float* const packed = scratch.packed;
     kernels().pack({layer.weights, co, 9, ci, int64_t(9) * ci, ci, 1, packed});
+    if (in_winograd(in, out)) return convolve_in_winograd(in, out, false, layer.bias, true, nullptr, scratch, threads);
     Product product{};
     product.a_step = in.step, product.b = packed, product.c_step = out.step, product.start = layer.bias, product.relu = true;
     convolve(product, around(in, 1), ci, out, threads, [&](int y) { return in.at(y); });
@@ -111,6 +181,7 @@ inline void backward_input(const Layer& layer, const Plane& grad, const Plane& t
     }
     float* const packed = scratch.packed;
     kernels().pack({layer.weights, ci, 9, co, 1, ci, int64_t(9) * ci, packed});
+    if (in_winograd(grad, to)) return convolve_in_winograd(grad, to, true, nullptr, false, active, scratch, threads);
     Product product{};
     product.a_step = grad.step, product.b = packed, product.c_step = to.step;
     if (active) product.active = active->first, product.active_step = active->step;
@@ -144,16 +215,30 @@ inline void correlate_in_tiles(const Layer& layer, const Plane& grad, const Plan
     in_parallel(threads, tiles()->correlations(co, ci), [&](int64_t piece) { tiles()->correlate(work, piece, piece + 1); });
 }
 
-inline void backward_weights(const Layer& layer, const Plane& grad, const Plane& in, const Scratch& scratch, int threads) {
-    const int ci = in.channels;
+// The gradient of the weights [out][tap][in], tap by tap. Columns of a product are done 16 at a time: they are of the plane that wastes less.
+inline void correlate_taps(const Plane& grad, const Plane& in, float* grad_weights, const Scratch& scratch, int threads) {
+    const int ci = in.channels, co = grad.channels;
     const Taps taps = around(in, 1);
+    const bool turned = int64_t(ci) * ((co + 15) / 16) < int64_t(co) * ((ci + 15) / 16);
+    in_parallel(threads, 9, [&](int64_t t) {
+        const float* read = in.first + taps.at[t];
+        float* to = grad_weights + t * ci;
+        if (!turned)
+            return correlate(grad.first, grad.row(), grad.step, co, read, in.row(), in.step, ci, grad.height, grad.width, to, int64_t(9) * ci);
+        float* sums = scratch.packed + t * ci * co;
+        correlate(read, in.row(), in.step, ci, grad.first, grad.row(), grad.step, co, grad.height, grad.width, sums, co);
+        for (int o = 0; o < co; ++o)
+            for (int i = 0; i < ci; ++i) to[int64_t(o) * 9 * ci + i] = sums[i * co + o];
+    });
+}
+
+inline void backward_weights(const Layer& layer, const Plane& grad, const Plane& in, const Scratch& scratch, int threads) {
     if (scratch.halves)
         correlate_in_tiles(layer, grad, in, scratch, threads);
+    else if (in_winograd(in, grad))
+        correlate_in_winograd(grad, in, layer.grad_weights, scratch, threads);
     else
-        in_parallel(threads, 9, [&](int64_t t) {
-            correlate(grad.first, grad.row(), grad.step, grad.channels, in.first + taps.at[t], in.row(), in.step, ci, grad.height, grad.width,
-                      layer.grad_weights + t * ci, int64_t(9) * ci);
-        });
+        correlate_taps(grad, in, layer.grad_weights, scratch, threads);
     sum_pixels(grad.first, grad.row(), grad.step, grad.height, grad.width, grad.channels, layer.grad_bias);
 }
 
@@ -213,22 +298,12 @@ inline void pool(const Plane& in, const Plane& out, int threads) {
 inline void backward_pool(const Plane& in, const Plane& pooled, const Plane& grad_pooled, const Plane& grad_skip, const Plane& grad_in, int threads) {
     in_bands(threads, pooled.height, [&](int y) {
         for (int x = 0; x < pooled.width; ++x) {
-            const float *most = pooled.at(y, x), *grad = grad_pooled.at(y, x);
-            const float *v[4], *s[4];
-            float* to[4];
+            PoolGradient pixel{{}, pooled.at(y, x), grad_pooled.at(y, x), {}, {}, pooled.channels};
             for (int k = 0; k < 4; ++k) {
                 const int yy = 2 * y + k / 2, xx = 2 * x + k % 2;
-                v[k] = in.at(yy, xx), s[k] = grad_skip.at(yy, xx), to[k] = grad_in.at(yy, xx);
+                pixel.in[k] = in.at(yy, xx), pixel.grad_skip[k] = grad_skip.at(yy, xx), pixel.grad_in[k] = grad_in.at(yy, xx);
             }
-            for (int i = 0; i < pooled.channels; ++i) {
-                float left = grad[i];  // goes to the first that has the largest value
-                for (int k = 0; k < 4; ++k) {
-                    const bool largest = v[k][i] == most[i];
-                    const float value = s[k][i] + (largest ? left : 0.0f);
-                    left = largest ? 0.0f : left;
-                    to[k][i] = v[k][i] > 0 ? value : 0.0f;
-                }
-            }
+            kernels().pool_backward(pixel);
         }
     });
 }

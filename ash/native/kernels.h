@@ -179,6 +179,22 @@ struct Packing {
     float* to;
 };
 
+// One pixel of a pool and the four that it was made of, which came out of a ReLU.
+struct PoolGradient {
+    const float *in[4], *pooled, *grad_pooled, *grad_skip[4];
+    float* grad_in[4];
+    int channels;
+};
+
+// Tiles of 4x4 pixels of a plane, `across` of them in a line, row by row; `stride`: floats from one of the 36 factors to the next.
+struct WinogradTiles {
+    float* pixels;  // pixel (0, 0)
+    int64_t row, step;
+    int across, channels;  // channels: whole 16s
+    int64_t first, count, stride;
+    int64_t at(int64_t tile) const { return 4 * (tile / across * row + tile % across * step); }
+};
+
 // What is wrong with an input, noticed while it is read. 0: nothing.
 enum Fault : int64_t { FAULT_MEANS = 1, FAULT_QUATS, FAULT_ZERO_QUAT, FAULT_SCALES, FAULT_OPACITIES, FAULT_SH };
 
@@ -204,7 +220,14 @@ struct Kernels {
     void (*shade_backward)(const ShadeArgs&, int64_t first, int64_t last, double* grad_light);  // adds to [9, 3]
     void (*multiply)(const Product&);
     void (*pack)(const Packing&);
+    void (*pool_backward)(const PoolGradient&);
     void (*raster_band)(const Triangle*, const int* members, int64_t count, const RasterBand&);
+    void (*winograd_weights)(const float* packed, int blocks, int64_t steps, bool flipped, float* to);
+    void (*winograd_weights_backward)(const float* sums, int64_t stride, int outs, int ins, float* grad);
+    void (*winograd_input)(const WinogradTiles&, float* to);
+    void (*winograd_output)(const WinogradTiles&, const float* products, const float* start, bool relu, const float* active,
+                            int64_t active_row, int64_t active_step);
+    void (*winograd_output_backward)(const WinogradTiles&, float* to);
 };
 
 extern const Kernels avx512_kernels, avx2_kernels, plain_kernels;

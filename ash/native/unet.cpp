@@ -21,13 +21,13 @@ struct Arena {
         const int64_t before = used;
         used += (int64_t(height + 2) * (width + 2) * channels + 15) / 16 * 16;
         Plane plane{nullptr, height, width, channels, channels};
-        if (memory) plane.first = memory.get() + before + plane.row() + plane.step;
+        if (memory) plane.first = aligned(memory.get()) + before + plane.row() + plane.step;
         return plane;
     }
     float* numbers(int64_t count) {
         const int64_t before = used;
         used += (count + 15) / 16 * 16;
-        return memory ? memory.get() + before : nullptr;
+        return memory ? aligned(memory.get()) + before : nullptr;
     }
 };
 
@@ -79,6 +79,7 @@ struct Network {
     void lay_out() {
         input = arena.plane(shape.height, shape.width, shape.inputs);
         int64_t widest = int64_t(16) * shape.channels + 16 * shape.outputs * (1 + shape.channels / 16);
+        int64_t winograd = 0;
         for (int l = 0; l <= shape.levels; ++l) {
             Level& at = levels[l];
             const int h = shape.height >> l, w = shape.width >> l, c = channels(l);
@@ -89,9 +90,10 @@ struct Network {
             at.grad = plane(c), at.grad_middle = plane(c), at.grad_joined = plane(joined);
             at.up = at.joined.part(0, c), at.skip = at.joined.part(l < shape.levels ? c : 0, c);
             widest = std::max(widest, int64_t(9) * (joined + 16) * (c + 16) * 2);
+            winograd = std::max(winograd, int64_t(36) * joined * c);
         }
         widest = std::max(widest, int64_t(9) * (shape.inputs + 16) * (shape.channels + 16));
-        scratch.packed = arena.numbers(widest);
+        scratch.packed = arena.numbers(widest), scratch.winograd = arena.numbers(winograd);
         scratch.halves = shape.halves != 0;
         if (scratch.halves) lay_out_halves();
     }

@@ -111,6 +111,7 @@ def test_features_reach_the_head_at_the_size_of_the_input(norm):
 SHAPES = {  # inputs, outputs, width, levels, height, width of the texture, features
     "as trained": (18, 56, 16, 3, 64, 64, 16),
     "narrow": (6, 24, 8, 3, 16, 32, 0),
+    "in Winograd's tiles above, without below": (6, 3, 16, 2, 8, 24, 0),
     "of no round number": (5, 3, 5, 1, 6, 10, 2),
     "one pixel at the bottom": (3, 17, 4, 2, 4, 4, 3),
 }
@@ -154,7 +155,7 @@ def compare_with_the_definition(shape: tuple[int, ...], *, channels_last: bool) 
         net, texture = (x.to(memory_format=torch.channels_last) for x in (net, texture))
     assert net._can_use_native(texture)
     found = value_and_gradients(net, texture, features, net)
-    assert max(relative_error(a, b) for a, b in zip(found, truth, strict=True)) < 1e-5
+    assert max(relative_error(a, b) for a, b in zip(found, truth, strict=True)) < 2e-5  # Winograd's sums: 1e-5
 
 
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
@@ -208,7 +209,7 @@ def test_what_the_kernels_do_not_know_goes_the_way_of_the_definition():
     assert not net._can_use_native(texture.double())
     assert not net._can_use_native(texture.clone().requires_grad_())
     assert not UNet(6, 4, width=8, levels=3, norm="instance")._can_use_native(texture)
-    assert not UNet(6, 4, width=64, levels=3, norm="none")._can_use_native(texture)
+    assert not UNet(6, 4, width=256, levels=3, norm="none")._can_use_native(texture)
     with torch.autocast("cpu", torch.bfloat16):
         assert not net._can_use_native(texture)
 
