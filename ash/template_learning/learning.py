@@ -103,8 +103,8 @@ def _learn(
     tracked, seconds = _tracked_once(deformation.graph, config, capture, device)
     start = time.perf_counter()
     if isinstance(deformation, LinearDeformation):
-        choice = fit_linear(deformation, capture.motion, tracked)
-        choices = f"static displacement {'kept' if choice.static else 'refused'}, ridge {choice.ridge:g}"
+        fit_linear(deformation, capture.motion, tracked)
+        choices = "a linear map per node"
     else:
         step = fit_graph(deformation, capture.motion, tracked, steps=config.steps, seed=seed)
         choices = f"step {step} of {config.steps}"

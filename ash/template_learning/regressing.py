@@ -1,13 +1,12 @@
 """From tracked frames to a template that can be animated: what all frames share, and what the pose explains.
 
-A few dozen frames of a few clips do not pin down a network: Adam on the graph networks explains the training frames
-and is worse than plain skinning on another motion. A ridge regression per node of the embedded graph, on the joints
-near it, explains nearly as much and is better than skinning there; the ridge weight is chosen by
-cross-validation over training sequences.
+A few dozen frames of a few clips do not pin down a network: the graph networks, whose weights all nodes share, explain
+no more than one shape for all frames. A ridge regression per node of the embedded graph, on the joints near it, does,
+and is better than skinning on other motion, too. Cross-validation over training sequences refuses it: a sequence left
+out is farther from the others than new poses are from all of them (docs/tuning.md).
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse
@@ -24,7 +23,7 @@ from ash.template_learning.deforming import LinearDeformation
 from ash.template_learning.graph_nets import GraphDeformation
 from ash.template_learning.tracking import Tracked
 
-RIDGES = (0.03, 0.1, 0.3, 1.0, 3.0)  # Against squared radians summed over frames; then none of the pose at all.
+RIDGE = 0.3  # Against squared radians summed over frames.
 FOLDS = 4
 BLEND_RIDGE = 1e-4  # Nodes without vertices of their own stay at zero.
 ROUGHNESS = 0.1  # Weight of the Laplacian of the deformation, against the squared distance.
@@ -34,28 +33,15 @@ LOOK_EVERY = 20  # Steps between two looks at the frames held out.
 Window = list[RigidTransforms]  # of the vertices, newest frame first
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class RidgeChoice:
-    """What the frames left out preferred."""
-
-    ridge: float  # infinite: the pose explains nothing
-    static: bool  # whether what all frames share is kept
-
-
-def fit_linear(deformation: LinearDeformation, motion: Motion, tracked: Tracked) -> RidgeChoice:
+def fit_linear(deformation: LinearDeformation, motion: Motion, tracked: Tracked) -> None:
     """Fit the static displacement and the nodes' maps, in place."""
     dofs = torch.stack([deformation.window(Pose(motion, frame)) for frame in tracked.frames]).double()
     targets = _node_translations(deformation.graph, tracked.shift).double()
-    static = tracked.canonical.mean(0) - deformation.rest
-    choice = _choose(deformation, tracked, dofs, targets, motion.sequence[list(tracked.frames)])
+    mean, maps = _ridge(dofs, targets, deformation.reach.double())
     with torch.no_grad():
-        if choice.static:
-            deformation.static.copy_(static)
-        if np.isfinite(choice.ridge):
-            mean, maps = _ridge(dofs, targets, deformation.reach.double(), choice.ridge)
-            deformation.mean_window.copy_(mean)
-            deformation.maps.copy_(maps)
-    return choice
+        deformation.static.copy_(tracked.canonical.mean(0) - deformation.rest)
+        deformation.mean_window.copy_(mean)
+        deformation.maps.copy_(maps)
 
 
 def _node_translations(graph: EmbeddedGraph, shift: Float[Tensor, "t v 3"]) -> Float[Tensor, "t g 3"]:
@@ -71,7 +57,7 @@ def _node_translations(graph: EmbeddedGraph, shift: Float[Tensor, "t v 3"]) -> F
 
 
 def _ridge(
-    dofs: Float[Tensor, "t f"], targets: Float[Tensor, "t g 3"], reach: Float[Tensor, "g f"], ridge: float
+    dofs: Float[Tensor, "t f"], targets: Float[Tensor, "t g 3"], reach: Float[Tensor, "g f"]
 ) -> tuple[Float[Tensor, " f"], Float[Tensor, "g f 3"]]:
     """Per node, the least-squares map from `reach * (dofs - mean)` to its translation; `reach` is part of the map."""
     mean = dofs.mean(0)
@@ -79,33 +65,9 @@ def _ridge(
     gram, moment = centred.T @ centred, torch.einsum("tf,tgo->gfo", centred, targets - targets.mean(0))
     maps = []
     for scale, right in zip(reach, moment, strict=True):  # One system at a time: together they would be gigabytes.
-        left = scale[:, None] * gram * scale + ridge * torch.eye(len(scale), dtype=gram.dtype, device=gram.device)
+        left = scale[:, None] * gram * scale + RIDGE * torch.eye(len(scale), dtype=gram.dtype, device=gram.device)
         maps.append(scale[:, None] * torch.cholesky_solve(scale[:, None] * right, torch.linalg.cholesky(left)))
     return mean, torch.stack(maps)
-
-
-def _choose(
-    deformation: LinearDeformation, tracked: Tracked, dofs: Tensor, targets: Tensor, sequence: np.ndarray
-) -> RidgeChoice:
-    """Leave out every fourth sequence (or a quarter of the only one) in turn, and score what it would have got."""
-    folds = held_out_folds(sequence)
-    if len(folds) < 2:
-        return RidgeChoice(ridge=np.inf, static=True)
-    nodes = deformation.graph.nodes
-    true = (tracked.canonical - deformation.rest)[:, nodes].double()
-    reach = deformation.reach.double()
-    errors = np.zeros((len(folds), len(RIDGES) + 2))
-    for index, fold in enumerate(folds):
-        others = ~fold
-        static = true[others].mean(0)
-        for column, ridge in enumerate(RIDGES):
-            mean, maps = _ridge(dofs[others], targets[others], reach, ridge)
-            moved = torch.einsum("tf,gfo->tgo", dofs[fold] - mean, maps)
-            errors[index, column] = _mean_square(true[fold] - static - moved)
-        errors[index, -2] = _mean_square(true[fold] - static)
-        errors[index, -1] = _mean_square(true[fold])
-    best = int(errors.mean(0).argmin())
-    return RidgeChoice(ridge=(*RIDGES, np.inf, np.inf)[best], static=best <= len(RIDGES))
 
 
 def held_out_folds(sequence: np.ndarray) -> list[Tensor]:

@@ -215,11 +215,11 @@ def _missing(tables: RunTables, scene: str) -> str:
 
 
 def templates(tables: RunTables, scene: str) -> str:
-    """What each template was learned from; the ridge weight is that of its regularisation."""
+    """What each template was learned from."""
     outcomes = tables.outcomes[tables.outcomes["scene"] == scene]
     learned = outcomes[outcomes["template"] != ""].drop_duplicates(["method", "template"])
     kinds = [f"{template} ({titles([*rows['method']])})" for template, rows in learned.groupby("template", sort=False)]
-    return f"Templates, and the weight of their regularisation (ridge): {'; '.join(kinds)}." if kinds else ""
+    return f"Templates: {'; '.join(kinds)}." if kinds else ""
 
 
 def _exact(tables: RunTables, scene: str) -> str:

@@ -23,11 +23,11 @@ from ash.template_learning import learning, tracking
 from ash.template_learning.deforming import LinearDeformation, joint_reach
 from ash.template_learning.graph_nets import GraphDeformation
 from ash.template_learning.learning import learned_template, template_key, template_of
-from ash.template_learning.regressing import RidgeChoice, fit_graph, fit_linear, held_out_folds
+from ash.template_learning.regressing import fit_graph, fit_linear, held_out_folds
 from ash.template_learning.tracking import Tracked, template_error_mm, track_scans
 from benchmarks.cell.sandbox import seen_by_method, watched
 
-SMALL = {"kind": "learned", "nodes": 30, "supervision": "scans"}
+SMALL = {"kind": "learned", "nodes": 30, "window": 2, "supervision": "scans"}
 BULGE_M = 0.012
 UNUSED = RigidTransforms(quats=torch.zeros(0, 4), translations=torch.zeros(0, 3))
 
@@ -89,28 +89,21 @@ def test_a_surface_without_correspondences_does_nearly_as_well(capture):
     assert rms_mm(learned, capture, test) < 0.5 * rms_mm(skinned, capture, test)
 
 
-def fitted(shift: torch.Tensor, sequences: int) -> tuple[RidgeChoice, torch.Tensor]:
-    """What is chosen where all vertices of every frame are off by `[t, 3]`, and by how much frame 3 is then moved."""
-    motion, rest = in_sequences(tube_motion(len(shift)), sequences), torch.from_numpy(tube_mesh().vertices).float()
+def fitted(shift: torch.Tensor) -> torch.Tensor:
+    """By how much the vertices move in every frame `[t, v, 3]`, learned from tracks that are off by `[t, 3]`."""
+    motion, rest = tube_motion(len(shift)), torch.from_numpy(tube_mesh().vertices).float()
     tracked = Tracked(frames=tuple(range(len(shift))), canonical=rest + shift[:, None].expand(-1, len(rest), -1))
     deformation = LinearDeformation(TemplateConfig(**SMALL), tube_mesh(), tube_skeleton())
-    choice = fit_linear(deformation, motion, tracked)
-    return choice, deformation.canonical(Pose(motion, 3), UNUSED) - rest
+    fit_linear(deformation, motion, tracked)
+    return torch.stack([deformation.canonical(Pose(motion, f), UNUSED) for f in tracked.frames]) - rest
 
 
-def test_the_pose_is_not_believed_where_it_explains_nothing():
-    """Shifts drawn anew for every frame: left-out sequences say so, and only what all frames share is kept."""
+def test_what_all_frames_share_is_kept_and_noise_of_the_tracks_is_damped():
     noise = torch.from_numpy(0.004 * np.random.default_rng(0).standard_normal((16, 3))).float()
     shift = torch.tensor([0.01, 0.0, 0.0]) + noise
-    choice, moved = fitted(shift, 4)
-    assert choice.static and choice.ridge >= 1
-    assert (moved - shift.mean(0)).norm(dim=-1).max() < 0.002
-
-
-def test_a_shift_that_no_other_sequence_shares_is_refused():
-    sign = torch.tensor([1.0] * 4 + [-1.0] * 4)[:, None]
-    choice, moved = fitted(sign * torch.tensor([0.01, 0, 0]) + torch.tensor([0.001, 0, 0]), 2)
-    assert not choice.static and not moved.any()
+    moved = fitted(shift)
+    torch.testing.assert_close(moved.mean(0), shift.mean(0).expand_as(moved[0]), atol=1e-5, rtol=0)
+    assert (moved - shift.mean(0)).square().mean() < 0.25 * (shift - shift.mean(0)).square().mean()
 
 
 def test_folds_leave_out_whole_sequences_or_stretches_of_the_only_one():
@@ -236,7 +229,7 @@ def test_configurations_share_what_is_tracked(capture: Capture, tmp_path: Path, 
         return track_scans(*arguments, **options)
 
     monkeypatch.setattr(learning, "track_scans", counted)
-    configs = [TemplateConfig(**SMALL, window=window) for window in (1, 2)]
+    configs = [TemplateConfig(**SMALL | {"window": window}) for window in (1, 2)]
     kept = replace(capture, store=tmp_path)
     shared = [learned_template(config, kept, seed=0) for config in configs]
     assert len(calls) == 1
@@ -250,4 +243,4 @@ def test_configurations_share_what_is_tracked(capture: Capture, tmp_path: Path, 
     (tracks,) = tmp_path.glob("tracked-*.safetensors")
     write_atomic(tracks, safetensors.torch.save({"canonical": torch.zeros(1)}, metadata={"seconds": "1"}))
     with pytest.raises(InputError, match="expected the template in 18 training frames"):
-        learned_template(TemplateConfig(**SMALL, window=3), kept, seed=0)
+        learned_template(TemplateConfig(**SMALL | {"window": 3}), kept, seed=0)

@@ -324,7 +324,7 @@ def test_a_report_says_what_each_rows_template_was_learned_from() -> None:
         end = TrainingOutcome(steps=9, seconds=1.0, ended_by="steps", template=template)
         return replace(scored(method, view=27.0, pose=20.0, seed=seed), training=end)
 
-    images, scans = "learned from images: ridge 1", "learned from scans: ridge 3"
+    images, scans = "learned from images: a linear map per node", "learned from scans: a linear map per node"
     results = [on("ash", images), on("ash", images, 1), on("ddc", images), on("by_scans", scans), on("static", "")]
     text = sentences.templates(RunTables(results), "loose")
     assert f": {images} (ASH, DDC); {scans} (template from scans)." in text
