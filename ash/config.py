@@ -107,6 +107,7 @@ class TrainingConfig:
     footage_s: float = math.inf  # seconds of training motion that are learned from, from its start
     fitted_steps: int = 2000  # at most, in which the paper's warm-up fits a frame alone: less where no more is gained
     seconds: float = math.inf  # of CPU time, at most
+    score_from: int = 0  # steps before which reserved views are not scored: a field takes a minute to draw them
     snapshots: bool = False  # keep the weights of half a minute, of 42 s, of a minute, ... of half an hour
 
     @property
@@ -157,7 +158,7 @@ class TemplateConfig:
     supervision: str = "images"  # nothing but the videos; "scans": of a scanner
     network: str = "linear"  # a map per node of the embedded graph; "graph": the paper's graph convolutions
     nodes: int = 400  # of the embedded graph
-    window: int = 2  # frames of motion that are seen
+    window: int = 3  # frames of motion that are seen
     yaw_normalise: bool = False  # in the heading of the root; not in the paper
     blocks: int = 2  # of the graph convolutions
     steps: int = 300  # of their training

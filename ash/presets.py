@@ -40,7 +40,7 @@ def paper() -> AshConfig:
         background="black",
         crop=False,
     )
-    template = TemplateConfig(kind="learned", network="graph", nodes=852, window=3, blocks=8, steps=2000)
+    template = TemplateConfig(kind="learned", network="graph", nodes=852, blocks=8, steps=2000)
     return AshConfig(model=model, training=training, template=template)
 
 
@@ -90,14 +90,14 @@ def ci() -> AshConfig:
 
 
 def cpu() -> AshConfig:
-    """3,000 steps, some minutes of one core: the default, at 256x256. `ci` at a larger size, on a learned template.
+    """6,000 steps, some minutes of one core: the default, at 256x256. `ci` at a larger size, on a learned template.
 
     What comes out does not depend on how fast the machine is, and all methods make equally many steps.
     """
     base = ci()
     training = replace(
         base.training,
-        steps=3000,
+        steps=6000,
         views_per_step=4,
         warmup_steps=500,
         fitted_steps=200,

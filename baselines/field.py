@@ -858,7 +858,7 @@ def _volume(name: str, preset: str) -> VolumeConfig:
 def _row(name: str) -> MethodFactory[FieldConfig]:
     def config(preset: str) -> FieldConfig:
         ash = named(preset)
-        training = replace(ash.training, warmup="none", warmup_steps=0, background="random")
+        training = replace(ash.training, warmup="none", warmup_steps=0, background="random", score_from=1000)
         if preset in ("paper", "official"):
             training = replace(training, steps=300_000, learning_rate=5e-4 if name == "tava" else 2e-4)
         return FieldConfig(

@@ -167,7 +167,8 @@ class Trainer:
 
     def _look(self, loss: Tensor) -> None:
         """Score the reserved views where it is time to, decide what follows from it, and write the log."""
-        if self.images.reserved and (is_eval_step(self.steps) or self.has_ended):
+        is_due = is_eval_step(self.steps) and self.steps >= self.config.score_from
+        if self.images.reserved and (is_due or self.has_ended):
             self._score()
         self.state = update(self.state, self.config, step=self.steps, seconds=self._elapsed())
         regular = self.steps <= FIRST_STEPS or self.steps % LOG_EVERY == 1

@@ -82,7 +82,7 @@ def update(course: ScheduleState, config: TrainingConfig, *, step: int, seconds:
     scored = step >= LEAST_STEPS and course.scores and course.scores[-1].step == step
     if not (limits or scored):
         return course
-    if step >= LULL_STEPS and has_plateaued(course.scores, since=2 * config.warmup_steps):
+    if step >= LULL_STEPS and has_plateaued(course.scores, since=2 * config.static_steps):
         return replace(course, decay_from=step, ended_by="plateau")
     return replace(course, decay_from=step, ended_by=limits[0]) if limits else course
 

@@ -124,7 +124,7 @@ def score_outputs(
     summary = (
         quality_summary(cell, capture, scored)
         + _geometry_summary(capture, drawn.geometry, drawn.views)
-        + _cost_summary(drawn, spent, before_s=max((point.seconds for point in curve), default=0.0))
+        + _cost_summary(drawn, spent, logged_s=max((point.seconds for point in curve), default=0.0))
         + _training_summary(training, curve)
     )
     return CellResult(
@@ -374,24 +374,31 @@ def _surface_distance(capture: Capture, means: np.ndarray, frame: int) -> float 
     return metrics.surface_distance_mm(some, vertices, faces)
 
 
-def _cost_summary(drawn: MethodOutputs, spent: TrainingTime, *, before_s: float) -> tuple[Summary, ...]:
-    """What training and drawing cost.
+def training_costs(spent: TrainingTime, *, logged_s: float) -> dict[tuple[str, str], float]:
+    """Seconds of training: those of the attempt that came through, or by the method's log where this is longer.
 
-    `before_s`: seconds by the method's log, which goes on where an interrupted attempt stopped. Wall and CPU seconds
-    are those of the attempt that came through.
+    The log goes on where an interrupted attempt stopped, and so has the seconds of all attempts.
     """
+    costs = {("speed", "train_s"): max(spent.wall_s, logged_s)}
+    if spent.cpu_s is not None:
+        was_interrupted = logged_s > spent.wall_s
+        costs["speed", "train_wall_s"] = costs["speed", "train_s"]
+        costs["speed", "train_cpu_s"] = logged_s if was_interrupted else spent.cpu_s
+    return costs
+
+
+def _cost_summary(drawn: MethodOutputs, spent: TrainingTime, *, logged_s: float) -> tuple[Summary, ...]:
+    """What training and drawing cost."""
     timing, described = drawn.timing, drawn.described
     costs = {
         ("speed", "frame_ms"): float(np.median(timing.frame_ms)),
         **{("speed", f"{name}_ms"): float(np.median(values)) for name, values in timing.stage_ms.items()},
-        ("speed", "train_s"): max(spent.wall_s, before_s),
+        **training_costs(spent, logged_s=logged_s),
         ("speed", "failed"): 0.0,
         ("memory", "params"): float(described.params),
         ("memory", "gaussians"): float(described.gaussians),
         ("memory", "peak_rss_mb"): drawn.peak_mb,
     }
-    if spent.cpu_s is not None:
-        costs |= {("speed", "train_wall_s"): spent.wall_s, ("speed", "train_cpu_s"): spent.cpu_s}
     if described.template_s is not None:  # What learning the template took; `train_s` is without it.
         costs["speed", "template_s"] = described.template_s
     return tuple(

@@ -1,6 +1,6 @@
 """What is measured, and how: one list that tables, chart and gate read, and the locked arithmetic behind it.
 
-Protocol "2". Before anything is compared, both images are composited on black and quantised to uint8 sRGB.
+Protocol "3". Before anything is compared, both images are composited on black and quantised to uint8 sRGB.
 Regions, ours first, then those of others' conventions:
 
 - `foreground`: pixels whose true alpha is above one half. The number to look at: background only dilutes it.

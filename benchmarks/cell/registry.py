@@ -198,14 +198,29 @@ def find_spec_of(target: str) -> ModuleSpec | None:
 
 @cache
 def code_version(method: str) -> str:
-    """SHA-256 over everything of ours that decides a cell's outcome, and all sources of a third party's method."""
-    roots = [*(_package_folder(package) for package in DECIDING_PACKAGES), Path(__file__).parent]
-    digest = hashlib.sha256(hash_sources(*roots).encode())
+    """SHA-256 over everything of ours that decides a cell's outcome, and all sources of a third party's method.
+
+    Of `baselines`, only what a method of ours imports decides its outcome; a third party's may import anything.
+    """
     source = find_method(method)
+    baselines = sorted(baseline_sources(source.target)) if source.is_ours else [_package_folder("baselines")]
+    digest = hashlib.sha256(hash_sources(_package_folder("ash"), *baselines, Path(__file__).parent).encode())
     if not source.is_ours:
         digest.update(f"{source.target} {source.distribution}".encode())
         digest.update(_sources_of(source).encode())
     return digest.hexdigest()[:16]
+
+
+def baseline_sources(target: str) -> set[Path]:
+    """The modules of `baselines` that a method of ours is made of: its own, and those it imports through each other."""
+    folder, found, todo = _package_folder("baselines"), set(), [target.partition(":")[0]]
+    while todo:
+        package, _, name = todo.pop().partition(".")
+        path = folder / f"{name}.py"
+        if package == "baselines" and path not in found and path.is_file():
+            found.add(path)
+            todo += _imported_modules(path)
+    return found
 
 
 def _sources_of(method: Method) -> str:
@@ -299,6 +314,11 @@ def imported_from(module: Path) -> set[Path]:
 
 def _imports(path: Path) -> set[str]:
     """Top-level names that a file imports, wherever it does."""
+    return {name.split(".")[0] for name in _imported_modules(path)}
+
+
+def _imported_modules(path: Path) -> set[str]:
+    """What a file imports, wherever it does: modules, and names in them, which may be modules, too."""
     try:
         tree = ast.parse(path.read_bytes())
     except (SyntaxError, ValueError):
@@ -306,7 +326,8 @@ def _imports(path: Path) -> set[str]:
     names: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            names |= {alias.name.split(".")[0] for alias in node.names}
+            names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            names |= {node.module.split(".")[0]} if node.module else {alias.name for alias in node.names}
+            inside = {f"{node.module}.{alias.name}" if node.module else alias.name for alias in node.names}
+            names |= inside | ({node.module} if node.module else set())
     return names

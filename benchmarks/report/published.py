@@ -18,7 +18,7 @@ from benchmarks.analysis.results import Quantity, compare, foreground, read_csv,
 from benchmarks.analysis.statistics import Comparison
 from benchmarks.analysis.style import style_of
 from benchmarks.cell.metrics import METRICS, PROTOCOL
-from benchmarks.cell.registry import code_version
+from benchmarks.cell.registry import code_version, methods
 from benchmarks.report.claims import printed
 from benchmarks.report.tables import ON_WHOLE_FRAMES, cost_columns, head_of, quality_columns
 
@@ -115,7 +115,9 @@ class Numbers:
     def state(self, report: str) -> str:
         """Whether today's code made a published report."""
         facts = self._facts(report)
-        return "current" if facts.get("code") == code_version("ash") else f"stale, {facts.get('commit', 'unknown')}"
+        today = {code_version(name) for name, method in methods().items() if method.is_ours}
+        is_current = set(facts.get("code", "").split(", ")) <= today
+        return "current" if is_current else f"stale, {facts.get('commit', 'unknown')}"
 
     def _facts(self, report: str) -> dict[str, str]:
         """The provenance that its page prints, without the backslashes of Markdown."""

@@ -98,6 +98,12 @@ def test_a_run_stopped_before_and_in_its_decay_decides_nothing_anew(capture, tmp
     assert replace(again.outcome(), seconds=0.0) == replace(undisturbed.outcome(), seconds=0.0)
 
 
+def test_views_that_are_dear_to_draw_are_scored_late_and_at_the_end(capture, tmp_path):
+    trained(config(steps=100, warmup="none", warmup_steps=0, score_from=80), capture, tmp_path)
+    rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows if "train_psnr" in row] == [96, 100]
+
+
 def test_a_limit_in_seconds_is_met(capture, tmp_path, monkeypatch):
     """By a clock on which every question takes a twentieth of a second; nothing here is a plateau."""
     ticks = itertools.count()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.cell.registry import code_version, imported_from, sources_below
+from benchmarks.cell.registry import baseline_sources, code_version, imported_from, sources_below
 
 PROJECT = """
 [build-system]
@@ -108,5 +108,12 @@ def test_environments_and_builds_are_no_sources(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path / "env")
 
 
-def test_our_own_methods_follow_our_packages_alone() -> None:
-    assert code_version("ash") == code_version("ddc")
+def test_our_own_methods_follow_the_baselines_that_they_import_alone() -> None:
+    def names(target: str) -> set[str]:
+        return {path.name for path in baseline_sources(target)}
+
+    assert names("ash.presets:ash") == set()
+    assert names("baselines.field:tava") == {"field.py", "mlp.py"}
+    assert {"ablations.py", "ddc.py"} <= names("baselines.ablations:wo_mot")
+    assert "field.py" not in names("baselines.ablations:wo_mot") | names("baselines.ddc:ddc")
+    assert code_version("ash") == code_version("ash_plus") != code_version("ddc") != code_version("tava")
