@@ -88,9 +88,11 @@ STYLES = {
     "constant_rate": MethodStyle("constant learning rate", "#c2415c"),
     "noisy_textures": MethodStyle("ASH+, noise on textures", "#7a869a", reference="ash_plus"),
     "last_weights": MethodStyle("no weight averaging", "#a0522d"),
-    # Suite `plus`: one addition to `ash`, and all up to one.
+    # Suite `plus`: one addition to `ash`, and all but one.
     **{f"plus_{name}": MethodStyle(f"+ {title}", colour) for name, title, colour in ADDED},
-    **{f"to_{name}": MethodStyle(f"up to {title}", colour) for name, title, colour in ADDED},
+    **{
+        f"without_{name}": MethodStyle(f"ASH+ - {title}", colour, reference="ash_plus") for name, title, colour in ADDED
+    },
     # Rows that differ in what the template is learned from.
     "by_scans": MethodStyle("template from scans", "#2a9d8f"),
     "ddc_by_scans": MethodStyle("DDC, template from scans", "#b8860b"),

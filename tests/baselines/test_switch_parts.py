@@ -120,18 +120,12 @@ def test_an_addition_changes_what_it_names_and_nothing_else(name: str, apart: Ap
     assert differing(apart("ash", {}), apart("ash", ADDITIONS[name])) == CHANGED_BY_ADDITION[name]
 
 
-def test_the_rows_of_the_suite_are_the_additions() -> None:
-    """One at a time and one after the other; all of them are `ash_plus`."""
-    suite = {row.name: row for row in find_suite("plus").methods}
-    merged: dict[str, Any] = {}
-    for name, changes in ADDITIONS.items():
-        merged |= changes
-        rows = {f"plus_{name}": changes, f"to_{name}": merged}
-        for row, wanted in rows.items():
-            assert row in suite or row in ("to_base", "to_narrow")
-            if row in suite:
-                assert configured("ash", "cpu", suite[row].changes) == apply_overrides(presets.cpu(), wanted, of=row)
-    assert apply_overrides(presets.cpu(), merged, of="all") == presets.plus("cpu")
+@pytest.mark.parametrize("name", ADDITIONS)
+def test_the_rows_of_the_suite_add_one_or_leave_one_out(name: str) -> None:
+    changes = {row.name: row.changes for row in find_suite("plus").methods}
+    added, left_out = apply_overrides(presets.cpu(), ADDITIONS[name], of=name), presets.plus("cpu", without=name)
+    assert configured("ash", "cpu", changes[f"plus_{name}"]) == added
+    assert configured("ash_plus", "cpu", changes[f"without_{name}"]) == left_out
 
 
 CAMERAS = {"batches"}
