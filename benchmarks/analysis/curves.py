@@ -1,6 +1,7 @@
 """Quality against what was spent and against how far a test is from training: curves with intervals, and sentences.
 
-`time_to_quality`: training seconds. `data_scaling`: training frames. `novelty`: distance of a pose from training.
+`during_training`, `time_to_quality`: training seconds. `data_scaling`: training frames. `novelty`: distance of a
+pose from training.
 """
 
 from collections.abc import Iterator
@@ -21,6 +22,20 @@ NARROW_DEG = 1.0  # Motion that stays within it makes no curve.
 
 def _table(rows: list[tuple], *columns: str) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=[*columns, "psnr", "low", "high"])
+
+
+def during_training(curves: pd.DataFrame) -> pd.DataFrame:
+    """Method, seconds, psnr: the mean over a method's trainings (captures, seeds), from where the last of them has its
+    first score to where the first of them ends. Between two scores a training's changes linearly.
+    """
+    rows = []
+    for method, trainings in curves.groupby("method", sort=False):
+        runs = [run.sort_values("seconds") for _, run in trainings.groupby(["capture", "seed"])]
+        start, end = (pick(run["seconds"].iloc[place] for run in runs) for pick, place in ((max, 0), (min, -1)))
+        marks = runs[0]["seconds"] if len(runs) == 1 else np.geomspace(start, end, min(map(len, runs)))
+        scores = [np.interp(marks, run["seconds"], run["psnr"]) for run in runs]
+        rows += [(method, *point) for point in zip(marks, np.mean(scores, axis=0), strict=True)]
+    return pd.DataFrame(rows, columns=["method", "seconds", "psnr"])
 
 
 def time_to_quality(snapshots: pd.DataFrame) -> pd.DataFrame:

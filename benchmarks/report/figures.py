@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import pandas as pd
 
-from benchmarks.analysis import pareto
+from benchmarks.analysis import curves, pareto
 from benchmarks.analysis.results import FRAME_MS, RANKED_SPLITS, RunTables, foreground, samples_of
 from benchmarks.analysis.statistics import intervals
 from benchmarks.analysis.style import EXACT, SPLIT_NAMES
@@ -66,21 +66,22 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
 
 
 def training_figure(tables: RunTables, scene: str) -> Figure | None:
-    """Foreground PSNR of reserved training views over seconds of training, first seed of the first capture."""
-    curves = tables.curves[tables.curves["scene"] == scene]
-    curves = curves[curves["capture"] == curves.groupby("method")["capture"].transform("first")]
-    curves = curves[curves["seed"] == curves.groupby("method")["seed"].transform("min")]
-    methods = [m for m in tables.methods(scene) if (curves["method"] == m).sum() > 1]
+    """Foreground PSNR of reserved training views over seconds of training, the mean over trainings of a method."""
+    table = curves.during_training(tables.curves[tables.curves["scene"] == scene])
+    counts = table.groupby("method").size()
+    methods = [m for m in tables.methods(scene) if counts.get(m, 0) > 1]
     if not methods:
         return None
     title = "Accuracy against training time"
-    caption = "Foreground PSNR of reserved training views, which no step sees, over seconds of training. First seed;"
+    caption = "Foreground PSNR of reserved training views, over CPU seconds of training, warm-up included."
+    if over := tables.unit(scene):
+        caption += f" Means over {over}, from the last one's first score to the end of the first that ends."
     return line_figure(
-        curves[curves["method"].isin(methods)].assign(panel=title),
+        table[table["method"].isin(methods)].assign(panel=title),
         vega.series_of(methods),
         name=f"training_{scene}",
         title=title,
-        caption=f"{caption} warm-up included.",
+        caption=caption,
         x="seconds",
         x_title="seconds of training",
         y_title="PSNR of reserved views [dB]",

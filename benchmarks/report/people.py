@@ -96,6 +96,8 @@ def pictured(
         rows = [pictures.compare(capture, cells, view, with_errors=False) for view in views]
         groups.append((who, tuple(replace(row, title=f"{who}, {row.title}").strip(album) for row in rows)))
         columns.append([replace(rows[0].images[0], caption=who), *rows[0].images[1:]])
+    if not columns:  # Rows of several runs, each on captures of its own.
+        return None, {}
     lines = [Frames(title="", images=line) for line in zip(*columns, strict=True)]
     file = f"pictures_people_{scene}.webp"
     strips = Strips(file=file, title=f"All subjects on {scene}", groups=tuple(groups))

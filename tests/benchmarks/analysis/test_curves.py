@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from helpers.cells import cell, config
 
@@ -27,6 +28,17 @@ def trained(method: str, course: dict[int, float], *, seed: int = 0) -> CellResu
     )
     outcome = TrainingOutcome(steps=100, seconds=float(end[0]), ended_by="plateau")
     return replace(cell(method, end[1], seed=seed), snapshots=snapshots, training=outcome)
+
+
+def test_a_training_curve_is_the_mean_over_people_while_all_of_them_train() -> None:
+    """One person is scored from 10 s to 90 s, the other from 5 s to 40 s; alone a curve is what was scored."""
+    first = pd.DataFrame({"capture": "a", "seconds": [10.0, 20.0, 90.0], "psnr": [20.0, 22.0, 29.0]})
+    second = pd.DataFrame({"capture": "b", "seconds": [5.0, 10.0, 40.0], "psnr": [25.0, 26.0, 29.0]})
+    both = curves.during_training(pd.concat([first, second]).assign(method="ash", seed=0))
+    assert both["seconds"].tolist() == pytest.approx([10, 20, 40]) and set(both["method"]) == {"ash"}
+    assert both["psnr"].tolist() == pytest.approx([23.0, 24.5, 26.5])
+    alone = curves.during_training(first.assign(method="ddc", seed=1))
+    assert alone["psnr"].tolist() == first["psnr"].tolist()
 
 
 def test_methods_cross_where_their_scores_are_equal() -> None:

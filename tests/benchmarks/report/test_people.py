@@ -112,6 +112,10 @@ def test_a_report_over_people_shows_everybody(run: Run, tmp_path: Path) -> None:
     sheet = Image.open(io.BytesIO(sheets[strips.file]))
     alone = next(b for s in sections for b in s.blocks if b.kind == "flipbook")
     assert strips.file in sheets and alone.file in sheets and sheet.width < sheet.height
+    apart = {cell.config.key: replace(cell.config, capture=cell.config.method) for cell in cast.cells}
+    rendered_twice = replace(cast, cells=tuple(replace(cell, config=apart[cell.config.key]) for cell in cast.cells))
+    of_both = [replace(each, config=apart[each.config.key]) for each in results]
+    assert people.pictured(rendered_twice, of_both, tables, "boxes", Album()) == (None, {})
     shutil.rmtree(tmp_path / "other")
     with pytest.raises(InputError):
         people.pictured(cast, results, tables, "boxes", Album())
