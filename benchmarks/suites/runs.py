@@ -337,7 +337,7 @@ def require_one_of_each(cells: Iterable[Cell]) -> None:
     rows: dict[tuple[str, str], Cell] = {}
     for cell in cells:
         config = cell.config
-        twin = names.setdefault((config.place, config.subject, config.capture, config.method, config.seed), cell)
+        twin = names.setdefault((config.place, config.subject, config.capture_seed, config.method, config.seed), cell)
         first = rows.setdefault((config.place, config.method), cell)
         if twin is not cell or _settings(first) != _settings(cell):
             other = first if twin is cell else twin
@@ -348,7 +348,8 @@ def require_one_of_each(cells: Iterable[Cell]) -> None:
 
 
 def _settings(cell: Cell) -> tuple[Any, ...]:
-    return cell.config.preset, cell.config.source, cell.config.changes
+    config = cell.config
+    return config.preset, config.source, config.changes, config.code
 
 
 def mixed_places(configs: Iterable[CellConfig]) -> set[str]:

@@ -216,11 +216,11 @@ def test_a_page_shows_what_was_judged(two_people: Run, tmp_path: Path) -> None:
     assert "more detail is more accurate" in (tmp_path / "judged" / "claims.md").read_text()
 
 
-def part_of(run: Run, method: str, folder: Path, *, preset: str = "ci") -> Path:
+def part_of(run: Run, method: str, folder: Path, **other: str) -> Path:
     """A run of one row of another, perhaps trained in another way."""
     made = []
     for cell in (cell for cell in run.cells if cell.config.method == method):
-        config, result = replace(cell.config, preset=preset), result_of(cell)
+        config, result = replace(cell.config, **other), result_of(cell)
         assert result is not None
         made.append(replace(cell, config=config, folder=folder / "cells" / config.key))
         write_config(made[-1])
@@ -229,14 +229,15 @@ def part_of(run: Run, method: str, folder: Path, *, preset: str = "ci") -> Path:
     return folder
 
 
+@pytest.mark.parametrize("other_way", [{"preset": "brief"}, {"code": "0123456789abcdef"}, {"capture": "rendered anew"}])
 def test_rows_of_two_runs_are_compared_where_one_report_can_hold_them(
-    two_people: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    two_people: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], other_way: dict[str, str]
 ) -> None:
     """Not where a row was trained in two ways."""
     file = tmp_path / "claims.toml"
     file.write_text(BOXES)
     good, bad = (part_of(two_people, f"fake_{name}", tmp_path / name) for name in ("good", "bad"))
-    other = part_of(two_people, "fake_good", tmp_path / "other_way", preset="brief")
+    other = part_of(two_people, "fake_good", tmp_path / "other_way", **other_way)
     asked = ["claims", str(good), str(bad), "--claims", str(file), "--out", str(tmp_path / "judged")]
     assert cli.main(asked) == cli.DONE
     assert "confirmed 1" in capsys.readouterr().out
