@@ -68,12 +68,11 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
 def training_figure(tables: RunTables, scene: str) -> Figure | None:
     """Foreground PSNR of reserved training views over seconds of training, the mean over trainings of a method."""
     table = curves.during_training(tables.curves[tables.curves["scene"] == scene])
-    counts = table.groupby("method").size()
-    methods = [m for m in tables.methods(scene) if counts.get(m, 0) > 1]
+    methods = [m for m in tables.methods(scene) if (table["method"] == m).sum() > 1]
     if not methods:
         return None
     title = "Accuracy against training time"
-    caption = "Foreground PSNR of reserved training views, over CPU seconds of training, warm-up included."
+    caption = "Foreground PSNR of reserved training views, which no step sees. Warm-up is included."
     if over := tables.unit(scene):
         caption += f" Means over {over}, from the last one's first score to the end of the first that ends."
     return line_figure(
