@@ -48,7 +48,10 @@ OTHER_STRENGTHS = frozenset(f"{factor}{end}" for factor in FACTORS for end in ST
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class AblationEffect:
-    """A cell of the matrix: PSNR of ASH with the component minus without, dB. `verdict`: on ASH with the component."""
+    """A cell of the matrix: PSNR of ASH with the component minus without, dB. `verdict`: on ASH with the component.
+
+    `needed`: how many people would give a verdict where it is unclear; NaN if unknown, or more than a thousand.
+    """
 
     scene: str
     row: str
@@ -56,6 +59,7 @@ class AblationEffect:
     low: float
     high: float
     verdict: str
+    needed: float
 
     @property
     def component(self) -> str:
@@ -82,9 +86,8 @@ def effects(table: pd.DataFrame, split: str) -> list[AblationEffect]:
         if row.method in ADDED:
             mean, low, high, verdict = -mean, -high, -low, FLIPPED.get(verdict, verdict)
         if row.method in SHOWN:
-            cells.append(
-                AblationEffect(scene=row.scene, row=row.method, mean=mean, low=low, high=high, verdict=verdict)
-            )
+            found = {"mean": mean, "low": low, "high": high, "verdict": verdict, "needed": row.needed}
+            cells.append(AblationEffect(scene=row.scene, row=row.method, **found))
     order = [*COMPONENTS, *dict.fromkeys(effect.row for effect in cells)]
     return sorted(cells, key=lambda effect: order.index(effect.row))
 
@@ -114,6 +117,16 @@ def surprises(cells: list[AblationEffect]) -> list[str]:
         if (control, effect.row) in by_place:
             text += f" Control scene {control}, {differs}: {by_place[control, effect.row].text}."
         sentences.append(text)
+    return sentences
+
+
+def undecided(cells: list[AblationEffect]) -> list[str]:
+    """Sentences on the components that a scene should need and whose verdict is unclear: how many people it takes."""
+    sentences = []
+    for effect in cells:
+        if effect.expected and effect.verdict == "unclear":
+            people = "more than a thousand people" if pd.isna(effect.needed) else f"about {effect.needed:.0f} people"
+            sentences.append(f"{effect.scene}, {effect.component}: {effect.text}; {people} would decide.")
     return sentences
 
 

@@ -24,7 +24,7 @@ FILE = Path(__file__).with_name("claims.toml")
 NO_SCENE = "no run of this scene"
 COLUMNS = [
     *("name", "scene", "says", "where", "contrast", "paper", "effect", "low", "high", "p", "people", "unit"),
-    *("verdict", "because", "run"),
+    *("verdict", "needed", "because", "run"),
 ]
 # What each verdict of `compare` on `a` makes of what was expected of it. What is missing was not shown.
 DECIDES: dict[Expected, dict[str, Verdict]] = {
@@ -85,7 +85,7 @@ def read_claims(path: Path = FILE) -> tuple[Claim, ...]:
 
 
 def judge(claims: Sequence[Claim], runs: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """Every claim on every scene of it: `COLUMNS`, `effect` is `a` minus `b`.
+    """Every claim on every scene of it: `COLUMNS`, `effect` is `a` minus `b`, `needed` people would decide.
 
     `runs`: rows as `analysis.results.load` has them, by the name of their run. A claim is judged within one run, that
     with the most people; people for validation decide nothing. p is corrected over all claims (Holm). A claim about a
@@ -112,6 +112,9 @@ def judge(claims: Sequence[Claim], runs: Mapping[str, pd.DataFrame]) -> pd.DataF
             record |= {"effect": test.mean, "low": test.low, "high": test.high, "p": test.p, "people": test.captures}
             short = _short_of_plateau(claim, scene, runs[run])
             record["verdict"], record["because"] = _verdict(claim, scene, test, short)
+            if record["verdict"] == "not shown":
+                beyond = claim.least if claim.expect in ("better", "worse") else None
+                record["needed"] = test.captures_needed(beyond or 0.0)
         records.append(record)
     return pd.DataFrame(records, columns=COLUMNS)
 

@@ -10,7 +10,7 @@ from benchmarks.analysis.results import RANKED_SPLITS, RunTables, compare, foreg
 from benchmarks.analysis.statistics import Comparison, corrected, detectable
 from benchmarks.analysis.style import REFERENCES, reference_of
 
-COLUMNS = ["scene", "split", "reference", "method", *Comparison.__dataclass_fields__, "verdict"]
+COLUMNS = ["scene", "split", "reference", "method", *Comparison.__dataclass_fields__, "verdict", "needed"]
 CAPTURES = (1, 2, 4, 8, 16)  # for which reports print the detectable difference
 
 
@@ -20,6 +20,7 @@ def differences(
     """Foreground PSNR of ASH (or ASH+) minus that of every other method that is no oracle, in dB: `COLUMNS`.
 
     A method is compared with the one of its pair (`benchmarks.analysis.style.reference_of`), ASH+ with ASH.
+    `needed`: how many captures would give a verdict where there is none, NaN if unknown.
 
     p is corrected over the methods and splits of a scene: splits asked for apart cost the others no power.
     """
@@ -35,7 +36,8 @@ def differences(
             and (comparison := compare(tables.of(scene), reference, method, foreground(split))) is not None
         ]
         for (row, _), each in zip(compared, corrected([each for _, each in compared]), strict=True):
-            rows.append({**row, **asdict(each), "verdict": each.verdict})
+            needed = each.captures_needed() if each.verdict == "unclear" else None
+            rows.append({**row, **asdict(each), "verdict": each.verdict, "needed": needed})
     return pd.DataFrame(rows, columns=COLUMNS)
 
 

@@ -6,6 +6,7 @@ the image: images of one training share its random numbers, so that a test over 
 """
 
 import math
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
@@ -17,6 +18,7 @@ Verdict = Literal["better", "worse", "equivalent", "unclear"]
 Samples = Mapping[str, Sequence[float]]  # values by capture, one for each seed
 
 LEVEL, ALPHA, POWER = 0.95, 0.05, 0.8
+MOST_PAIRS = 1000  # that are worth a search
 ROUNDING = 1e-12  # as a share of the values: a smaller spread is none
 
 
@@ -41,6 +43,7 @@ class Comparison:
     captures: int = 0  # that were compared in pairs; 0: seeds of a single capture
     margin: float = 0.0  # differences up to it do not count
     higher_is_better: bool = True
+    tests: int = 1  # among which p is corrected
 
     @property
     def significant(self) -> bool:
@@ -53,6 +56,21 @@ class Comparison:
         if self.significant and abs(self.mean) > self.margin:
             return "better" if (self.mean > 0) == self.higher_is_better else "worse"
         return "equivalent" if -self.margin <= self.low and self.high <= self.margin else "unclear"
+
+    def captures_needed(self, beyond: float = 0.0) -> int | None:
+        """How many captures would decide, were mean and spread those of all people: with 80 % power, corrected.
+
+        A difference within the margin is decided once it is known to lie there. p is corrected as Bonferroni does, the
+        hardest step of Holm's. `beyond`: what a larger difference must exceed. None: above a thousand, or one capture.
+        """
+        size = abs(self.mean)
+        distance = size - beyond if size > max(self.margin, beyond) else self.margin - size
+        if self.captures < 2 or distance <= 0 or math.isnan(self.spread):
+            return None
+        level = 1 - ALPHA / self.tests
+        counts = range(2, MOST_PAIRS + 1)
+        index = bisect_left(counts, True, key=lambda count: detectable(self.spread, count, level) <= distance)
+        return counts[index] if index < len(counts) else None
 
 
 def compare_samples(
@@ -100,8 +118,8 @@ def compare_samples(
 def corrected(comparisons: Sequence[Comparison]) -> list[Comparison]:
     """With p adjusted so that the chance of any false alarm among all of them is at most 5 % (Holm 1979)."""
     p_values = [each.p for each in comparisons if not math.isnan(each.p)]
-    adjusted = iter(holm(p_values))
-    return [each if math.isnan(each.p) else replace(each, p=next(adjusted)) for each in comparisons]
+    adjusted, tests = iter(holm(p_values)), len(p_values)
+    return [each if math.isnan(each.p) else replace(each, p=next(adjusted), tests=tests) for each in comparisons]
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -113,14 +131,14 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return [float(p) for p in adjusted]
 
 
-def detectable(spread: float, pairs: int) -> float:
+def detectable(spread: float, pairs: int, level: float = LEVEL) -> float:
     """The smallest difference that so many pairs show with 80 % power; `spread`: deviation of their differences.
 
     Infinite for a single pair.
     """
     if pairs < 2:
         return math.inf
-    return _noncentrality(pairs - 1.0, _quantile(LEVEL, pairs - 1)) * spread / math.sqrt(pairs)
+    return _noncentrality(pairs - 1.0, _quantile(level, pairs - 1)) * spread / math.sqrt(pairs)
 
 
 def mean_interval(values: Sequence[float]) -> Interval:

@@ -19,6 +19,7 @@ from benchmarks.cell.schema import printable
 from benchmarks.report import author_table, content, escaping, glossary, sections, sentences, tables, vega
 from benchmarks.report.author_table import AuthorTable
 from benchmarks.report.content import Section
+from benchmarks.report.headings import new_headings
 from benchmarks.report.pictures import Album
 from benchmarks.report.scene import FEW_WORST, MANY, WORST, SceneData, scene_report
 from benchmarks.report.vega import Figure
@@ -66,6 +67,7 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
     first, others = _first_sections([parts for parts, _ in made], run.command)
     curves = [*sections.training_cost(run_tables), *sections.template_errors(run_tables)]
     novelty = sections.novelty(run_tables)
+    turned, turned_sheets = new_headings(run, results, run_tables, album)
     title = f"Report of suite {run.suite}"
     parts = [
         Section(title="", blocks=(content.Text(text=run.about[:1].upper() + run.about[1:] + "."),)),
@@ -76,13 +78,14 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
         *curves,
         *others,
         *novelty,
+        *turned,
         *sections.beside_the_paper(run_tables, run.suite),
         *sections.failed_cells(results, len(run.cells) + len(run.absent) - len(results)),
         sections.provenance(results, run.command),
         sections.glossary(),
     ]
     files = {each.file: each.svg().encode() for part in parts for each in part.blocks if isinstance(each, Figure)}
-    files |= {name: png for _, sheets in made for name, png in sheets.items()}
+    files |= {name: png for _, sheets in made for name, png in sheets.items()} | turned_sheets
     files |= {
         "results.csv": csv_of(_without_formulas(run_tables.all_rows)).encode(),
         "tables.tex": author_table.latex(own or author_table.default_tables(run_tables)).encode(),

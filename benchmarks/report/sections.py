@@ -30,6 +30,10 @@ MATRIX_NOTE = (
     "ASH: better means that the component is needed, worse that it does harm. The numbers and verdicts are those of "
     "the scene's own table of differences. n/a: not run there. One seed on one capture gives no verdict."
 )
+UNDECIDED = (
+    "Unclear, and how many people would decide, if difference and spread are those of all people (80 % power, after "
+    "correction):"
+)
 ONE_VALUE = "One seed on one capture: no verdict on components; --seeds 3 or --subjects 8 gives one."
 SUFFICIENT_NOTE = (
     f"The cheapest row by milliseconds per frame whose loss to the best is below {pareto.SUFFICIENT_DB} dB (upper 95 % "
@@ -114,6 +118,8 @@ def _matrix(tables: RunTables, effects: Sequence[ablation_matrix.AblationEffect]
         text += f" Verdicts on ASH with them: {', '.join(f'{count} {verdict}' for verdict, count in counts.items())}."
         blocks.append(Text(text=f"{text} {'Contradictions:' if sentences else 'No contradictions.'}"))
         blocks += [Bullets(items=tuple(sentences))] if sentences else []
+        if open_cells := ablation_matrix.undecided(list(effects)):
+            blocks += [Text(text=UNDECIDED), Bullets(items=tuple(open_cells))]
     return blocks
 
 

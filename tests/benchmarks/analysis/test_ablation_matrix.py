@@ -6,7 +6,15 @@ from dataclasses import replace
 import pytest
 from helpers.cells import people
 
-from benchmarks.analysis.ablation_matrix import COMPONENTS, CONTROL_SCENES, EXPECTED, matrix, strength_curves, surprises
+from benchmarks.analysis.ablation_matrix import (
+    COMPONENTS,
+    CONTROL_SCENES,
+    EXPECTED,
+    matrix,
+    strength_curves,
+    surprises,
+    undecided,
+)
 from benchmarks.analysis.differences import differences
 from benchmarks.analysis.results import RunTables
 from benchmarks.cell.registry import configured, offered
@@ -91,6 +99,15 @@ def test_a_surprise_names_the_control_scene_where_it_was_run() -> None:
     tables = RunTables([*shown, *run("overcast", base | {"wo_mot": 26.9})])
     said = surprises(matrix(tables, differences(tables), "novel_view"))
     assert "Control scene overcast, under an even sky, where no lamp casts shadows: +0.10 dB" in said[0]
+
+
+def test_what_a_scene_should_need_and_is_unclear_says_how_many_people_would_decide() -> None:
+    unclear = people({"ash": (27.0, 29.0, 31.0), "wo_mot": (26.8, 28.1, 31.2)}, scene="wrinkles")
+    tables = RunTables(unclear + run("swing", {"ash": 27.0, "wo_mot": 26.0}))
+    (sentence,) = undecided(matrix(tables, differences(tables), "novel_view"))
+    assert sentence.startswith("wrinkles, w/o mot.: +0.30 dB [") and sentence.endswith(" people would decide.")
+    said = [item for bullets in blocks_of(sections.ablations(tables), Bullets) for item in bullets.items]
+    assert sentence in said
 
 
 def test_loss_by_strength(factors: RunTables) -> None:

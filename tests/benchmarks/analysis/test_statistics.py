@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import optimize, stats
@@ -106,6 +108,7 @@ def test_holms_correction_by_hand_leaves_out_what_has_no_p() -> None:
     found = corrected(tests)
     assert [each.p for each in (*found[:2], found[3])] == pytest.approx([0.08, 0.03, 0.9]) and np.isnan(found[2].p)
     assert [each.verdict for each in found] == ["unclear", "better", "unclear", "unclear"]
+    assert [each.tests for each in found] == [3, 3, 1, 3]
 
 
 def test_false_alarms_and_power_on_our_design() -> None:
@@ -133,6 +136,24 @@ def test_what_is_detectable_falls_with_the_number_of_captures() -> None:
         compared(captures(*rng.normal(found[2], 0.3, 4)), captures(*[0.0] * 4)).significant for _ in range(1000)
     )
     assert shown / 1000 == pytest.approx(0.8, abs=0.04)
+
+
+def test_so_many_captures_would_decide() -> None:
+    unclear = compared(captures(0.1, 0.9, 0.2), captures(0.0, 0.0, 0.0))
+    needed = unclear.captures_needed()
+    assert unclear.verdict == "unclear" and needed is not None
+    assert detectable(unclear.spread, needed) <= unclear.mean < detectable(unclear.spread, needed - 1)
+    rng = np.random.default_rng(6)
+    draws = rng.normal(unclear.mean, unclear.spread, (1000, needed))
+    shown = sum(compared(captures(*draw), captures(*[0.0] * needed)).significant for draw in draws)
+    assert shown / 1000 == pytest.approx(0.8, abs=0.08)
+    assert (replace(unclear, tests=20).captures_needed() or 0) > needed  # corrected over more comparisons
+    assert (unclear.captures_needed(beyond=0.2) or 0) > needed
+    inside = replace(unclear, mean=0.05, margin=0.1)
+    assert inside.captures_needed() == replace(inside, mean=-0.05).captures_needed() is not None
+    assert replace(inside, mean=0.1).captures_needed() is None  # on the margin
+    assert replace(unclear, mean=1e-4).captures_needed() is None  # more than a thousand
+    assert compared(seeds(1.0, 2.0), seeds(1.5, 1.9)).captures_needed() is None  # a single capture
 
 
 def test_mean_interval_and_wilson_agree_with_scipy() -> None:

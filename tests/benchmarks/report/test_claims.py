@@ -1,5 +1,6 @@
 """Claims: their file, what decides them, and the command."""
 
+import math
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -98,6 +99,15 @@ def test_a_contrast_decides(expect: str, a: Sequence[float], found: str) -> None
     mirrored = {"better": "worse", "worse": "better", "not better": "not worse", "not worse": "not better"}
     turned = replace(CLAIM, a="ddc", b="ash", expect=mirrored.get(expect, expect))
     assert verdict(turned, rows(a, OTHER)) == found
+
+
+def test_what_is_not_shown_says_how_many_people_would_decide() -> None:
+    def needed(claim: Claim, a: Sequence[float]) -> float:
+        return float(judge([claim], {"run": rows(a, OTHER)}).needed.item())
+
+    assert needed(CLAIM, UNCLEAR) > 3 and math.isnan(needed(CLAIM, BETTER)) and math.isnan(needed(CLAIM, SAME))
+    wide = (29.0, 31.1, 32.2)  # Better, but not surely by a decibel and a half.
+    assert needed(replace(CLAIM, least=1.5), wide) > needed(replace(CLAIM, least=1.0), wide) > 3
 
 
 def test_a_published_difference_above_the_interval_makes_it_smaller() -> None:
@@ -213,7 +223,7 @@ def test_a_page_shows_what_was_judged(two_people: Run, tmp_path: Path) -> None:
     assert "confirmed 1" in lines[-1] and lost == []
     page = (tmp_path / "judged" / "claims.html").read_text()
     assert "the view of the median difference" in page and "run/report.html" in page
-    assert "more detail is more accurate" in (tmp_path / "judged" / "claims.md").read_text()
+    assert "80 % power" in page and "more detail is more accurate" in (tmp_path / "judged" / "claims.md").read_text()
 
 
 def part_of(run: Run, method: str, folder: Path, **other: str) -> Path:

@@ -17,6 +17,7 @@ from helpers.waiting import wait_for
 from ash.files import InputError
 from ash.protocol import TrainingOutcome
 from benchmarks import cli
+from benchmarks.analysis import headings
 from benchmarks.analysis.differences import differences
 from benchmarks.analysis.results import Quantity, RunTables
 from benchmarks.analysis.style import titles_of
@@ -26,8 +27,9 @@ from benchmarks.commands import arguments
 from benchmarks.report import charts, sentences, tables, vega
 from benchmarks.report import page as page_module
 from benchmarks.report import scene as scene_module
-from benchmarks.report.content import Text
+from benchmarks.report.content import Strips, Table, Text
 from benchmarks.report.figures import speed_figure
+from benchmarks.report.headings import new_headings
 from benchmarks.report.page import publish, write_report
 from benchmarks.report.pictures import Album, Shown
 from benchmarks.report.scene import SceneData, scene_report
@@ -107,6 +109,17 @@ def test_the_page_is_whole_and_needs_nothing_else(run: Run) -> None:
         "2 cameras, 4 frames",
     ):
         assert words in text
+
+
+def test_headings_far_from_those_of_training_are_told_apart(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "New headings" not in (run.folder / "report.md").read_text()
+    monkeypatch.setattr(headings, "EDGES_DEG", (-2.0, -1.0))  # All lie beyond.
+    (turned,), sheets = new_headings(run, results_of(run), RunTables(results_of(run)), Album())
+    _, table, _, strips = turned.blocks
+    assert isinstance(table, Table) and isinstance(strips, Strips)
+    assert list(table.frame.columns) == ["beyond 60 deg, 3 frames [dB]"]
+    assert {"fake_good", "fake_bad"} <= set(table.frame.index)
+    assert len(strips.groups[0][1][0].tiles) == 1 + len(table.frame) and list(sheets) == [strips.file]
 
 
 def test_the_charts_are_valid_svg_and_adapt_to_dark_pages(run: Run) -> None:
