@@ -32,6 +32,8 @@ def by_heading(images: pd.DataFrame, degrees: Mapping[tuple[str, int], float]) -
     `degrees`: of a capture's frame, by `heading_deg`. Scenes without a frame in the last bin have no rows.
     """
     columns = ["scene", "method", "bin", "psnr", "frames", "captures"]
+    if "psnr" not in images:  # All pictures were brought without alpha.
+        return pd.DataFrame(columns=columns)
     posed = images[images["split"].isin(MOTION_SPLITS) & images["psnr"].notna()]
     known = [degrees.get(place, np.nan) for place in zip(posed["capture"], posed["frame"], strict=True)]
     posed = posed.assign(bin=np.searchsorted(EDGES_DEG, known))[~np.isnan(known)]

@@ -40,7 +40,7 @@ def new_headings(
     for scene, here in table.groupby("scene", sort=False):
         wide = here.pivot(index="method", columns="bin", values="psnr").reindex(here["method"].unique())
         counts = here.groupby("bin")["frames"].first()
-        wide = wide[[name for name in BINS if name in wide]].map("{:.1f}".format)
+        wide = wide[[name for name in BINS if name in wide]].map("{:.1f}".format, na_action="ignore").fillna("n/a")
         frame = wide.set_axis([f"{name}, {counts[name]} frames [dB]" for name in wide.columns], axis=1)
         blocks.append(Table(title=str(scene), frame=frame.rename(index=lambda method: style_of(method).title)))
         if (row := _farthest(run, results, str(scene), degrees)) is not None:
@@ -53,8 +53,10 @@ def new_headings(
 
 
 def _degrees(run: Run) -> dict[tuple[str, int], float]:
+    """From the heading of each frame of a new pose to the nearest of training."""
     degrees: dict[tuple[str, int], float] = {}
-    for identity, folder in {cell.config.capture: cell.capture_folder for cell in run.cells}.items():
+    folders = {cell.config.capture: cell.capture_folder for cell in run.cells if not cell.config.axis}
+    for identity, folder in folders.items():
         with suppress(InputError):
             splits = (capture := load_capture(folder)).splits
             frames = [frame for name in MOTION_SPLITS if name in splits for frame in splits[name].frames]
