@@ -3,6 +3,7 @@
 The numbers are those of `differences`: a row that was compared with ASH has the same verdict in both tables.
 """
 
+import math
 from dataclasses import dataclass
 
 import pandas as pd
@@ -50,7 +51,7 @@ OTHER_STRENGTHS = frozenset(f"{factor}{end}" for factor in FACTORS for end in ST
 class AblationEffect:
     """A cell of the matrix: PSNR of ASH with the component minus without, dB. `verdict`: on ASH with the component.
 
-    `needed`: how many people would give a verdict where it is unclear; NaN if unknown, or more than a thousand.
+    `needed`: how many people would give a verdict where it is unclear; infinite above a thousand, NaN if unknown.
     """
 
     scene: str
@@ -124,8 +125,8 @@ def undecided(cells: list[AblationEffect]) -> list[str]:
     """Sentences on the components that a scene should need and whose verdict is unclear: how many people it takes."""
     sentences = []
     for effect in cells:
-        if effect.expected and effect.verdict == "unclear":
-            people = "more than a thousand people" if pd.isna(effect.needed) else f"about {effect.needed:.0f} people"
+        if effect.expected and not math.isnan(effect.needed):
+            people = "more than a thousand people" if math.isinf(effect.needed) else f"about {effect.needed:.0f} people"
             sentences.append(f"{effect.scene}, {effect.component}: {effect.text}; {people} would decide.")
     return sentences
 

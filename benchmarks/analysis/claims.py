@@ -113,7 +113,7 @@ def judge(claims: Sequence[Claim], runs: Mapping[str, pd.DataFrame]) -> pd.DataF
             short = _short_of_plateau(claim, scene, runs[run])
             record["verdict"], record["because"] = _verdict(claim, scene, test, short)
             if record["verdict"] == "not shown":
-                beyond = claim.least if claim.expect in ("better", "worse") else None
+                beyond = claim.least if claim.expect in ("better", "worse") else 0.0
                 record["needed"] = test.captures_needed(beyond or 0.0)
         records.append(record)
     return pd.DataFrame(records, columns=COLUMNS)

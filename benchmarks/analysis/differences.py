@@ -1,5 +1,6 @@
 """Every method of a run against a reference, with verdicts, and how small a difference more captures would show."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 
@@ -20,7 +21,7 @@ def differences(
     """Foreground PSNR of ASH (or ASH+) minus that of every other method that is no oracle, in dB: `COLUMNS`.
 
     A method is compared with the one of its pair (`benchmarks.analysis.style.reference_of`), ASH+ with ASH.
-    `needed`: how many captures would give a verdict where there is none, NaN if unknown.
+    `needed`: how many captures would give a verdict where there is none; NaN if there is one, or a single capture.
 
     p is corrected over the methods and splits of a scene: splits asked for apart cost the others no power.
     """
@@ -36,7 +37,7 @@ def differences(
             and (comparison := compare(tables.of(scene), reference, method, foreground(split))) is not None
         ]
         for (row, _), each in zip(compared, corrected([each for _, each in compared]), strict=True):
-            needed = each.captures_needed() if each.verdict == "unclear" else None
+            needed = each.captures_needed() if each.verdict == "unclear" else math.nan
             rows.append({**row, **asdict(each), "verdict": each.verdict, "needed": needed})
     return pd.DataFrame(rows, columns=COLUMNS)
 

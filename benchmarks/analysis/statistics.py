@@ -57,20 +57,20 @@ class Comparison:
             return "better" if (self.mean > 0) == self.higher_is_better else "worse"
         return "equivalent" if -self.margin <= self.low and self.high <= self.margin else "unclear"
 
-    def captures_needed(self, beyond: float = 0.0) -> int | None:
+    def captures_needed(self, beyond: float = 0.0) -> float:
         """How many captures would decide, were mean and spread those of all people: with 80 % power, corrected.
 
         A difference within the margin is decided once it is known to lie there. p is corrected as Bonferroni does, the
-        hardest step of Holm's. `beyond`: what a larger difference must exceed. None: above a thousand, or one capture.
+        hardest step of Holm's. `beyond`: what a larger difference must exceed. Infinite above a thousand; NaN where a
+        single capture was compared, whose seeds say nothing of others.
         """
-        size = abs(self.mean)
-        distance = size - beyond if size > max(self.margin, beyond) else self.margin - size
-        if self.captures < 2 or distance <= 0 or math.isnan(self.spread):
-            return None
-        level = 1 - ALPHA / self.tests
+        if not self.captures:
+            return math.nan
+        size, level = abs(self.mean), 1 - ALPHA / self.tests
+        distance = size - beyond if size > self.margin else self.margin - size
         counts = range(2, MOST_PAIRS + 1)
         index = bisect_left(counts, True, key=lambda count: detectable(self.spread, count, level) <= distance)
-        return counts[index] if index < len(counts) else None
+        return counts[index] if index < len(counts) else math.inf
 
 
 def compare_samples(

@@ -87,7 +87,7 @@ def printed(judged: pd.DataFrame) -> pd.DataFrame:
             "difference": f"{number(row.effect, row.unit)} [{number(row.low)}, {number(row.high)}]",
             "paper": number(row.paper, row.unit),
             "people": str(int(row.people)),
-            "needed": "" if pd.isna(row.needed) else str(int(row.needed)),
+            "needed": "" if pd.isna(row.needed) else f"{row.needed:.0f}".replace("inf", "over 1000"),
         }
         for row in judged.itertuples()
     )

@@ -7,11 +7,11 @@ from ash.capture.formats import load_capture
 from ash.files import InputError
 from benchmarks.analysis.headings import BINS, by_heading, changes, heading_deg
 from benchmarks.analysis.results import MOTION_SPLITS, RunTables
-from benchmarks.analysis.style import is_ours, style_of
+from benchmarks.analysis.style import style_of
 from benchmarks.cell.schema import CellResult, ViewScore
 from benchmarks.report import pictures
 from benchmarks.report.content import Block, Bullets, Section, Strips, Table, Text
-from benchmarks.report.people import FEW, REFERENCE, RIVALS
+from benchmarks.report.people import FEW, REFERENCE, is_rival
 from benchmarks.report.pictures import Album, Frames
 from benchmarks.suites.runs import Run
 
@@ -72,9 +72,10 @@ def _farthest(run: Run, results: Sequence[CellResult], scene: str, degrees: Degr
         shown = [
             each
             for method, each in by_method.items()
-            if each.cell.config.place == scene and (method in (REFERENCE, *RIVALS) or not is_ours(method))
-        ]
-        shown = [each for each in shown if any(_turned(each.result, degrees))][: FEW + 1]
+            if each.cell.config.place == scene
+            and (method == REFERENCE or is_rival(method))
+            and any(_turned(each.result, degrees))
+        ][: FEW + 1]
         if shown:
             found.append((*max(_turned(shown[0].result, degrees), key=lambda turned: turned[0]), shown))
     if not found:

@@ -114,7 +114,12 @@ def _others(tables: RunTables, scene: str) -> list[str]:
         for row in tables.methods(scene, oracles=False)
         if row != REFERENCE and tables.whole(scene, row) and samples_of_method <= samples.get(row, {}).keys()
     ]
-    return others if len(others) <= FEW else [row for row in others if row in RIVALS or not is_ours(row)][:FEW]
+    return others if len(others) <= FEW else [row for row in others if is_rival(row)][:FEW]
+
+
+def is_rival(row: str) -> bool:
+    """Whether a row is shown where there are many: one of `RIVALS`, or a user's own."""
+    return row in RIVALS or not is_ours(row)
 
 
 def _names(tables: RunTables, scene: str) -> dict[str, str]:

@@ -223,7 +223,7 @@ def test_reports_need_a_finished_cell(finished: Path, tmp_path: Path, capsys) ->
 
 
 # An interrupt may fall between psutil's open() and its `with`: the file is closed when it is collected.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.filterwarnings("ignore:.*FileIO name='/proc/:pytest.PytestUnraisableExceptionWarning")
 def test_ctrl_c_exits_with_130_and_the_same_command_goes_on(capture: Path, tmp_path: Path, capsys) -> None:
     def interrupt_the_training(number: int) -> None:
         wait_for(lambda: list(tmp_path.glob("cells/*/*/log.jsonl")))

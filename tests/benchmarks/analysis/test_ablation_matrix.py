@@ -108,6 +108,11 @@ def test_what_a_scene_should_need_and_is_unclear_says_how_many_people_would_deci
     assert sentence.startswith("wrinkles, w/o mot.: +0.30 dB [") and sentence.endswith(" people would decide.")
     said = [item for bullets in blocks_of(sections.ablations(tables), Bullets) for item in bullets.items]
     assert sentence in said
+    seeds = people({"ash": (27.0,), "wo_mot": (26.9,)}, (0.0, 0.5, -0.5), scene="wrinkles")
+    single = RunTables(seeds + run("swing", {"ash": 27.0, "wo_mot": 26.0}))
+    assert undecided(matrix(single, differences(single), "novel_view")) == [], (
+        "seeds of one person say nothing of others"
+    )
 
 
 def test_loss_by_strength(factors: RunTables) -> None:

@@ -141,19 +141,19 @@ def test_what_is_detectable_falls_with_the_number_of_captures() -> None:
 def test_so_many_captures_would_decide() -> None:
     unclear = compared(captures(0.1, 0.9, 0.2), captures(0.0, 0.0, 0.0))
     needed = unclear.captures_needed()
-    assert unclear.verdict == "unclear" and needed is not None
+    assert unclear.verdict == "unclear" and isinstance(needed, int)
     assert detectable(unclear.spread, needed) <= unclear.mean < detectable(unclear.spread, needed - 1)
     rng = np.random.default_rng(6)
     draws = rng.normal(unclear.mean, unclear.spread, (1000, needed))
     shown = sum(compared(captures(*draw), captures(*[0.0] * needed)).significant for draw in draws)
     assert shown / 1000 == pytest.approx(0.8, abs=0.08)
-    assert (replace(unclear, tests=20).captures_needed() or 0) > needed  # corrected over more comparisons
-    assert (unclear.captures_needed(beyond=0.2) or 0) > needed
+    assert np.inf > replace(unclear, tests=20).captures_needed() > needed  # corrected over more comparisons
+    assert np.inf > unclear.captures_needed(beyond=0.2) > needed
     inside = replace(unclear, mean=0.05, margin=0.1)
-    assert inside.captures_needed() == replace(inside, mean=-0.05).captures_needed() is not None
-    assert replace(inside, mean=0.1).captures_needed() is None  # on the margin
-    assert replace(unclear, mean=1e-4).captures_needed() is None  # more than a thousand
-    assert compared(seeds(1.0, 2.0), seeds(1.5, 1.9)).captures_needed() is None  # a single capture
+    assert inside.captures_needed() == replace(inside, mean=-0.05).captures_needed() < np.inf
+    assert replace(inside, mean=0.1).captures_needed() == np.inf  # on the margin
+    assert replace(unclear, mean=1e-4).captures_needed() == np.inf  # more than a thousand
+    assert np.isnan(compared(seeds(1.0, 2.0), seeds(1.5, 1.9)).captures_needed())  # a single capture
 
 
 def test_mean_interval_and_wilson_agree_with_scipy() -> None:
