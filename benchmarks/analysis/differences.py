@@ -1,18 +1,16 @@
-"""Every method of a run against a reference, with verdicts, and how small a difference more captures would show."""
+"""Every method of a run against a reference, with verdicts, and how many captures those that are unclear would take."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
 
-import numpy as np
 import pandas as pd
 
 from benchmarks.analysis.results import RANKED_SPLITS, RunTables, compare, foreground
-from benchmarks.analysis.statistics import Comparison, corrected, detectable
+from benchmarks.analysis.statistics import Comparison, corrected
 from benchmarks.analysis.style import REFERENCES, reference_of
 
 COLUMNS = ["scene", "split", "reference", "method", *Comparison.__dataclass_fields__, "verdict", "needed"]
-CAPTURES = (1, 2, 4, 8, 16)  # for which reports print the detectable difference
 
 
 def differences(
@@ -40,18 +38,3 @@ def differences(
             needed = each.captures_needed() if each.verdict == "unclear" else math.nan
             rows.append({**row, **asdict(each), "verdict": each.verdict, "needed": needed})
     return pd.DataFrame(rows, columns=COLUMNS)
-
-
-def detectable_effects(table: pd.DataFrame) -> pd.DataFrame:
-    """By split and number of captures: the smallest true difference, dB, that so many captures show with 80 % power.
-
-    `median` over the methods of `differences`, and `worst`. A single capture tells nothing about others.
-    """
-    rows = []
-    for split, group in table[table["captures"] > 0].groupby("split", sort=False):
-        spread = group["spread"]
-        rows += [
-            (split, count, detectable(float(np.median(spread)), count), detectable(float(spread.max()), count))
-            for count in CAPTURES
-        ]
-    return pd.DataFrame(rows, columns=["split", "captures", "median", "worst"])

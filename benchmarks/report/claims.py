@@ -13,6 +13,7 @@ from benchmarks.analysis.error_attribution import psnr_of
 from benchmarks.analysis.results import load
 from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.schema import ViewScore
+from benchmarks.report import tables
 from benchmarks.report.compare import Rows, Views, cells_by_row, same_person, shared_views
 from benchmarks.report.content import Block, Bullets, Mark, Section, Strip, Strips, Table, Text
 from benchmarks.report.page import render
@@ -87,7 +88,7 @@ def printed(judged: pd.DataFrame) -> pd.DataFrame:
             "difference": f"{number(row.effect, row.unit)} [{number(row.low)}, {number(row.high)}]",
             "paper": number(row.paper, row.unit),
             "people": str(int(row.people)),
-            "needed": "" if pd.isna(row.needed) else f"{row.needed:.0f}".replace("inf", "over 1000"),
+            "needed": tables.people_needed(row.needed),
         }
         for row in judged.itertuples()
     )

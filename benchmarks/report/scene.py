@@ -50,11 +50,8 @@ COST_NOTE = (
 DIFFERENCES_NOTE = (
     "Foreground PSNR. Verdict on the method in the corner: better or worse if p is below 5 % and the difference above "
     f"{METRICS['psnr'].abs_tol:g} dB; equivalent if the interval lies within that margin; unclear otherwise. p is the "
-    "chance of such a difference between equal methods, corrected for all rows of the table (Holm)."
-)
-DETECTABLE_NOTE = (
-    "The smallest true difference that so many captures (subjects in this outfit) show with 80 % power, from the "
-    "spread of the differences over the captures here: of the median row, and of the row that spreads most."
+    "chance of such a difference between equal methods, corrected for all rows of the table (Holm). People needed: how "
+    "many would decide what is unclear, with 80 % power, were mean and spread of the difference those found here."
 )
 CONVENTIONS_NOTE = (
     "One set of predictions, scored in four ways. The release scores only inside the eroded mask; whole frames are "
@@ -112,7 +109,7 @@ def scene_report(data: SceneData) -> tuple[list[Section], dict[str, bytes]]:
         *picture_sections,
         Section(
             title=f"For specialists: statistics of {scene}",
-            blocks=tuple(statistics_blocks(run_tables, scene, ranked)),
+            blocks=tuple(statistics_blocks(run_tables, scene)),
             folded=True,
         ),
         Section(title=f"All other numbers of {scene}", blocks=more, folded=True),
@@ -185,6 +182,8 @@ def difference_tables(run_tables: RunTables, scene: str, rows: pd.DataFrame, *, 
             f"95 % interval [{test}]": [f"[{r.low:+.2f}, {r.high:+.2f}]" for r in table.itertuples()],
             "p [Holm]": table["p"].map("{:.2g}".format),
         }
+        if table["needed"].notna().any():
+            columns["people needed"] = table["needed"].map(tables.people_needed)
         frame = pd.DataFrame(columns).set_axis(table["method"].map(lambda method: style_of(method).title))
         marks: dict[tuple[int, int], Mark] = {(i, 2): "strong" for i, p in enumerate(table["p"]) if p < 0.05}
         corner = f"{style_of(str(reference)).title} minus"
@@ -192,22 +191,13 @@ def difference_tables(run_tables: RunTables, scene: str, rows: pd.DataFrame, *, 
     return [*blocks, Text(text=DIFFERENCES_NOTE, note=True)]
 
 
-def statistics_blocks(run_tables: RunTables, scene: str, ranked: pd.DataFrame) -> list[Block]:
-    """Templates, differences on other splits, and how small a difference more captures would show."""
+def statistics_blocks(run_tables: RunTables, scene: str) -> list[Block]:
+    """Templates, and differences on other splits."""
     learned = sentences.templates(run_tables, scene)
     blocks: list[Block] = [Text(text=learned)] if learned else []
     others = tuple(split for split in MOTION_SPLITS if split not in RANKED_SPLITS)
     beside = differences.differences(run_tables, splits=others, scenes=(scene,))
     blocks += difference_tables(run_tables, scene, beside, title="Near and far novel poses")
-    effects = differences.detectable_effects(ranked)
-    if len(effects):
-        span = [f"{r.median:.2f} to {r.worst:.2f}" if r.captures > 1 else "none" for r in effects.itertuples()]
-        wide = effects.assign(span=span).pivot(index="split", columns="captures", values="span")
-        wide = wide.loc[effects["split"].unique()]
-        frame = wide.set_axis([f"{n} capture{'' if n == 1 else 's'} [dB]" for n in wide.columns], axis=1)
-        frame = frame.rename(index=lambda split: SPLIT_NAMES[split].title)
-        blocks += [Table(title="Detectable with more captures", corner="split", frame=frame)]
-        blocks += [Text(text=DETECTABLE_NOTE, note=True)]
     return blocks
 
 

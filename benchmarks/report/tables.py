@@ -21,6 +21,11 @@ MEMORY = ("peak_rss_mb", "params", "gaussians")
 ON_WHOLE_FRAMES = ("lpips", "iou")
 
 
+def people_needed(count: float) -> str:
+    """`captures_needed` of `benchmarks.analysis.statistics` as text: empty where it is NaN."""
+    return "" if pd.isna(count) else f"{count:.0f}".replace("inf", "over 1000")
+
+
 def quality_columns(metrics: Sequence[str]) -> list[Quantity]:
     """Foreground qualities on novel views and poses; near and far poses have few of them."""
     asked = [(s, m) for s in HELD_OUT_SPLITS for m in metrics if s in RANKED_SPLITS or m in BESIDE]
