@@ -70,7 +70,12 @@ STYLES = {
     "sh_1": MethodStyle("SH 1", "#a0522d"),
     "sh_2": MethodStyle("SH 2", "#7a869a"),
     "mlp": MethodStyle("w/ MLP", "#c2415c"),
-    "mlp_base": MethodStyle("w/ MLP on learned texels", "#a0522d"),
+    "mlp_base": MethodStyle("w/ MLP on static texels", "#a0522d"),
+    # Suite `mlp`.
+    "ash_6_min": MethodStyle("ASH, 6 min", "#2f6fde"),
+    "mlp_6_min": MethodStyle("w/ MLP, 6 min", "#c2415c", reference="ash_6_min"),
+    "plus_base_6_min": MethodStyle("+ static texels, 6 min", "#5b8c2a", reference="ash_6_min"),
+    "mlp_base_6_min": MethodStyle("w/ MLP on static texels, 6 min", "#a0522d", reference="plus_base_6_min"),
     "smpl": MethodStyle("bare-body template", "#8d6e63"),
     "tava": MethodStyle("TAVA", "#c2415c"),
     "neural_actor": MethodStyle("Neural Actor", "#5b8c2a"),

@@ -17,7 +17,7 @@ from benchmarks.analysis.ablation_matrix import (
 )
 from benchmarks.analysis.differences import differences
 from benchmarks.analysis.results import RunTables
-from benchmarks.cell.registry import configured, offered
+from benchmarks.cell.registry import configured
 from benchmarks.cell.schema import CellResult, failed_result
 from benchmarks.report import sections
 from benchmarks.report.content import Bullets, Section, Table, Text
@@ -184,10 +184,10 @@ def test_the_suite_has_a_row_for_every_expected_component() -> None:
     assert {f"{factor}_half" for factor in FACTORS} <= set(captures)
 
 
-def test_the_mlp_with_a_learned_base_is_ash_but_for_its_decoders() -> None:
-    suite = find_suite("table")
-    (mlp,) = [row for row in suite.methods if row.name == "mlp_base"]
-    (ash,) = [row for row in suite.methods if row.name == "plus_base"]
-    expected = configured("ash", suite.preset, ash.changes)
-    half = replace(expected, training=replace(expected.training, precision="bfloat16"))
-    assert not mlp.changes and offered(mlp.name, suite.preset) == half
+@pytest.mark.parametrize(("mlp", "decoders"), [("mlp_6_min", "ash_6_min"), ("mlp_base_6_min", "plus_base_6_min")])
+def test_the_mlp_is_trained_as_the_decoders_and_as_long(mlp: str, decoders: str) -> None:
+    suite = find_suite("mlp")
+    rows = {row.name: configured(row.of, suite.preset, row.changes) for row in suite.methods}
+    assert rows[decoders].training.seconds == 360 and rows[decoders].model.base == ("base" in mlp)
+    half = replace(rows[decoders].training, precision="bfloat16")
+    assert rows[mlp] == replace(rows[decoders], training=half)
