@@ -94,9 +94,9 @@ STYLES = {
     "noisy_textures": MethodStyle("ASH+, noise on textures", "#7a869a", reference="ash_plus"),
     "last_weights": MethodStyle("no weight averaging", "#a0522d"),
     # Suite `plus`: one addition to `ash`, and all but one.
-    **{f"plus_{name}": MethodStyle(f"+ {title}", colour) for name, title, colour in ADDED},
+    **{f"plus_{name}": MethodStyle(f"+ {what}", colour) for name, what, colour in ADDED},
     **{
-        f"without_{name}": MethodStyle(f"ASH+ - {title}", colour, reference="ash_plus") for name, title, colour in ADDED
+        f"without_{name}": MethodStyle(f"ASH+ w/o {what}", colour, reference="ash_plus") for name, what, colour in ADDED
     },
     # Rows that differ in what the template is learned from.
     "by_scans": MethodStyle("template from scans", "#2a9d8f"),

@@ -97,12 +97,13 @@ def scene_report(data: SceneData) -> tuple[list[Section], dict[str, bytes]]:
     headline = sentences.headline(run_tables, scene, smoke=smoke)
     charts_first = [figures.speed_figure(run_tables, scene), figures.training_figure(run_tables, scene)]
     opening = Facts(items=tuple(_facts(data, capture, smoke=smoke)))
+    compared_with = " and ".join(style_of(name).title for name in ranked["reference"].unique())
     sections = [
         Section(title=scene, headline=headline, blocks=(opening, *(chart for chart in charts_first if chart))),
         Section(title=quality.title, blocks=(_untitled(quality), *seen, Text(text=note, note=True))),
         Section(title=cost.title, blocks=(_untitled(cost), Text(text=COST_NOTE, note=True), *doubts)),
         Section(
-            title=f"Differences to ASH on {scene}",
+            title=f"Differences to {compared_with or 'ASH'} on {scene}",
             blocks=tuple(difference_tables(run_tables, scene, ranked, title="")),
         ),
         Section(title=f"Subject by subject on {scene}", blocks=people.blocks(run_tables, scene)),

@@ -65,11 +65,13 @@ def headline(tables: RunTables, scene: str, *, smoke: bool = False) -> str:
 
 
 def _finding(tables: RunTables, scene: str) -> str:
-    """The verdict on each pair, and where there is none on the two best methods."""
+    """The verdict on each pair; where there is none, those on the rows of an ablation, or on the two best methods."""
+    ranked = differences(tables, scenes=(scene,))
     if pairs := [pair for pair in PAIRS if set(pair) <= set(tables.methods(scene))]:
-        ranked = differences(tables, scenes=(scene,))
         first, *others = (_pair(tables, scene, ranked, *pair) for pair in pairs)
         return " ".join([f"On {scene}, {first}", *(text[0].upper() + text[1:] for text in others)])
+    if len(ranked) and ranked["p"].notna().all():
+        return f"On {scene}, {'; '.join(_ablation(ranked))}."
     means = tables.values(scene, foreground(), tables.methods(scene, oracles=False))
     first, *others = sorted(means, key=lambda name: -means[name]) or [""]
     if not first:
@@ -83,6 +85,20 @@ def _finding(tables: RunTables, scene: str) -> str:
         for other, each in zip(tests, corrected([*tests.values()]), strict=True)
     ]
     return f"On {scene}, {_pair(tables, scene, pd.DataFrame(rows), first, others[0])}"
+
+
+def _ablation(ranked: pd.DataFrame) -> list[str]:
+    """By split and reference: the rows it is better or worse than, and how many show no difference to it."""
+    words = {"better": "better than", "worse": "worse than", "equivalent": f"equal within {MARGIN_DB:g} dB to"}
+    texts = []
+    for (split, reference), rows in ranked.groupby(["split", "reference"], sort=False):
+        by_verdict = {verdict: list(group["method"]) for verdict, group in rows.groupby("verdict")}
+        found = [f"{text} {titles(by_verdict[verdict])}" for verdict, text in words.items() if verdict in by_verdict]
+        if unclear := by_verdict.get("unclear", []):
+            named = titles(unclear) if len(unclear) <= FEW_NAMED else f"{len(unclear)} methods"
+            found.append(f"not known to differ from {named}")
+        texts.append(f"on {SPLIT_NAMES[split].words} {style_of(reference).title} is {', '.join(found)}")
+    return texts
 
 
 def _pair(tables: RunTables, scene: str, ranked: pd.DataFrame, first: str, second: str) -> str:

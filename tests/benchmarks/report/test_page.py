@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from helpers import fakes
 from helpers.browser import DESKTOP, PHONE, Visit, Visitor
-from helpers.cells import config
+from helpers.cells import config, people
 from helpers.waiting import wait_for
 
 from ash.files import InputError
@@ -254,6 +254,15 @@ def test_the_headline_has_the_verdict_of_the_table_below_it() -> None:
     table = differences(scores).query("method == 'ddc' and split == 'novel_view'").iloc[0]
     assert table["verdict"] == "unclear" and table["p"] > 0.05
     assert sentences.headline(scores, "loose").startswith("On loose, no difference between ASH and DDC is shown on ")
+
+
+def test_the_headline_of_an_ablation_has_the_verdicts_on_its_rows() -> None:
+    levels = {"ash_plus": (24.0, 25.0, 30.0), "wo_mot_plus": (22.0, 23.1, 28.1), "double_width": (24.1, 24.8, 30.4)}
+    scores = RunTables(people(levels | {"half_width": (24.01, 25.0, 30.01)}))
+    verdicts = "ASH+ is better than ASH+ w/o mot., equal within 0.1 dB to ASH+, half width, not known to differ from"
+    assert sentences.headline(scores, "loose") == (
+        f"On loose, on novel views {verdicts} ASH+, double width; on novel poses {verdicts} ASH+, double width."
+    )
 
 
 def test_best_and_second_are_marked_as_printed_and_oracles_are_not_ranked() -> None:
