@@ -51,7 +51,7 @@ def test_rows_that_have_a_device_are_moved_and_others_stay() -> None:
     suite = find_suite("table")
     moved = on_device(suite, "cuda:1")
     devices = {row.name: dict(row.changes).get("device") for row in moved.methods}
-    assert devices["ash"] == devices["ddc"] == devices["mlp"] == devices["oracle_texture"] == "cuda:1"
+    assert devices["ash"] == devices["ddc"] == devices["smpl"] == devices["oracle_texture"] == "cuda:1"
     assert devices["nearest"] is None
     assert [row.name for row in moved.methods] == [row.name for row in suite.methods]
     assert on_device(suite, "cpu") is suite
