@@ -51,7 +51,8 @@ GLOSSARY = {
     "Welch": "Welch's t test: two means of unequal variance, here over the seeds of a single capture.",
     "paired t": "Student's t test of the differences between two methods, a mean over seeds for each capture.",
     "Holm": "Holm's correction (1979): keeps the chance of any false alarm among all rows at 5 %.",
-    "detectable": "The smallest true difference that this number of captures or seeds finds with 80 % power.",
+    "people needed": "How many people would decide what is unclear, with 80 % power after correction, if mean and "
+    "spread of the difference are those found here.",
     "breakdown point": "The least severity at which the interval of a method lies below the middle between its score "
     "on the clean capture and that of the nearest training image.",
     "seed": "The start of the random numbers of a training.",

@@ -50,8 +50,7 @@ COST_NOTE = (
 DIFFERENCES_NOTE = (
     "Foreground PSNR. Verdict on the method in the corner: better or worse if p is below 5 % and the difference above "
     f"{METRICS['psnr'].abs_tol:g} dB; equivalent if the interval lies within that margin; unclear otherwise. p is the "
-    "chance of such a difference between equal methods, corrected for all rows of the table (Holm). People needed: how "
-    "many would decide what is unclear, with 80 % power, were mean and spread of the difference those found here."
+    "chance of such a difference between equal methods, corrected for all rows of the table (Holm)."
 )
 CONVENTIONS_NOTE = (
     "One set of predictions, scored in four ways. The release scores only inside the eroded mask; whole frames are "
@@ -103,7 +102,7 @@ def scene_report(data: SceneData) -> tuple[list[Section], dict[str, bytes]]:
         Section(title=quality.title, blocks=(_untitled(quality), *seen, Text(text=note, note=True))),
         Section(title=cost.title, blocks=(_untitled(cost), Text(text=COST_NOTE, note=True), *doubts)),
         Section(
-            title=f"Differences to {compared_with or 'ASH'} on {scene}",
+            title=f"Differences to {compared_with} on {scene}",
             blocks=tuple(difference_tables(run_tables, scene, ranked, title="")),
         ),
         Section(title=f"Subject by subject on {scene}", blocks=people.blocks(run_tables, scene)),
