@@ -64,14 +64,12 @@ class ModelConfig(AtlasConfig):
     sh_degree: int = 3
     offset_unit_m: float = 0.01  # metres per unit of a decoded offset; the release decodes metres
     quat_frame: str = "canonical"  # "canonical": rotations and SH turn with the surface; "world": as released
-    anchor: str = "blended"  # texels follow their corners' blended transforms (Eq. 5); "surface": the posed triangle
     refine: bool = False  # what is drawn also trains networks of Stg.1 on top of the template; the paper's future work
     dilation: float = 0.3  # px^2 added to the projected covariance
 
     def __post_init__(self) -> None:
         """Refuse what cannot be built."""
         AtlasConfig.__post_init__(self)  # `super()` does not know a class that slots made anew.
-        one_of("anchor", self.anchor, ("blended", "surface"))
         one_of("quat_frame", self.quat_frame, ("canonical", "world"))
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")

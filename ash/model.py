@@ -66,7 +66,7 @@ class AshModel(MovingModule):
             learns = self.refinement is not None and torch.is_grad_enabled()
             posed = self.template.pose_uncached(pose) if learns else self.template.pose(pose)
         with stage(clock, "stg2", device):
-            canonical, normals, transforms = sample_surface(self.lattice, posed, self.config.anchor, threads=threads)
+            canonical, normals, transforms = sample_surface(self.lattice, posed, threads=threads)
             config = self.config
             motion = normalised_motion(pose, window=config.window, yaw_normalise=config.yaw_normalise)
             return FrameInputs(

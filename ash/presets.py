@@ -170,7 +170,6 @@ ADDITIONS: dict[str, Mapping[str, Any]] = {
     "light": {"model.light": True},
     "standardise": {"model.standardise": True},
     "heading": {"model.yaw_normalise": True, "template.yaw_normalise": True},
-    "anchor": {"model.anchor": "surface"},
     "background": {"training.background": "random"},
     "loss": {"training.l1_weight": 0.8, "training.ssim_weight": 0.2},
     "dilation": {"model.dilation": 0.05},

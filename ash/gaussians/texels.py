@@ -13,7 +13,7 @@ import ash.native.texels
 from ash.config import ModelConfig
 from ash.gaussians.gaussians import Gaussians, split_raw
 from ash.harmonics import SH_C0, rotate_sh, sh_basis
-from ash.rotations import RigidTransforms, quat_multiply, rotate
+from ash.rotations import RigidTransforms, quat_multiply
 from ash.template.skinning import dual_parts
 from ash.template.template import PosedTemplate
 from ash.textures import FrameInputs, TexelLattice
@@ -24,43 +24,32 @@ LIGHT_COEFFICIENTS = 9
 Placed = tuple[Tensor, Tensor, RigidTransforms]
 
 
-def sample_surface_naive(lattice: TexelLattice, posed: PosedTemplate, anchor: str = "blended") -> Placed:
+def sample_surface_naive(lattice: TexelLattice, posed: PosedTemplate) -> Placed:
     """The template's surface at the texels: the definition, differentiable.
 
     Positions `[n, 3]` on the canonical template (metres, Eq. 4), unit normals `[n, 3]` in the world, and the
     transforms T of Eq. 5. Blended transforms leave a texel beside the posed triangle that it belongs to, by a third of
-    a millimetre, and by ten where a joint is bent far; with the anchor "surface" T is moved so that it lies there.
+    a millimetre, and by ten where a joint is bent far.
     """
     canonical = lattice.interpolate(posed.canonical)
     normals = nn.functional.normalize(lattice.interpolate(posed.normals), dim=-1)
-    transforms = lattice.interpolate_transforms(posed.transforms)
-    return canonical, normals, _anchored(transforms, canonical, lattice, posed, anchor)
+    return canonical, normals, lattice.interpolate_transforms(posed.transforms)
 
 
-def _anchored(
-    transforms: RigidTransforms, canonical: Tensor, lattice: TexelLattice, posed: PosedTemplate, anchor: str
-) -> RigidTransforms:
-    if anchor == "blended":
-        return transforms
-    turned = rotate(transforms.quats, canonical)
-    return RigidTransforms(quats=transforms.quats, translations=lattice.interpolate(posed.vertices) - turned)
-
-
-def sample_surface(lattice: TexelLattice, posed: PosedTemplate, anchor: str = "blended", *, threads: int = 1) -> Placed:
+def sample_surface(lattice: TexelLattice, posed: PosedTemplate, *, threads: int = 1) -> Placed:
     """`sample_surface_naive`, by native kernels where nothing needs a gradient."""
     transforms = posed.transforms
     if not ash.native.skinning.can_use_native(
         posed.canonical, posed.normals, transforms.quats, transforms.translations
     ):
-        return sample_surface_naive(lattice, posed, anchor)
+        return sample_surface_naive(lattice, posed)
     dual = dual_parts(transforms)
     blank = dual.new_zeros(len(dual), 2)
     vertices = torch.cat([transforms.quats, dual, posed.canonical, posed.normals, blank], 1)
     quats, translations, canonical, normals = ash.native.texels.place_texels(
         vertices, lattice.corners.int(), lattice.barycentric, threads=threads
     )
-    blended = RigidTransforms(quats=quats, translations=translations)
-    return canonical, normals, _anchored(blended, canonical, lattice, posed, anchor)
+    return canonical, normals, RigidTransforms(quats=quats, translations=translations)
 
 
 def pose_naive(

@@ -12,11 +12,10 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ash.capture.dataset import Motion, Pose
-from ash.devices import CPU
 from ash.rotations import RigidTransforms
 from ash.template.graph import EmbeddedGraph
 from ash.template_learning.deforming import LinearDeformation
@@ -24,7 +23,7 @@ from ash.template_learning.graph_nets import GraphDeformation
 from ash.template_learning.tracking import Tracked
 
 RIDGE = 0.3  # Against squared radians summed over frames.
-FOLDS = 4
+FOLDS = 4  # of the frames, of which one is held out
 BLEND_RIDGE = 1e-4  # Nodes without vertices of their own stay at zero.
 ROUGHNESS = 0.1  # Weight of the Laplacian of the deformation, against the squared distance.
 LOOK_EVERY = 20  # Steps between two looks at the frames held out.
@@ -70,14 +69,13 @@ def _ridge(
     return mean, torch.stack(maps)
 
 
-def held_out_folds(sequence: np.ndarray) -> list[Tensor]:
-    """Which frames each fold leaves out: whole sequences where there are several, else stretches of the only one."""
+def held_out_frames(sequence: np.ndarray, seed: int) -> Bool[Tensor, " t"]:
+    """A quarter of the frames: every fourth sequence where there are several, else a stretch of the only one."""
     names = np.unique(sequence)
-    if len(names) == 1:
-        parts = np.array_split(np.arange(len(sequence)), min(FOLDS, len(sequence)))
-        return [torch.from_numpy(np.isin(np.arange(len(sequence)), part)) for part in parts if len(parts) > 1]
-    count = min(FOLDS, len(names))
-    return [torch.from_numpy(np.isin(sequence, names[first::count])) for first in range(count)]
+    stretches = np.arange(len(sequence)) * min(FOLDS, len(sequence)) // len(sequence)
+    groups = np.searchsorted(names, sequence) if len(names) > 1 else stretches
+    folds = min(FOLDS, int(groups.max()) + 1)
+    return torch.from_numpy((groups % folds == seed % folds) & (folds > 1))
 
 
 def _mean_square(error: Tensor) -> float:
@@ -90,8 +88,7 @@ def fit_graph(deformation: GraphDeformation, motion: Motion, tracked: Tracked, *
     One fold of the training frames is held out, and the step is found at which they fit it best: step 0, which deforms
     nothing, where no training helps. Then the networks learn as many steps on all frames, from the same start.
     """
-    folds = held_out_folds(motion.sequence[list(tracked.frames)])
-    held = folds[seed % len(folds)] if folds else torch.zeros(len(tracked.frames), dtype=torch.bool, device=CPU)
+    held = held_out_frames(motion.sequence[list(tracked.frames)], seed)
     windows = [deformation.window_transforms(Pose(motion, frame)) for frame in tracked.frames]
     start = {name: value.clone() for name, value in deformation.state_dict().items()}
     best, best_step = float("inf"), 0

@@ -32,7 +32,6 @@ ADDED = (  # by `ash_plus`: name, title, colour
     ("light", "light", "#b8860b"),
     ("standardise", "standardised textures", "#c2415c"),
     ("heading", "heading normalised", "#8d6e63"),
-    ("anchor", "texels on triangles", "#a0522d"),
     ("background", "random background", "#2a9d8f"),
     ("loss", "more L1 in the loss", "#9b59b6"),
     ("dilation", "less dilation", "#008fb3"),

@@ -189,7 +189,7 @@ def _fill_heads(avatar: AshAvatar) -> None:
 def frame_by_definition(model: AshModel, pose: Pose, camera: Camera) -> np.ndarray:
     """The image of a frame by the definitions alone: premultiplied RGBA, float32 `[h, w, 4]`."""
     posed = model.template.pose(pose)
-    canonical, normals, transforms = sample_surface_naive(model.lattice, posed, model.config.anchor)
+    canonical, normals, transforms = sample_surface_naive(model.lattice, posed)
     inputs = replace(model.frame_inputs(pose), canonical=canonical, normals=normals, transforms=transforms)
     (raw,) = model.decode([inputs])
     return image_of(_splat_by_definition(model, raw, inputs, [camera]))

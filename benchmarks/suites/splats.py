@@ -78,7 +78,7 @@ def known_avatar(template: Template, *, count: int, seed: int) -> AshModel:
     No texel lattice and no initialiser of the method has a part in it: what is trained must approximate them.
     """
     size: dict[str, Any] = {"texels": 4, "window": 1, "levels": 0, "sh_degree": 0, "dilation": 0.05}
-    kind: dict[str, Any] = {"yaw_normalise": True, "motion": False, "base": True, "anchor": "surface"}
+    kind: dict[str, Any] = {"yaw_normalise": True, "motion": False, "base": True}
     config = ModelConfig(**size, **kind, offset_unit_m=1.0)
     rng = np.random.default_rng([seed, 7])
     places = scattered(template.mesh, count, rng)

@@ -105,7 +105,6 @@ CHANGED_BY_ADDITION = {
     "light": {"light", "rates"},
     "standardise": {"textures"},
     "heading": {"textures"},
-    "anchor": {"places"},
     "background": {"batches"},
     "loss": {"loss"},
     "dilation": {"drawing"},

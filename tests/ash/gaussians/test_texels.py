@@ -69,18 +69,13 @@ def farthest_from_the_triangles(posed: PosedTemplate, placed: Placed) -> float:
     return float((transforms.apply(canonical) - on_triangles).norm(dim=1).max())
 
 
-@pytest.mark.parametrize("angle", [0.3, 1.5, 2.5])
-def test_anchored_at_the_surface_texels_lie_on_the_posed_triangles(angle, monkeypatch):
-    """Also where a joint is bent far; with blended transforms they do not."""
+@pytest.mark.parametrize(("angle", "least", "most"), [(0.0, 0.0, 1e-6), (0.3, 1e-3, 1e-2), (1.5, 1e-2, 5e-2)])
+def test_blended_texels_leave_the_posed_triangles_where_a_joint_is_bent(angle, least, most, monkeypatch):
     posed = posed_tube(bent(angle))
-    naive = {anchor: sample_surface_naive(LATTICE, posed, anchor) for anchor in ("surface", "blended")}
+    naive = sample_surface_naive(LATTICE, posed)
     monkeypatch.setattr(texels, "sample_surface_naive", pytest.fail)
-    native = {anchor: sample_surface(LATTICE, posed, anchor) for anchor in ("surface", "blended")}
-    for placed in (naive, native):
-        assert farthest_from_the_triangles(posed, placed["surface"]) < 1e-5
-        assert farthest_from_the_triangles(posed, placed["blended"]) > 1e-4
-        assert torch.equal(placed["surface"][0], placed["blended"][0])
-        assert torch.equal(placed["surface"][2].quats, placed["blended"][2].quats), "moved, not turned"
+    for placed in (naive, sample_surface(LATTICE, posed)):
+        assert least <= farthest_from_the_triangles(posed, placed) <= most
 
 
 def test_opposite_quaternions_of_neighbours_are_the_same_rotation():

@@ -23,7 +23,7 @@ from ash.template_learning import learning, tracking
 from ash.template_learning.deforming import LinearDeformation, joint_reach
 from ash.template_learning.graph_nets import GraphDeformation
 from ash.template_learning.learning import learned_template, template_key, template_of
-from ash.template_learning.regressing import fit_graph, fit_linear, held_out_folds
+from ash.template_learning.regressing import fit_graph, fit_linear, held_out_frames
 from ash.template_learning.tracking import Tracked, template_error_mm, track_scans
 from benchmarks.cell.sandbox import seen_by_method, watched
 
@@ -106,12 +106,13 @@ def test_what_all_frames_share_is_kept_and_noise_of_the_tracks_is_damped():
     assert (moved - shift.mean(0)).square().mean() < 0.25 * (shift - shift.mean(0)).square().mean()
 
 
-def test_folds_leave_out_whole_sequences_or_stretches_of_the_only_one():
-    folds = held_out_folds(np.repeat([3, 5, 7, 8, 9], 2))
-    assert len(folds) == 4 and [int(fold.sum()) for fold in folds] == [4, 2, 2, 2]
-    assert torch.equal(torch.stack(folds).sum(0), torch.ones(10, dtype=torch.long))
-    assert [int(fold.sum()) for fold in held_out_folds(np.zeros(8))] == [2, 2, 2, 2]
-    assert held_out_folds(np.zeros(1)) == []
+def test_whole_sequences_are_held_out_or_a_stretch_of_the_only_one():
+    held = [held_out_frames(np.repeat([3, 5, 7, 8, 9], 2), seed) for seed in range(4)]
+    assert held[0].tolist() == [True] * 2 + [False] * 6 + [True] * 2
+    assert torch.stack(held).sum(0).tolist() == [1] * 10
+    assert held_out_frames(np.zeros(8), 5).tolist() == [False] * 2 + [True] * 2 + [False] * 4
+    assert held_out_frames(np.zeros(2), 1).tolist() == [False, True]
+    assert not held_out_frames(np.zeros(1), 0).any()
 
 
 def test_a_node_feels_its_joint_and_half_its_neighbours():
@@ -138,7 +139,7 @@ def test_graph_networks_learn_from_all_frames_for_as_long_as_those_held_out_gain
     torch.testing.assert_close(deformation.static, tracked.canonical.mean(0) - deformation.rest)
     again = learned(tracked)[1].state_dict()
     assert all(torch.equal(value, again[name]) for name, value in deformation.state_dict().items())
-    held = held_out_folds(capture.motion.sequence[list(tracked.frames)])[0]
+    held = held_out_frames(capture.motion.sequence[list(tracked.frames)], 0)
     moved = tracked.canonical + 0.002 * held[:, None, None]
     other_kept, other = learned(replace(tracked, canonical=moved))
     assert not torch.equal(other.static, deformation.static) and other_kept >= 0
