@@ -17,12 +17,13 @@ from ash.protocol import StageClock
 from benchmarks.cell import metrics
 from benchmarks.cell.evaluation import evaluated_views, image_summary, scored_views
 from benchmarks.cell.schema import CHECKPOINT, Cell, CellConfig, CellResult, prediction_path
-from benchmarks.gate.baseline import Entry
+from benchmarks.gate.baseline import Entry, stored_views
 from benchmarks.gate.checks import FAILING, Check
 from benchmarks.gate.exact import first_steps_check, protocol_check, rendering_checks, seeds_check
 from benchmarks.gate.statistical import judge_quality
 
 TINY = tiny_plus(steps=16, warmup_steps=4)
+PSNR = "foreground", "psnr"
 
 
 @pytest.fixture(scope="module")
@@ -116,3 +117,20 @@ def test_harmless_changes_fail_nowhere(
     assert not [check for check in checks if check.verdict in FAILING]
     exact = {check.verdict for check in checks if name == "the same bits" or check.layer in ("protocol", "rendering")}
     assert exact == {"unchanged"}
+
+
+def test_a_picture_that_is_not_stored_is_judged_by_its_scores(
+    tube: Capture, seeds: Callable[[AshConfig, int], Entry]
+) -> None:
+    before = seeds(TINY, 0)
+    stored = {view.prediction for view in stored_views(before.result)}
+    view = next(view for view in before.result.views if view.prediction not in stored)
+
+    def verdicts(lost_db: float) -> set[str]:
+        worse = replace(view, prediction="0", scores=view.scores | {PSNR: view.scores[PSNR] - lost_db})
+        views = tuple(worse if each is view else each for each in before.result.views)
+        result = replace(before.result, views=views, summary=image_summary(list(views)))
+        return {check.verdict for check in rendering_checks("tube", before, replace(before, result=result), tube)[0]}
+
+    assert verdicts(lost_db=0.0) == {"unchanged"}
+    assert verdicts(lost_db=3.0) >= {"not worse", "worse"}
