@@ -141,9 +141,7 @@ PRESETS = {
 }
 
 
-VALIDATION = (
-    "subjects 100 and 102 in loose, 103 in tight clothes; the additions: subjects 100 to 102 in both outfits"
-)
+VALIDATION = "subjects 100 and 102 in loose, 103 in tight clothes; the additions: subjects 100 to 102 in both outfits"
 # On which captures a preset's numbers were chosen. From now on: on none that a suite runs on (docs/tuning.md).
 CHOSEN_ON = {
     **dict.fromkeys(("ci", "brief", "cpu", "thorough", "budget"), VALIDATION),

@@ -10,7 +10,8 @@
 
 Without `rows` the table has every method of the run, without `columns` those of the table above it. `scene` names the
 scene, of a table or of a column; without it there is a table for each scene of the run. A column
-`{ given = "paper", title = "PSNR" }` prints what rows bring along: `{ title = "NA", given.paper = 30.33 }`.
+`{ given = "paper", title = "PSNR" }` prints what rows bring along: `{ title = "NA", given.paper = 30.33 }`. The orders
+of rows by a metric and by such numbers are compared where its column says `beside = "paper"`.
 """
 
 import re
@@ -59,6 +60,7 @@ class TableColumn:
 
     metric: str = ""
     given: str = ""
+    beside: str = ""  # of a metric: the numbers of this table whose order of rows its own is compared with
     split: str = ""  # none: novel views, or the first that has the metric
     region: str = ""  # none: the foreground, or the first that has the metric
     scene: str = ""  # none: the table's
@@ -91,8 +93,10 @@ class TableSpec:
         rows = [row for group in self.rows for row in group]
         if not self.columns:
             raise ValueError("columns: expected at least one")
+        given = tuple(column.given for column in self.columns)
         for column in self.columns:
             _require_column(column)
+            _require_known("beside", column.beside, ("", *given) if column.metric else ("",))
         _require_known("form", self.form, FORMS)
         for mark in self.marks:
             _require_known("mark", mark, MARKS)

@@ -1,34 +1,29 @@
 """Our rows beside the paper's, and the agreement of the two orders."""
 
+import itertools
 import math
-import tomllib
 
 import pytest
-from helpers.cells import cell, config
+from helpers.cells import cell, config, people
 
 from benchmarks.analysis import paper
-from benchmarks.analysis.results import RunTables
+from benchmarks.analysis.results import RunTables, foreground
 from benchmarks.cell.registry import offered
 from benchmarks.cell.schema import CellResult, Summary
 from benchmarks.report.content import Table, Text
-from benchmarks.report.sections import PAPER_SUITES, beside_the_paper
-from benchmarks.suites.files import find_suite, suite_file
-from benchmarks.suites.tables import TableSpec, tables_of
+from benchmarks.report.sections import beside_the_paper
+from benchmarks.suites.files import find_suite
 
 
 def run(levels: dict[str, float], seeds: int = 3) -> RunTables:
     return RunTables([cell(m, level + 0.1 * seed, seed=seed) for m, level in levels.items() for seed in range(seeds)])
 
 
-def specs() -> list[TableSpec]:
-    files = [suite_file(name) for name in PAPER_SUITES]
-    return [spec for path in files for spec in tables_of(tomllib.loads(path.read_text())["table"], place=path.name)]
-
-
 def test_the_papers_numbers_are_the_papers() -> None:
-    comparison = {row.title: row.given for row in specs()[1].rows[0]}
+    tables = paper.paper_tables()
+    comparison = {row.title: row.given for row in tables[1].rows[0]}
     assert comparison["ASH"]["view_psnr"] - comparison["DDC"]["view_psnr"] == pytest.approx(7.37)  # "7.4 dB" there
-    assert [len(spec.rows[0]) for spec in specs()] == [5, 5, 5, 2, 2, 4]
+    assert [len(spec.rows[0]) for spec in tables] == [5, 5, 5, 2, 2, 4]
 
 
 def test_a_table_needs_two_of_its_methods() -> None:
@@ -57,6 +52,46 @@ def test_the_papers_static_row_is_compared_with_ours_of_as_few_frames_or_it_is_s
     text, said = components({"wo_mot": 30.0, "ash": 24.0})
     assert text.startswith("30.10") and said
     assert components({"wo_disp": 20.0, "ash": 24.0}) == ("n/a", False), "neither was run"
+
+
+def test_orders_are_compared_on_each_person() -> None:
+    given = {"ash": 4.0, "ddc": 3.0, "tava": 2.0, "hdhumans": 1.0}
+    same, swapped = [30.0, 28.0, 26.0, 24.0], [28.0, 30.0, 26.0, 24.0]  # one of six pairs
+    rows = RunTables(people(dict(zip(given, zip(same, swapped, same, strict=True), strict=True)))).of("loose")
+    found = paper.order_agreement(rows, given, foreground())
+    assert found is not None and (found.rows, found.people) == (4, 3)
+    taus = [1.0, 4 / 6, 1.0]
+    assert found.tau.mean == pytest.approx(sum(taus) / 3)
+    assert found.tau.low == pytest.approx(8 / 9 - 4.30265 * 0.19245 / math.sqrt(3), abs=1e-4)
+    assert found.tau.high == 1.0, "no order agrees better"
+    assert found.chance == pytest.approx(1 / math.factorial(4)), "the means stand in the given order"
+    assert found.tau_text == "+0.89 [+0.41, +1.00]"
+
+
+def test_two_rows_are_no_order_and_equal_orders_have_no_interval() -> None:
+    levels = {"ash": [30.0, 31.0], "ddc": [28.0, 29.0], "tava": [26.0, 27.0]}
+    rows = RunTables(people(levels)).of("loose")
+    found = paper.order_agreement(rows, dict(zip(levels, (1.0, 2.0, 3.0), strict=True)), foreground())
+    assert found is not None and found.tau_text == "-1.00" and found.chance == 1.0
+    assert paper.order_agreement(rows, {"ash": 1.0, "ddc": 2.0}, foreground()) is None
+    assert paper.order_agreement(rows.head(0), {"ash": 1.0, "ddc": 2.0}, foreground()) is None
+
+
+def test_chance_is_the_share_of_all_orders() -> None:
+    given = {"ash": 1.0, "ddc": 2.0, "tava": 3.0, "hdhumans": 4.0, "neural_actor": 5.0}
+    ours = dict(zip(given, ([1.0], [3.0], [2.0], [5.0], [4.0]), strict=True))
+    found = paper.order_agreement(RunTables(people(ours)).of("loose"), given, foreground())
+    swapped = [sum(a > b for a, b in itertools.combinations(order, 2)) for order in itertools.permutations(range(5))]
+    assert found is not None and found.chance == pytest.approx(sum(n <= 2 for n in swapped) / 120)
+    assert found.tau.mean == pytest.approx(1 - 2 * 2 / 10)
+
+
+def test_the_report_prints_the_order_of_the_papers_rows() -> None:
+    (section,) = beside_the_paper(run({"ash": 24.0, "ddc": 22.0, "tava": 20.0}), "table")
+    _, _, order = (block for block in section.blocks if isinstance(block, Table) or block is section.blocks[1])
+    assert isinstance(order, Table) and order.title == "The order of rows"
+    assert order.frame.loc["Paper, seen motion: PSNR"].tolist() == ["+1.00", "3", "1", "17%"]
+    assert "Paper, seen motion: LPIPS" not in order.frame.index, "no weights for LPIPS"
 
 
 def test_conventions_score_the_same_renders_and_leave_oracles_out() -> None:
@@ -90,5 +125,5 @@ def test_rows_on_a_part_of_the_views_train_on_the_papers_share(method: str) -> N
 
 
 def test_the_suites_of_the_paper_have_all_of_its_rows_that_we_have() -> None:
-    ours = {row.method for spec in specs() for row in spec.rows[0]} - {""}
+    ours = {row.method for spec in paper.paper_tables() for row in spec.rows[0]} - {""}
     assert ours <= {row.name for row in find_suite("paper").methods}
