@@ -13,13 +13,14 @@ from typing import Any
 import pandas as pd
 
 from ash.files import InputError
+from benchmarks.analysis.paper import order_agreement
 from benchmarks.analysis.results import RANKED_SPLITS, Quantity, RunTables, compare
 from benchmarks.analysis.statistics import Comparison, corrected
 from benchmarks.analysis.style import style_of, titles_of
 from benchmarks.cell.metrics import METRICS, PROTOCOL, Metric
 from benchmarks.cell.registry import is_oracle
 from benchmarks.report import tables as measured
-from benchmarks.report.content import Mark, Table
+from benchmarks.report.content import Block, Mark, Table, Text
 from benchmarks.report.escaping import latex as tex
 from benchmarks.suites.files import methods_known, read_tables
 from benchmarks.suites.runs import Run, read_run, results_of
@@ -33,6 +34,11 @@ FORMS = {  # what stands in a cell, by form
     "difference": "Mean (difference to {reference} ± half-width of its 95 % confidence interval)",
 }
 BEST, SECOND = {"bold": "bold", "colour": "yellow"}, {"underline": "underlined", "colour": "orange"}
+ORDER_NOTE = (
+    "Kendall's tau between the order of our rows and that of the numbers beside them: 1 the same, 0 unrelated, -1 "
+    "reversed; the mean over people of the order on each, with its 95 % interval. By chance: the share of all orders "
+    "of as many rows that agree at least as well as the order of our means."
+)
 HEAD = r"""% In a paper: \usepackage{booktabs,graphicxPACKAGES} and \input this file. Compiled alone, it is a document.
 \expandafter\ifx\csname @nodocument\endcsname\relax\else
 \def\ashbenchalone{}
@@ -62,6 +68,7 @@ class AuthorTable:
     numbers: pd.DataFrame
     caption: str
     breaks: tuple[int, ...]  # rows above which there is a rule
+    orders: Table | None  # how far its rows stand in the order of the numbers that its columns name `beside`
 
 
 def load(run: Path | Run, tables: Path | None = None) -> pd.DataFrame:
@@ -121,6 +128,15 @@ def default_tables(tables: RunTables) -> tuple[AuthorTable, ...]:
     )
     specs = [TableSpec(scene=s, columns=columns, label=f"tab:{_plain(s)}", wide=True) for s in tables.scenes]
     return of_tables(tables, specs)
+
+
+def blocks(tables: Sequence[AuthorTable]) -> list[Block]:
+    """The tables with their captions, and the order of their rows beside that of published numbers."""
+    made: list[Block] = []
+    for table in tables:
+        made += [table.shown, Text(text=table.caption, note=True)]
+        made += [table.orders, Text(text=ORDER_NOTE, note=True)] if table.orders is not None else []
+    return made
 
 
 def _plain(name: str) -> str:
@@ -193,7 +209,22 @@ def _table(tables: RunTables, asked: TableSpec) -> AuthorTable:
     frame = pd.DataFrame(texts, index=[_name(tables, row, scenes) for row in rows], columns=heads)
     caption = _caption(tables, spec, set(marks.values()), notes)
     ends = tuple(accumulate(len(group) for group in groups[:-1]))
-    return AuthorTable(spec=spec, shown=Table(frame=frame, marks=marks), numbers=numbers, caption=caption, breaks=ends)
+    shown, orders = Table(frame=frame, marks=marks), _orders(tables, spec, rows)
+    return AuthorTable(spec=spec, shown=shown, numbers=numbers, caption=caption, breaks=ends, orders=orders)
+
+
+def _orders(tables: RunTables, spec: TableSpec, rows: Sequence[TableRow]) -> Table | None:
+    texts = {}
+    for column in (column for column in spec.columns if column.beside):
+        given = {row.method: row.given[column.beside] for row in rows if row.method and column.beside in row.given}
+        if (order := order_agreement(tables.of(column.scene), given, _quantity(column))) is not None:
+            place = next(each for each in spec.columns if each.given == column.beside)
+            text = [order.tau_text, str(order.rows), str(order.people), f"{order.chance:.0%}"]
+            texts[": ".join(filter(None, (place.group, place.title)))] = text
+    if not texts:
+        return None
+    frame = pd.DataFrame.from_dict(texts, orient="index", columns=["tau", "rows", "people", "by chance"])
+    return Table(title="The order of rows", corner="beside", frame=frame)
 
 
 def _record(

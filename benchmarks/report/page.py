@@ -17,7 +17,6 @@ from benchmarks.analysis.results import RunTables, csv_of
 from benchmarks.analysis.style import titles_of
 from benchmarks.cell.schema import printable
 from benchmarks.report import author_table, content, escaping, glossary, sections, sentences, tables, vega
-from benchmarks.report.author_table import AuthorTable
 from benchmarks.report.content import Section
 from benchmarks.report.headings import new_headings
 from benchmarks.report.pictures import Album
@@ -72,7 +71,7 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
     parts = [
         Section(title="", blocks=(content.Text(text=run.about[:1].upper() + run.about[1:] + "."),)),
         *first,
-        *([Section(title="Tables of the suite", blocks=_blocks(own))] if own else []),
+        *([Section(title="Tables of the suite", blocks=tuple(author_table.blocks(own)))] if own else []),
         *sections.ablations(run_tables, None if chosen_on is None else RunTables(results_of(chosen_on))),
         *sections.stabilities(run_tables),
         *curves,
@@ -128,16 +127,12 @@ def write_tables(
     if latex is not None:
         write_atomic(latex, author_table.latex(made).encode())
     if markdown is not None:
-        page = render("Tables", [Section(title="", blocks=_blocks(made))], "md")
+        page = render("Tables", [Section(title="", blocks=tuple(author_table.blocks(made)))], "md")
         write_atomic(markdown, page.encode())
     if csv is not None:
         write_atomic(csv, numbers.assign(**texts).to_csv(lineterminator="\n").encode())
     lines = [line for table in made for line in (tables.plain(table.shown), "", table.caption, "")]
     return [*lines, *(str(path) for path in (latex, markdown, csv) if path is not None)]
-
-
-def _blocks(made: Sequence[AuthorTable]) -> tuple[content.Block, ...]:
-    return tuple(block for table in made for block in (table.shown, content.Text(text=table.caption, note=True)))
 
 
 def publish(run: Run, folder: Path) -> None:

@@ -45,11 +45,6 @@ PAPER_NOTE = (
     "The paper: captured data at 1285x940 and weeks on a GPU, PSNR of the release's convention. Ours: foreground PSNR "
     "and LPIPS on the release's window, on {suite}. Levels cannot be compared, orders can."
 )
-ORDER_NOTE = (
-    "Kendall's tau between the order of our rows and the paper's: 1 the same, 0 unrelated, -1 reversed; the mean over "
-    "people of the order on each, with its 95 % interval. By chance: the share of all orders of as many rows that "
-    "agree with the paper's at least as well as the order of our means."
-)
 PROVENANCE_NOTE = (
     f"Protocol {PROTOCOL}: predictions are quantised to 8 bits on black before anything is compared. Code: hash of the "
     "sources that decide a cell. results.csv beside this report has every number; each cell's result.json the scores "
@@ -330,34 +325,14 @@ def _stability(tables: RunTables, scene: str, breakdowns: pd.DataFrame, steps: p
 
 
 def beside_the_paper(tables: RunTables, suite: str) -> list[Section]:
-    """Our rows beside those of the paper's tables, of which at least two were run, and how far their orders agree."""
+    """Our rows beside those of the paper's tables, of which at least two were run."""
     blocks: list[Block] = []
     for spec in paper.paper_tables():
         run = tables.methods(spec.scene)
         if sum(row.method in run or row.instead in run for group in spec.rows for row in group) > 1:
-            for made in author_table.of_tables(tables, [spec]):
-                blocks += [made.shown, Text(text=made.caption, note=True), *_orders(tables, made)]
+            blocks += author_table.blocks(author_table.of_tables(tables, [spec]))
     note = Text(text=PAPER_NOTE.format(suite=suite), note=True)
     return [Section(title="Beside the paper", blocks=(*blocks, note))] if blocks else []
-
-
-def _orders(tables: RunTables, made: author_table.AuthorTable) -> list[Block]:
-    """How far the rows of a table stand in the order of the paper's numbers, for each pair of columns."""
-    spec = made.spec
-    ran = made.numbers["method"][:: len(spec.columns)]  # with those that stand in for others
-    rows = dict(zip(map(str, ran), (row for group in spec.rows for row in group), strict=True))
-    texts = {}
-    for column in (column for column in spec.columns if column.beside):
-        given = {method: row.given[column.beside] for method, row in rows.items() if column.beside in row.given}
-        quantity = Quantity(column.split, column.region, column.metric)
-        if (order := paper.order_agreement(tables.of(column.scene), given, quantity)) is not None:
-            place = next(each for each in spec.columns if each.given == column.beside)
-            text = [order.tau_text, str(order.rows), str(order.people), f"{order.chance:.0%}"]
-            texts[f"{place.group}: {place.title}"] = text
-    if not texts:
-        return []
-    frame = pd.DataFrame.from_dict(texts, orient="index", columns=["tau", "rows", "people", "by chance"])
-    return [Table(title="The order of rows", corner="beside", frame=frame), Text(text=ORDER_NOTE, note=True)]
 
 
 def failed_cells(results: Sequence[CellResult], missing: int) -> list[Section]:
