@@ -134,8 +134,8 @@ def _cell_problem(error: Exception) -> str | None:
     """What ended a cell that a command runs in its own process, and is not the method's fault."""
     from benchmarks.cell.schema import HarnessFailed, Killed
 
-    told = str(error) or "the method's process was killed from outside"
-    return told if isinstance(error, (HarnessFailed, Killed)) else None
+    reason = str(error) or "the method's process was killed from outside"
+    return reason if isinstance(error, (HarnessFailed, Killed)) else None
 
 
 def _parse(tokens: Sequence[str]) -> Command | None:

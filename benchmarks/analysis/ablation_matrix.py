@@ -87,8 +87,8 @@ def effects(table: pd.DataFrame, split: str) -> list[AblationEffect]:
         if row.method in ADDED:
             mean, low, high, verdict = -mean, -high, -low, FLIPPED.get(verdict, verdict)
         if row.method in SHOWN:
-            found = {"mean": mean, "low": low, "high": high, "verdict": verdict, "needed": row.needed}
-            cells.append(AblationEffect(scene=row.scene, row=row.method, **found))
+            numbers = {"mean": mean, "low": low, "high": high, "verdict": verdict, "needed": row.needed}
+            cells.append(AblationEffect(scene=row.scene, row=row.method, **numbers))
     order = [*COMPONENTS, *dict.fromkeys(effect.row for effect in cells)]
     return sorted(cells, key=lambda effect: order.index(effect.row))
 

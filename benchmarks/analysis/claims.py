@@ -91,10 +91,10 @@ def judge(claims: Sequence[Claim], runs: Mapping[str, pd.DataFrame]) -> pd.DataF
     with the most people; people for validation decide nothing. p is corrected over all claims (Holm). A claim about a
     single person is not judged, for one person says nothing about others.
     """
-    asked = [(claim, scene, *_compared_in(claim, scene, runs)) for claim in claims for scene in claim.scenes]
-    tests = iter(corrected([test for _, _, test, _, _ in asked if test is not None]))
+    contrasts = [(claim, scene, *_compared_in(claim, scene, runs)) for claim in claims for scene in claim.scenes]
+    tests = iter(corrected([test for _, _, test, _, _ in contrasts if test is not None]))
     records = []
-    for claim, scene, test, missing, run in asked:
+    for claim, scene, test, missing, run in contrasts:
         record: dict[str, Any] = {
             "name": claim.name,
             "scene": scene,
@@ -121,13 +121,13 @@ def judge(claims: Sequence[Claim], runs: Mapping[str, pd.DataFrame]) -> pd.DataF
 
 def _compared_in(claim: Claim, scene: str, runs: Mapping[str, pd.DataFrame]) -> tuple[Comparison | None, str, str]:
     """The comparison in the run that has the most people; or None, and why there is none; and the run's name."""
-    asked = [
+    compared = [
         (name, *_compared(claim, rows[(rows["scene"] == scene) & (rows["subject"] < VALIDATION)]))
         for name, rows in runs.items()
     ]
-    judged = [(test, name) for name, test, _ in asked if test is not None]
+    judged = [(test, name) for name, test, _ in compared if test is not None]
     if not judged:
-        return None, next((why for _, _, why in asked if why != NO_SCENE), NO_SCENE), ""
+        return None, next((why for _, _, why in compared if why != NO_SCENE), NO_SCENE), ""
     test, name = max(judged, key=lambda each: each[0].captures)  # the first of equals
     return test, "", name
 
@@ -177,8 +177,8 @@ def _verdict(claim: Claim, scene: str, test: Comparison, short: str) -> tuple[Ve
         far = test.high if published > 0 else test.low  # The end of the interval that lies nearest to the publication.
         if abs(far) < abs(published):
             verdict = "confirmed but smaller"
-    told = (short, claim.condition, "" if verdict in HOLDS else claim.experiment)
-    return verdict, "; ".join(filter(None, told))
+    reasons = (short, claim.condition, "" if verdict in HOLDS else claim.experiment)
+    return verdict, "; ".join(filter(None, reasons))
 
 
 def broken(before: pd.DataFrame, after: pd.DataFrame) -> list[str]:
@@ -187,7 +187,7 @@ def broken(before: pd.DataFrame, after: pd.DataFrame) -> list[str]:
     now = after.set_index(["name", "scene"])["verdict"]
     lost = []
     for name, scene, verdict in zip(held["name"], held["scene"], held["verdict"], strict=True):
-        found = now.get((name, scene), "not asked")
-        if found not in HOLDS:
-            lost.append(f"{name}{scene and f', {scene}'}: {verdict} before, {found} now")
+        verdict_now = now.get((name, scene), "not asked")
+        if verdict_now not in HOLDS:
+            lost.append(f"{name}{scene and f', {scene}'}: {verdict} before, {verdict_now} now")
     return lost

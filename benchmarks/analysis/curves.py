@@ -143,8 +143,8 @@ def novelty(images: pd.DataFrame) -> pd.DataFrame:
     """
     if "psnr" not in images:  # All pictures were brought without alpha.
         return _table([], "scene", "method", "novelty_deg")
-    known = images["novelty_deg"].notna() & images["psnr"].notna()
-    with_novelty = images[images["split"].isin(HELD_OUT_SPLITS) & known]
+    scored = images["novelty_deg"].notna() & images["psnr"].notna()
+    with_novelty = images[images["split"].isin(HELD_OUT_SPLITS) & scored]
     rows = [row for scene, here in with_novelty.groupby("scene", sort=False) for row in _novelty_of(str(scene), here)]
     return _table(rows, "scene", "method", "novelty_deg")
 

@@ -57,7 +57,7 @@ def worst_frames(
         return ()
     visible = _visible_triangles(capture.folder, capture.identity)
     degrees = np.array(novelty_deg(capture.motion, train=capture.splits["train"].frames, test=frames))
-    found = []
+    worst = []
     for view in list(worst_of_frame.values())[:count]:
         truth = metrics.on_black(capture.image(view.camera, view.frame))
         predicted = stored_prediction(cell, capture, view)
@@ -66,8 +66,8 @@ def worst_frames(
         error = ((truth[..., :3].astype(float) - predicted[..., :3]) ** 2).sum(-1)
         novelty = degrees[frames.index(view.frame)]
         text = explanation(regions, error, novelty, (degrees < novelty).sum() / max(1, len(frames) - 1))
-        found.append(ErrorAttribution(view=view, explanation=text, map=regions, truth=truth, predicted=predicted))
-    return tuple(found)
+        worst.append(ErrorAttribution(view=view, explanation=text, map=regions, truth=truth, predicted=predicted))
+    return tuple(worst)
 
 
 def explanation(regions: np.ndarray, error: np.ndarray, novelty_deg: float, rank: float) -> str:

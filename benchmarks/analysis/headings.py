@@ -35,8 +35,8 @@ def by_heading(images: pd.DataFrame, degrees: Mapping[tuple[str, int], float]) -
     if "psnr" not in images:  # All pictures were brought without alpha.
         return pd.DataFrame(columns=columns)
     posed = images[images["split"].isin(MOTION_SPLITS) & images["psnr"].notna()]
-    known = [degrees.get(place, np.nan) for place in zip(posed["capture"], posed["frame"], strict=True)]
-    posed = posed.assign(bin=np.searchsorted(EDGES_DEG, known))[~np.isnan(known)]
+    turned_deg = [degrees.get(place, np.nan) for place in zip(posed["capture"], posed["frame"], strict=True)]
+    posed = posed.assign(bin=np.searchsorted(EDGES_DEG, turned_deg))[~np.isnan(turned_deg)]
     rows = []
     for (scene, method, index), here in posed.groupby(["scene", "method", "bin"], sort=False):
         frames = here.drop_duplicates(["capture", "frame"])

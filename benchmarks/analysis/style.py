@@ -178,8 +178,8 @@ def style_of(method: str) -> MethodStyle:
 def reference_of(method: str, methods: Collection[str]) -> str | None:
     """Which of the methods of a run a method is compared with: ASH or ASH+, of its own pair first; None: neither."""
     first = STYLES[method].reference if is_ours(method) and method in STYLES else REFERENCES[0]
-    known = [name for name in (first, *REFERENCES) if name in methods and name != method]
-    return known[0] if known else None
+    references = [name for name in (first, *REFERENCES) if name in methods and name != method]
+    return references[0] if references else None
 
 
 def is_ours(method: str) -> bool:

@@ -261,15 +261,15 @@ def _flags_of(command: type[Any]) -> Iterator[_Flag]:
 
 def _flags_of_config(config: Any, taken: set[str]) -> list[_Flag]:
     """The fields of a configuration; those that the command has itself stay its own."""
-    wanted = [leaf for leaf in leaves(config) if leaf.key not in taken]
+    shown = [leaf for leaf in leaves(config) if leaf.key not in taken]
     # Once for each class: Python parses the whole file to find its source.
-    comments = {owner: field_comments(owner) for owner in {leaf.owner for leaf in wanted}}
+    comments = {owner: field_comments(owner) for owner in {leaf.owner for leaf in shown}}
 
     def flag(leaf: Leaf) -> _Flag:
         kind, argument, several = _described(leaf.kind)
         return _Flag(leaf.key, kind, comments[leaf.owner].get(leaf.name, ""), leaf.value, argument, several)
 
-    flags = [flag(leaf) for leaf in wanted]
+    flags = [flag(leaf) for leaf in shown]
     return [flag for flag in flags if flag.kind in READ or get_origin(flag.kind) is Literal]
 
 
@@ -315,15 +315,15 @@ def _current_tokens(tokens: Sequence[str], flags: Sequence[_Flag]) -> list[str]:
     for token in tokens:
         flag, equals, value = token.partition("=")
         new = "--" + OLD_FIELDS.get(flag[2:].replace("-", "_"), "").replace("_", "-")
-        known = flag.startswith("--") and new in names
-        current.append(f"{new}{equals}{value}" if known else token)
+        renamed = flag.startswith("--") and new in names
+        current.append(f"{new}{equals}{value}" if renamed else token)
     return [OLD_SIZES.get(t, t) if flag == "--size" else t for flag, t in zip(["", *current], current, strict=False)]
 
 
 def _config_of(command: type[Any], name: str, own: Sequence[_Flag], tokens: Sequence[str]) -> Any:
     """The configuration that a command line means, without its flags; None where its own arguments are incomplete."""
     names = {flag.name for flag in own}
-    known: list[str] = []
+    own_tokens: list[str] = []
     waiting = iter(range(len(tokens)))
     for index in waiting:
         token = tokens[index]
@@ -333,11 +333,11 @@ def _config_of(command: type[Any], name: str, own: Sequence[_Flag], tokens: Sequ
             if "=" not in token and index + 1 < len(tokens) and not tokens[index + 1].startswith("--"):
                 next(waiting, None)
             continue
-        known.append(token)
-    helped = any(token in HELP for token in tokens) and known[:1] and not known[0].startswith("-")
+        own_tokens.append(token)
+    helped = any(token in HELP for token in tokens) and own_tokens[:1] and not own_tokens[0].startswith("-")
     for missing in ([], ["."]) if helped else ([],):  # Help on a method needs no capture.
         try:
-            made = _made(command, _parse(command, name, own, _current_tokens([*known, *missing], own)))
+            made = _made(command, _parse(command, name, own, _current_tokens([*own_tokens, *missing], own)))
         except InputError:
             continue
         return made.settings()

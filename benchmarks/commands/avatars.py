@@ -118,11 +118,11 @@ class ExportCommand:
         from benchmarks.export.formats import FORMATS as OF_AVATARS
 
         avatars, video = tuple(OF_AVATARS), ("mp4",)
-        known: dict[str, tuple[str, ...]] = dict.fromkeys(("split", "frame"), ("nerfstudio", "colmap"))
-        known |= dict.fromkeys(("motion", "frames", "methods", "scene", "trust"), avatars)
-        known |= dict.fromkeys(("camera", "truth", "height", "fps"), video)
+        formats: dict[str, tuple[str, ...]] = dict.fromkeys(("split", "frame"), ("nerfstudio", "colmap"))
+        formats |= dict.fromkeys(("motion", "frames", "methods", "scene", "trust"), avatars)
+        formats |= dict.fromkeys(("camera", "truth", "height", "fps"), video)
         for option in fields(self):
-            forms = known.get(option.name, (self.form,))
+            forms = formats.get(option.name, (self.form,))
             if self.form not in forms and getattr(self, option.name) != option.default:
                 raise InputError(f"--{option.name}: goes with the format {', '.join(forms)}, got {self.form}")
 

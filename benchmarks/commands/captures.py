@@ -106,8 +106,8 @@ class SynthCommand:
         with contextlib.nullcontext() if local else make_executor(self.executor, workers=workers) as executor:
             draw_scene(self.scene, scene, folder, title=name, workers=workers, executor=executor, shard=shard)
         if not read_manifest(folder).complete:
-            told = "this shard is done; the capture is finished by the shard that comes last"
-            print(f"{folder}: {told}", file=sys.stderr)
+            message = "this shard is done; the capture is finished by the shard that comes last"
+            print(f"{folder}: {message}", file=sys.stderr)
         print(folder)
         return DONE
 
@@ -118,13 +118,13 @@ class SynthCommand:
         from benchmarks.suites.suites import capture_name, varied_name
 
         changes = dict(self.changes)
-        wanted = apply_overrides(self.settings(), changes, of=self.scene)
+        scene = apply_overrides(self.settings(), changes, of=self.scene)
         if changes and "name" not in changes:
-            wanted = replace(wanted, name=varied_name(self.scene, tuple(changes.items())))
-        wanted = self._moved(wanted)
+            scene = replace(scene, name=varied_name(self.scene, tuple(changes.items())))
+        scene = self._moved(scene)
         name = capture_name(self.scene, self.size, self.seed, self.subject)
-        plain = wanted == scene_of(self.scene, size=self.size, seed=self.seed, subject=self.subject)
-        return wanted, name if plain else f"{name}-{wanted.identity[:8]}"
+        plain = scene == scene_of(self.scene, size=self.size, seed=self.seed, subject=self.subject)
+        return scene, name if plain else f"{name}-{scene.identity[:8]}"
 
     def _moved(self, scene: "Scene") -> "Scene":
         """The scene driven by the user's motions, if there are any."""

@@ -13,7 +13,7 @@ CPU = "cpu"
 DeviceName = Annotated[str, Argument(metavar="DEVICE")]
 
 
-def chosen_device(wanted: str, *, here: bool = True) -> str:
+def chosen_device(name: str, *, here: bool = True) -> str:
     """The device that is meant: `auto` takes CUDA where everything works there, and says why where it does not.
 
     `here`: cells run on this machine, so that it must have the device.
@@ -24,9 +24,9 @@ def chosen_device(wanted: str, *, here: bool = True) -> str:
     from ash.config import check_device
     from ash.devices import cuda_error, device_named
 
-    if wanted != "auto":
-        device_named(wanted) if here else check_device(wanted)
-        return wanted
+    if name != "auto":
+        device_named(name) if here else check_device(name)
+        return name
     why = cuda_error()
     if why:
         print(f"device: {CPU}, because {why}", file=sys.stderr)

@@ -47,8 +47,8 @@ def _renderer() -> Finding:
 def _compiler() -> Finding:
     for name in ("c++", "g++", "clang++"):
         if path := shutil.which(name):
-            told = subprocess.run([path, "--version"], capture_output=True, text=True, check=False).stdout
-            return Finding("compiler", told.partition("\n")[0] or path, "native kernels can be built")
+            version = subprocess.run([path, "--version"], capture_output=True, text=True, check=False).stdout
+            return Finding("compiler", version.partition("\n")[0] or path, "native kernels can be built")
     return Finding("compiler", "none", "native kernels cannot be rebuilt here (apt: g++)")
 
 
@@ -64,8 +64,8 @@ def _kernels() -> Finding:
 def _gpu() -> Finding:
     name = provenance.gpu_name()
     if name is None:
-        told = "everything runs on the processor; absolute ms are not comparable with the paper's"
-        return Finding("GPU", "none", told)
+        consequence = "everything runs on the processor; absolute ms are not comparable with the paper's"
+        return Finding("GPU", "none", consequence)
     from ash.devices import cuda_error, describe_gpu
 
     if why := cuda_error():
@@ -89,8 +89,8 @@ def _isolation() -> Finding:
     from benchmarks.cell import sandbox
 
     if problem := sandbox.problem():
-        told = "a method is only watched: its process could reach truth, and its row says so"
-        return Finding("isolation", problem, told)
+        consequence = "a method is only watched: its process could reach truth, and its row says so"
+        return Finding("isolation", problem, consequence)
     return Finding("isolation", "namespaces", "a method's process sees training data alone")
 
 

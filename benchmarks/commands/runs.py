@@ -320,8 +320,8 @@ class TrainCommand:
         cell = _cell_on(self.capture, row, self.out, seed=self.seed)
         plan_cells([cell], retry_failed=True)
         if read_result(cell.folder) is not None:
-            told = "was trained before, from the same inputs: nothing is done again"
-            print(f"{cell.config.title} {told}", file=sys.stderr)
+            message = "was trained before, from the same inputs: nothing is done again"
+            print(f"{cell.config.title} {message}", file=sys.stderr)
         else:
             write_config(cell)
             print(f"training {cell.config.title} in {cell.folder}", file=sys.stderr)

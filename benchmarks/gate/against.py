@@ -90,10 +90,10 @@ def _method_paths() -> list[Path]:
 
 def _repository_of(method: str) -> Path:
     """The git repository that holds a method's code."""
-    found = find_method(method)
-    if found.is_ours and (ROOT / ".git").exists():
+    source = find_method(method)
+    if source.is_ours and (ROOT / ".git").exists():
         return ROOT
-    spec = find_spec_of(found.target)
+    spec = find_spec_of(source.target)
     file = Path(spec.origin if spec and spec.origin else os.devnull).resolve()
     for folder in _method_paths():
         if file.is_relative_to(folder) and (root := _git(folder, "rev-parse", "--show-toplevel")):

@@ -190,8 +190,8 @@ def with_row(
     """The baseline's cells as a run with those of one row replaced, and the changes accepted so far with this one."""
     rows = {**baseline.rows, row: list(entries)}
     cells = tuple(entry.cell for each in rows.values() for entry in each)
-    told = Accepted(row=row, because=printable(because), commit=commit)
-    return replace(read_run(baseline.folder), cells=cells), (*baseline.file.accepted, told)
+    acceptance = Accepted(row=row, because=printable(because), commit=commit)
+    return replace(read_run(baseline.folder), cells=cells), (*baseline.file.accepted, acceptance)
 
 
 def stored_views(result: CellResult) -> list[ViewScore]:

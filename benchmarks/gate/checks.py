@@ -42,8 +42,8 @@ class Check:
 
 def outcome(checks: Sequence[Check]) -> Verdict:
     """The verdict on a change: the worst of its checks."""
-    found = {check.verdict for check in checks}
-    return next((verdict for verdict in OUTCOMES if verdict in found), "not judged")
+    verdicts = {check.verdict for check in checks}
+    return next((verdict for verdict in OUTCOMES if verdict in verdicts), "not judged")
 
 
 def of_exact_change(change: float, margin: float, *, higher_is_better: bool) -> Verdict:

@@ -115,8 +115,8 @@ def _first_difference(row: str, old: Mapping[str, Any], new: Mapping[str, Any], 
         "gradient": f"from the gradient of step {step} on, whose loss is equal",
     }.get(what, f"from step {step} on")
     near = isinstance(before, float) and isinstance(after, float) and math.isclose(before, after, rel_tol=SAME_STEP)
-    told = f"{what} {before} -> {after}{'; it may be rounding' if near else ''}"
-    return Check(row, "training", "not worse", f"training changed {where} ({told})")
+    difference = f"{what} {before} -> {after}{'; it may be rounding' if near else ''}"
+    return Check(row, "training", "not worse", f"training changed {where} ({difference})")
 
 
 def _steps(path: Path) -> list[dict[str, Any]]:

@@ -78,8 +78,8 @@ def judge(
     frozen = [row for row in by_row if keeps_avatar(baseline.rows[row][0].cell)]
     progress = Progress("frozen avatars", len(frozen), expected_s=15.0, workers=1)
     for row in frozen:
-        found, result, changed = _draw_frozen(row, baseline.rows[row][0], by_row[row][0], options.out / FROZEN)
-        checks += found
+        row_checks, result, changed = _draw_frozen(row, baseline.rows[row][0], by_row[row][0], options.out / FROZEN)
+        checks += row_checks
         drawn |= {} if result is None else {row: result}
         worst |= {} if changed is None else {row: changed}
         progress.finish(row)
@@ -108,13 +108,13 @@ def trained(
 ) -> dict[str, list[Entry]]:
     """Run the first seeds of all rows, by default every seed; what is there is not run again."""
     run_missing([cell for cells in by_row.values() for cell in cells[:seeds]], suite, options)
-    found: dict[str, list[Entry]] = {}
+    entries: dict[str, list[Entry]] = {}
     for row, cells in by_row.items():
         for cell in cells[:seeds]:
             if (result := result_of(cell)) is None:
                 raise KeyboardInterrupt("some trainings were interrupted")
-            found.setdefault(row, []).append(Entry(cell, result))
-    return found
+            entries.setdefault(row, []).append(Entry(cell, result))
+    return entries
 
 
 def times_of(entries: Mapping[str, Sequence[Entry]], out: Path) -> Times:

@@ -63,10 +63,10 @@ def read(path: Path) -> list[dict[str, Any]]:
         try:
             line = json.loads(text)
             rows = {printable(row): _numbers(values) for row, values in line["rows"].items()}
-            told = {name: printable(str(line[name])) for name in ("commit", "when", "outcome")}
+            labels = {name: printable(str(line[name])) for name in ("commit", "when", "outcome")}
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"{path}:{number}: expected a line that the gate wrote ({error})") from error
-        lines.append({**told, "rows": rows})
+        lines.append({**labels, "rows": rows})
     return lines
 
 
@@ -88,10 +88,10 @@ def table(lines: list[dict[str, Any]]) -> pd.DataFrame:
         for row, values in line["rows"].items()
         for what, value in values.items()
     ]
-    found = pd.DataFrame(records, columns=["run", "commit", "row", "what", "value"])
-    change = found.groupby(["row", "what"])["value"].diff()
-    usual = change.groupby([found["row"], found["what"]]).transform(lambda each: each.expanding(3).std().shift())
-    return found.assign(step=(change.abs() > STEP * usual) & (change.abs() > 0))
+    runs = pd.DataFrame(records, columns=["run", "commit", "row", "what", "value"])
+    change = runs.groupby(["row", "what"])["value"].diff()
+    usual = change.groupby([runs["row"], runs["what"]]).transform(lambda each: each.expanding(3).std().shift())
+    return runs.assign(step=(change.abs() > STEP * usual) & (change.abs() > 0))
 
 
 def page(lines: list[dict[str, Any]]) -> str:

@@ -36,13 +36,13 @@ def judge_quality(pairs: Pairs, *, looks: int) -> tuple[list[Check], list[str]]:
     (Bonferroni), then corrected over all comparisons (Holm). Also returns the rows of which more seeds would tell more.
     """
     checks: list[Check] = []
-    asked: list[tuple[str, str, str]] = []  # row, name, change
+    changes: list[tuple[str, str, str]] = []  # row, name, change
     tests: list[Comparison] = []
     undecided: list[str] = []
     for row, (before, after) in pairs.items():
         old_of_seed = {entry.result.config.seed: entry.result for entry in before}
-        known = [entry.result for entry in after if entry.result.config.seed in old_of_seed]
-        seeds = [(old_of_seed[new.config.seed], new) for new in known]
+        shared = [entry.result for entry in after if entry.result.config.seed in old_of_seed]
+        seeds = [(old_of_seed[new.config.seed], new) for new in shared]
         if all([v.prediction for v in old.views] == [v.prediction for v in new.views] for old, new in seeds):
             checks.append(Check(row, "quality", "unchanged", f"identical predictions of {len(seeds)} seeds"))
         elif len(seeds) < 2:
@@ -62,8 +62,8 @@ def judge_quality(pairs: Pairs, *, looks: int) -> tuple[list[Check], list[str]]:
                     assert test is not None, "the seeds are common"
                     tests.append(replace(test, p=min(1.0, looks * test.p)))
                     change = f"{old.mean():.4g} -> {new.mean():.4g}{metric.unit and ' ' + metric.unit}"
-                    asked.append((row, "/".join(name), change))
-    for (row, quality, change), test in zip(asked, corrected(tests), strict=True):
+                    changes.append((row, "/".join(name), change))
+    for (row, quality, change), test in zip(changes, corrected(tests), strict=True):
         detail = (
             f"{change} ({test.mean:+.4g} [{test.low:+.4g}, {test.high:+.4g}], p {test.p:.2g}, {test.verdict}; "
             f"a change of {max(test.margin, test.detectable):.2g} would have been seen)"
@@ -140,10 +140,10 @@ def time_checks(row: str, before: Mapping[str, float], after: Mapping[str, float
         if stored and name not in WHOLE:
             continue
         verdict: Verdict = "worse" if rise >= fails else "not judged" if rise >= SLOWER else "unchanged"
-        told = f"a rise from {fails - 1:.0%} on fails"
+        limit = f"a rise from {fails - 1:.0%} on fails"
         if verdict == "not judged":
-            told = f"stored times cannot decide a rise below {fails - 1:.0%}"
-            told += "" if name == "training" else "; --against REV does"
-        detail = f"{before[name]:.4g} -> {after[name]:.4g} times the reference workload ({rise - 1:+.0%}; {told})"
+            limit = f"stored times cannot decide a rise below {fails - 1:.0%}"
+            limit += "" if name == "training" else "; --against REV does"
+        detail = f"{before[name]:.4g} -> {after[name]:.4g} times the reference workload ({rise - 1:+.0%}; {limit})"
         checks.append(Check(row, "cost", verdict, detail, f"time of {name}"))
     return checks

@@ -27,11 +27,11 @@ BRIGHTER = 4  # The difference of two pictures is shown so many times as large.
 
 def verdict(checks: Sequence[Check]) -> str:
     """One line."""
-    found = outcome(checks)
+    judgement = outcome(checks)
     bad = sum(check.verdict in FAILING for check in checks)
     judged = sum(check.verdict != "not judged" for check in checks)
     count = f"{bad} of {judged} checks fail" if bad else f"{judged} checks"
-    return f"gate: {'FAILED' if found in FAILING else 'passed'}, {WORDS[found]} ({count})"
+    return f"gate: {'FAILED' if judgement in FAILING else 'passed'}, {WORDS[judgement]} ({count})"
 
 
 def terminal(baseline: Baseline, judged: Judgement) -> str:
@@ -54,8 +54,8 @@ def markdown(baseline: Baseline, judged: Judgement) -> str:
     if news := [check for check in checks if check.verdict != "unchanged"]:
         lines += ["", *_table(news)]
     for accepted in baseline.file.accepted:
-        told = (accepted.row, accepted.commit, accepted.because)
-        lines += ["", "Accepted: {} at {}: {}".format(*map(escaping.markdown, told))]
+        acceptance = (accepted.row, accepted.commit, accepted.because)
+        lines += ["", "Accepted: {} at {}: {}".format(*map(escaping.markdown, acceptance))]
     lines += ["", "<details><summary>All checks</summary>", "", *_table(checks), "", "</details>", ""]
     return "\n".join(lines)
 

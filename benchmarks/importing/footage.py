@@ -185,12 +185,12 @@ def _pictures(folder: Path, kinds: Sequence[str], cameras: dict[str, Camera]) ->
 
 def _require_complete(folder: Path, files: dict[str, Files], splits: dict[str, Split]) -> None:
     """Refuse missing pictures, with a line per camera."""
-    wanted: dict[str, list[int]] = {}
+    frames_of: dict[str, list[int]] = {}
     for camera, frame in (view for split in splits.values() for view in split.views):
-        wanted.setdefault(camera, []).append(frame)
+        frames_of.setdefault(camera, []).append(frame)
     problems = []
     for kind, listed in files.items():
-        for name, frames in wanted.items():
+        for name, frames in frames_of.items():
             if missing := [frame for frame in frames if frame not in listed[name]]:
                 count = f"{len(missing)} of {len(frames)} frames are missing"
                 problems.append(f"{folder / kind / name}: {count}, the first is {missing[0]}")

@@ -170,9 +170,9 @@ class Page:
         if self._camera.value != FREE:
             self._camera.value = FREE
 
-    def _show_error(self, wanted: bool) -> None:
-        self._error.value = wanted
-        self._set(error=wanted)
+    def _show_error(self, shown: bool) -> None:
+        self._error.value = shown
+        self._set(error=shown)
 
     def _ask_truth(self) -> None:
         """Render the truth of what is seen, and put it beside the avatar."""

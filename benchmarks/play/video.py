@@ -53,9 +53,10 @@ def render_video(avatars: AvatarSet, spec: VideoSpec, on_progress: Callable[[str
             pose = Pose(clip.motion, frame)
             if title in loaded:
                 return on_paper(loaded[title].on_black(pose, camera))
-            known = truths.find(clip, frame, camera)
-            if known is not None and (known.camera.width, known.camera.height) == (camera.width, camera.height):
-                return on_paper(known.on_black)
+            truth_frame = truths.find(clip, frame, camera)
+            size = (camera.width, camera.height)
+            if truth_frame is not None and (truth_frame.camera.width, truth_frame.camera.height) == size:
+                return on_paper(truth_frame.on_black)
             on_progress(f"truth of frame {frame}, camera {camera.name}")
             return on_paper(truth.render(pose, camera, captured=clip.captured))
 

@@ -98,8 +98,8 @@ class Viewer:
             )
             allowed_ms = max(8.0, alone / viewers)
             # By small steps, so that a single slow picture does not show.
-            wanted = width * height * min(1.25, max(0.5, allowed_ms / ms))
-            self._pixels = min(max(wanted, MIN_PIXELS), MAX_PIXELS)
+            pixels = width * height * min(1.25, max(0.5, allowed_ms / ms))
+            self._pixels = min(max(pixels, MIN_PIXELS), MAX_PIXELS)
         else:
             self._sharp = not self._dirty
         with may_be_closed(self.client):

@@ -119,11 +119,11 @@ def of_run(run: Run, tables: Path | None = None) -> tuple[AuthorTable, ...]:
 def default_tables(tables: RunTables) -> tuple[AuthorTable, ...]:
     """A table for each scene, over both columns of a paper: PSNR, LPIPS or FLIP, and times, as far as measured."""
     has_lpips = (tables.rows["metric"] == "lpips").any()
-    asked = [(metric, split) for split in RANKED_SPLITS for metric in ("psnr", "lpips" if has_lpips else "flip")]
+    qualities = [(metric, split) for split in RANKED_SPLITS for metric in ("psnr", "lpips" if has_lpips else "flip")]
     there = set(tables.rows["metric"])
     columns = tuple(
         TableColumn(metric=metric, split=split)
-        for metric, split in (*asked, ("frame_ms", ""), ("train_s", ""))
+        for metric, split in (*qualities, ("frame_ms", ""), ("train_s", ""))
         if metric in there
     )
     specs = [TableSpec(scene=s, columns=columns, label=f"tab:{_plain(s)}", wide=True) for s in tables.scenes]

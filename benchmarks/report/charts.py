@@ -156,7 +156,7 @@ def heatmap(cells: pd.DataFrame, *, rows: Sequence[str], columns: Sequence[str],
     scale = alt.Scale(domain=[-limit, 0, limit], range=list(RANGE), clamp=True, interpolate="rgb")
     tips = [("row", "", ""), ("column", "", ""), ("text", "dB lost", ""), ("interval", "95 %", ""), ("verdict", "", "")]
     shown = alt.Chart(inline(cells))
-    known = "indexof(['better', 'worse'], datum.verdict)"
+    index = "indexof(['better', 'worse'], datum.verdict)"
     text: dict[str, Any] = {"dy": -6, "fontSize": 13, "color": WRITING}
     layers = [
         shown.mark_rect(cornerRadius=2).encode(
@@ -165,8 +165,8 @@ def heatmap(cells: pd.DataFrame, *, rows: Sequence[str], columns: Sequence[str],
         shown.transform_filter("datum.framed")
         .mark_rect(filled=False, stroke=FRAME, strokeWidth=2.5, cornerRadius=2)
         .encode(**at),
-        shown.transform_filter(f"{known} >= 0").mark_text(fontWeight="bold", **text).encode(**at, text="text:N"),
-        shown.transform_filter(f"{known} < 0").mark_text(**text).encode(**at, text="text:N"),
+        shown.transform_filter(f"{index} >= 0").mark_text(fontWeight="bold", **text).encode(**at, text="text:N"),
+        shown.transform_filter(f"{index} < 0").mark_text(**text).encode(**at, text="text:N"),
         shown.mark_text(dy=9, fontSize=10, color=WRITING).encode(**at, text="interval:N"),
     ]
     return (layered(layers, title, (CELL[0] * len(columns), CELL[1] * len(rows))),)

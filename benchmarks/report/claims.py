@@ -98,11 +98,11 @@ def printed(judged: pd.DataFrame) -> pd.DataFrame:
 
 def _told(claim: Claim, rows: pd.DataFrame) -> str:
     """What is claimed, where, and what was found on each of its scenes."""
-    found = (
+    verdicts = (
         f"{f'{row.scene}: ' if row.scene else ''}{row.verdict}{f' ({row.because})' if row.because else ''}"
         for row in rows.itertuples()
     )
-    return f"{claim.name} ({claim.where}): {claim.says}. {'; '.join(found)}."
+    return f"{claim.name} ({claim.where}): {claim.says}. {'; '.join(verdicts)}."
 
 
 def _table(rows: Rows) -> pd.DataFrame:

@@ -112,8 +112,8 @@ def line_figure(
     titles = {method: each.title for method, each in series.items()}
     places = table[x].astype(float) if pd.api.types.is_numeric_dtype(table[x]) else table[x]
     samples = table.assign(series=table["method"].map(titles), x=places, y=table["psnr"])
-    known = [c for c in ("panel", "scale", "series", "x", "y", "low", "high", "crossed") if c in samples]
+    columns_drawn = [c for c in ("panel", "scale", "series", "x", "y", "low", "high", "crossed") if c in samples]
     drawn = tuple(series.values())
-    panels = charts.lines(samples[known], drawn, x=x_title, y=y_title, size=size, log=log, rules=rules)
+    panels = charts.lines(samples[columns_drawn], drawn, x=x_title, y=y_title, size=size, log=log, rules=rules)
     columns = min(columns, len(panels))
     return Figure(name=name, title=title, caption=caption, panels=panels, series=drawn, columns=columns)

@@ -60,14 +60,14 @@ def _degrees(run: Run) -> dict[tuple[str, int], float]:
         with suppress(InputError):
             splits = (capture := load_capture(folder)).splits
             frames = [frame for name in MOTION_SPLITS if name in splits for frame in splits[name].frames]
-            found = heading_deg(capture.motion, train=splits["train"].frames, test=frames)
-            degrees |= {(identity, frame): float(each) for frame, each in zip(frames, found, strict=True)}
+            turned_deg = heading_deg(capture.motion, train=splits["train"].frames, test=frames)
+            degrees |= {(identity, frame): float(each) for frame, each in zip(frames, turned_deg, strict=True)}
     return degrees
 
 
 def _farthest(run: Run, results: Sequence[CellResult], scene: str, degrees: Degrees) -> Frames | None:
     """The view of all captures of a scene that is turned farthest; None where a picture is missing."""
-    found = []
+    farthest = []
     for by_method in pictures.first_cells(run, results):
         shown = [
             each
@@ -77,10 +77,10 @@ def _farthest(run: Run, results: Sequence[CellResult], scene: str, degrees: Degr
             and any(_turned(each.result, degrees))
         ][: FEW + 1]
         if shown:
-            found.append((*max(_turned(shown[0].result, degrees), key=lambda turned: turned[0]), shown))
-    if not found:
+            farthest.append((*max(_turned(shown[0].result, degrees), key=lambda turned: turned[0]), shown))
+    if not farthest:
         return None
-    _, view, shown = max(found, key=lambda each: each[0])
+    _, view, shown = max(farthest, key=lambda each: each[0])
     with suppress(InputError):
         return pictures.compare(load_capture(shown[0].cell.capture_folder), shown, view, with_errors=False)
     return None

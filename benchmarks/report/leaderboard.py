@@ -227,12 +227,12 @@ def _notes(results: Sequence[CellResult]) -> list[str]:
         notes.append("is given part of the truth")
     for brought in dict.fromkeys(result.brought for result in results):
         if brought is not None:
-            told = {
+            reported = {
                 "s of training": brought.training_s,
                 "ms per frame": brought.frame_ms,
                 "parameters": brought.parameters,
             }
-            figures = ", ".join(f"{value:.10g} {unit}" for unit, value in told.items() if value is not None)
+            figures = ", ".join(f"{value:.10g} {unit}" for unit, value in reported.items() if value is not None)
             notes += [BROUGHT_NOTE, *([f"reported by its authors, not measured: {figures}"] if figures else [])]
     if any(result.isolated is False for result in results):
         notes.append("not isolated")

@@ -84,13 +84,13 @@ class Numbers:
 
     def scores(self, report: str, scene: str) -> str:
         """A table in Markdown: PSNR and LPIPS on all held-out splits, milliseconds and training seconds."""
-        wanted = [*quality_columns(("psnr", "lpips")), *cost_columns(("frame_ms", "train_cpu_s"))]
+        quantities = [*quality_columns(("psnr", "lpips")), *cost_columns(("frame_ms", "train_cpu_s"))]
         methods = list(dict.fromkeys(self._of_scene(report, scene)["method"]))
         cells = [
-            [style_of(method).title, *(self._score(report, scene, method, quantity) for quantity in wanted)]
+            [style_of(method).title, *(self._score(report, scene, method, quantity) for quantity in quantities)]
             for method in methods
         ]
-        return _markdown(["", *(": ".join(head_of(quantity)) for quantity in wanted)], cells)
+        return _markdown(["", *(": ".join(head_of(quantity)) for quantity in quantities)], cells)
 
     def claims(self) -> str:
         """The claims that were judged, as a table in Markdown."""

@@ -282,8 +282,8 @@ def _picture_sections(
 
 def on_sheet(shown: list[Shown]) -> list[Shown]:
     """Whose pictures come first: a user's rows, which may have the names of ours, then the main ones of ours."""
-    wanted = [each for each in shown if not is_ours(each.cell.config.method) or each.cell.config.method in ON_SHEETS]
-    return sorted(wanted, key=lambda each: is_ours(each.cell.config.method))
+    main = [each for each in shown if not is_ours(each.cell.config.method) or each.cell.config.method in ON_SHEETS]
+    return sorted(main, key=lambda each: is_ours(each.cell.config.method))
 
 
 def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Flipbook, dict[str, bytes]]:

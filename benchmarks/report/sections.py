@@ -222,12 +222,12 @@ def template_errors(tables: RunTables) -> list[Section]:
 def training_cost(tables: RunTables) -> list[Section]:
     """Quality against training seconds and against training frames, where a suite made them."""
     seconds, frames = curves.time_to_quality(tables.snapshots), curves.data_scaling(tables.all_rows)
-    asked = (
+    charts_asked = (
         ("budget", "Accuracy against training seconds", "seconds", "seconds of training", seconds),
         ("footage", "Novel poses against the number of training frames", "frames", "training frames", frames),
     )
     sections = []
-    for name, title, x, x_title, table in asked:
+    for name, title, x, x_title, table in charts_asked:
         if len(table):
             words = table["split"].map(lambda split: SPLIT_NAMES[split].words)
             sentences = curves.crossings(table) if name == "budget" else curves.frames_needed(table)

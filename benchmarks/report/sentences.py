@@ -93,11 +93,11 @@ def _ablation(ranked: pd.DataFrame) -> list[str]:
     texts = []
     for (split, reference), rows in ranked.groupby(["split", "reference"], sort=False):
         by_verdict = {verdict: list(group["method"]) for verdict, group in rows.groupby("verdict")}
-        found = [f"{text} {titles(by_verdict[verdict])}" for verdict, text in words.items() if verdict in by_verdict]
+        clauses = [f"{text} {titles(by_verdict[verdict])}" for verdict, text in words.items() if verdict in by_verdict]
         if unclear := by_verdict.get("unclear", []):
             named = titles(unclear) if len(unclear) <= FEW_NAMED else f"{len(unclear)} methods"
-            found.append(f"not known to differ from {named}")
-        texts.append(f"on {SPLIT_NAMES[split].words} {style_of(reference).title} is {', '.join(found)}")
+            clauses.append(f"not known to differ from {named}")
+        texts.append(f"on {SPLIT_NAMES[split].words} {style_of(reference).title} is {', '.join(clauses)}")
     return texts
 
 
@@ -183,11 +183,11 @@ def _sufficient(tables: RunTables, scene: str) -> str:
         competing = pareto.candidates(tables, scene, split)
         if len(competing) < 2:
             continue
-        if (found := pareto.smallest_sufficient(competing)) is None:
+        if (sufficient := pareto.smallest_sufficient(competing)) is None:
             return "Not known from one value of each."
-        title, best = style_of(found.name).title, style_of(found.best).title
+        title, best = style_of(sufficient.name).title, style_of(sufficient.best).title
         text = f"{title}, the fastest that loses less than {pareto.SUFFICIENT_DB} dB to {best} (95 % confidence)"
-        if found.name == found.best:
+        if sufficient.name == sufficient.best:
             text = f"{title}, the best; no faster method is known to lose less than {pareto.SUFFICIENT_DB} dB"
         parts.setdefault(text, []).append(SPLIT_NAMES[split].words)
     return " ".join(f"On {' and '.join(words)}: {text}." for text, words in parts.items())
@@ -338,7 +338,7 @@ def _clocks(results: Sequence[CellResult]) -> list[str]:
         why = "it was stopped, or shared its core" if wall > cpu else "it used more than one core"
         text = f"{result.config.title} trained {wall:.0f} s by the clock and {cpu:.0f} s of CPU time: {why}"
         apart.setdefault(why, []).append((abs(wall - cpu), text))
-    return [f"{max(found)[1]}{f'; likewise {len(found) - 1} more' if found[1:] else ''}." for found in apart.values()]
+    return [f"{max(cells)[1]}{f'; likewise {len(cells) - 1} more' if cells[1:] else ''}." for cells in apart.values()]
 
 
 def _reported(result: CellResult) -> str:

@@ -28,8 +28,8 @@ def people_needed(count: float) -> str:
 
 def quality_columns(metrics: Sequence[str]) -> list[Quantity]:
     """Foreground qualities on novel views and poses; near and far poses have few of them."""
-    asked = [(s, m) for s in HELD_OUT_SPLITS for m in metrics if s in RANKED_SPLITS or m in BESIDE]
-    return [Quantity(s, "full", m) if m in ON_WHOLE_FRAMES else foreground(s, m) for s, m in asked]
+    qualities = [(s, m) for s in HELD_OUT_SPLITS for m in metrics if s in RANKED_SPLITS or m in BESIDE]
+    return [Quantity(s, "full", m) if m in ON_WHOLE_FRAMES else foreground(s, m) for s, m in qualities]
 
 
 def main_columns(tables: RunTables, scene: str) -> list[Quantity]:

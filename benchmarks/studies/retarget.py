@@ -83,9 +83,9 @@ def render_truth(own: Capture, motion: Path, folder: Path, *, frames: int, worke
     scene = recorded_scene(own.manifest, own.folder)
     body = make_body(scene)
     print(describe(read_motion_file(motion, body.skeleton, fps=scene.fps, most=frames)), file=sys.stderr)
-    wanted = retargeted(scene, body, motion, frames=frames)
+    driven = retargeted(scene, body, motion, frames=frames)
     progress = Progress(f"images of {motion.name}", 0, expected_s=0.0, workers=workers)
-    make_capture(wanted, folder, workers=workers, progress=progress.advance)
+    make_capture(driven, folder, workers=workers, progress=progress.advance)
     progress.close()
     truth = load_capture(folder)
     if own.manifest.code != truth.manifest.code:

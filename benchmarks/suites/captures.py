@@ -23,13 +23,15 @@ def make_capture(spec: CaptureSpec, data: Path, *, workers: int) -> Path:
     A capture that an older version of the scene left under the same name is not touched: the new one goes beside it.
     """
     if spec.stress is not None:
-        return _spoilt_capture(spec, spec.stress, make_capture(replace(spec, stress=None), data, workers=workers), data)
+        return _perturbed_capture(
+            spec, spec.stress, make_capture(replace(spec, stress=None), data, workers=workers), data
+        )
     if spec.folder is not None:
         return spec.folder
     folder = data / spec.name
-    wanted = identity_of(spec.of or spec.scene, described(spec))
-    if is_capture(folder) and read_manifest(folder).identity not in ("", wanted):
-        folder = data / f"{spec.name}-{wanted[:8]}"
+    identity = identity_of(spec.of or spec.scene, described(spec))
+    if is_capture(folder) and read_manifest(folder).identity not in ("", identity):
+        folder = data / f"{spec.name}-{identity[:8]}"
     make_capture_in(spec, folder, workers=workers)
     return folder
 
@@ -51,7 +53,7 @@ def described(spec: CaptureSpec) -> Scene:
     return scene_of(of, size=spec.size, seed=spec.seed, subject=who, name=spec.scene, changes=spec.changes)
 
 
-def _spoilt_capture(spec: CaptureSpec, stress: Stress, clean: Path, data: Path) -> Path:
+def _perturbed_capture(spec: CaptureSpec, stress: Stress, clean: Path, data: Path) -> Path:
     """The clean capture, perturbed; made anew where an earlier attempt did not come to its manifest, the last file."""
     capture = load_capture(clean)
     folder = data / f"{spec.name}-{capture.identity[:8]}"

@@ -152,7 +152,7 @@ def run_cells(
     _stopping.clear()  # Not when a run is over: a thread that the interruption kept from its executor may still look.
     futures: dict[Future[str], Cell] = {}
     repeats: Counter[Path] = Counter()
-    known = {cell.folder: (cell, _digest(cell)) for cell in plan.done}
+    digests = {cell.folder: (cell, _digest(cell)) for cell in plan.done}
 
     def submit(cell: Cell) -> Future[str]:
         write_config(cell)
@@ -167,17 +167,17 @@ def run_cells(
             for future in finished:
                 cell = futures[future]
                 progress.finish(cell.config.title, status=future.result())
-                known[cell.folder] = (cell, _digest(cell))
+                digests[cell.folder] = (cell, _digest(cell))
             if finished:
                 # A method that nothing isolates can write to the folders of other cells.
-                for cell in [cell for cell, digest in known.values() if _digest(cell) != digest]:
+                for cell in [cell for cell, digest in digests.values() if _digest(cell) != digest]:
                     repeats[cell.folder] += 1
                     if repeats[cell.folder] == ATTEMPTS:
                         times = f"changed by other cells {ATTEMPTS} times, since nothing isolates methods here"
                         raise InputError(f"{cell.config.title}: its result was {times}; run its row alone")
                     progress.say(f"{cell.config.title}: run again, its result was changed while another cell ran")
                     progress.total += 1
-                    del known[cell.folder]
+                    del digests[cell.folder]
                     _set_aside(cell)
                     pending.add(submit(cell))
             progress.tick(running=[futures[f].config.title for f in pending if f.running()])

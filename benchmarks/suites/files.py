@@ -61,14 +61,14 @@ def suite_files() -> dict[str, Path]:
 
 def our_rows() -> frozenset[tuple[str, str, str]]:
     """Name, factory and hash of the changes of every varied method in our own suites."""
-    found = set()
+    names = set()
     for path in suite_files().values():
         for row in tomllib.loads(path.read_text())["methods"]:  # tomlkit takes seconds for all.
             if isinstance(row, dict):
                 changes = _dotted({key: value for key, value in row.items() if key not in METHOD_KEYS})
                 name = row.get("name") or varied_name(row["of"], changes)
-                found.add((name, row["of"], hash_of(for_json(changes))))
-    return frozenset(found)
+                names.add((name, row["of"], hash_of(for_json(changes))))
+    return frozenset(names)
 
 
 def methods_known() -> frozenset[str]:
@@ -87,10 +87,10 @@ def suite_file(name: str | Path) -> Path:
     Raises:
         InputError: it is neither.
     """
-    known = suite_files()
-    path = known.get(OLD_SUITES.get(str(name), str(name)), Path(name))
+    suites = suite_files()
+    path = suites.get(OLD_SUITES.get(str(name), str(name)), Path(name))
     if path.suffix != ".toml":
-        raise InputError(f"unknown suite {str(name)!r}, {suggest(str(name), (*known, 'FILE.toml'))}")
+        raise InputError(f"unknown suite {str(name)!r}, {suggest(str(name), (*suites, 'FILE.toml'))}")
     return path
 
 
@@ -300,11 +300,11 @@ def given_captures(folders: Sequence[Path]) -> tuple[SceneSpec, ...]:
 
 
 def _dotted(table: Mapping[str, Any]) -> Changes:
-    found: dict[str, Any] = {}
+    flat: dict[str, Any] = {}
     for key, value in table.items():
         inner = _dotted(value) if isinstance(value, dict) else None
-        found |= {key: value} if inner is None else {f"{key}.{name}": each for name, each in inner}
-    return tuple((key, tuple(value) if isinstance(value, list) else value) for key, value in sorted(found.items()))
+        flat |= {key: value} if inner is None else {f"{key}.{name}": each for name, each in inner}
+    return tuple((key, tuple(value) if isinstance(value, list) else value) for key, value in sorted(flat.items()))
 
 
 def line_of(text: str, place: Place) -> int:

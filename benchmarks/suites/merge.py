@@ -13,8 +13,8 @@ from benchmarks.suites.runs import RUN_FILE, read_run
 def are_shards(folders: Sequence[Path]) -> bool:
     """Whether several folders hold parts of one run: the same suite and the same cells."""
     descriptions = [read_json(path) if (path := folder / RUN_FILE).is_file() else None for folder in folders]
-    asked = [(each.get("suite"), each.get("cells")) if isinstance(each, dict) else None for each in descriptions]
-    return len(folders) > 1 and None not in asked and all(each == asked[0] for each in asked)
+    identities = [(each.get("suite"), each.get("cells")) if isinstance(each, dict) else None for each in descriptions]
+    return len(folders) > 1 and None not in identities and all(each == identities[0] for each in identities)
 
 
 def merge_runs(shards: Sequence[Path], out: Path) -> None:

@@ -130,9 +130,9 @@ def _require_column(column: TableColumn) -> None:
         _require_known("unit", column.unit, ("", own, *(shown for measured, shown in UNITS if measured == own)))
 
 
-def _require_known(what: str, name: str, known: tuple[str, ...]) -> None:
-    if name not in known:
-        raise ValueError(f"unknown {what} {name!r}, expected one of {', '.join(filter(None, known)) or 'none'}")
+def _require_known(what: str, name: str, allowed: tuple[str, ...]) -> None:
+    if name not in allowed:
+        raise ValueError(f"unknown {what} {name!r}, expected one of {', '.join(filter(None, allowed)) or 'none'}")
 
 
 def tables_of(content: Any, *, place: str) -> tuple[TableSpec, ...]:

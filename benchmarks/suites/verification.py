@@ -106,18 +106,18 @@ def _check(cell: Cell, result: CellResult, folder: Path | None, intact: set[Path
         if before.prediction != view.prediction:
             return "differs", f"the picture {view.split}/{view.camera}/{view.frame} is not the one that it names"
     same = capture.identity == cell.config.capture
-    told, measured = _scores(result.summary, result.views), _scores(quality_summary(on_cpu, capture, scored), scored)
-    values, given = dict(measured), dict(told)
+    scores, measured = _scores(result.summary, result.views), _scores(quality_summary(on_cpu, capture, scored), scored)
+    values, given = dict(measured), dict(scores)
     if left_out := [place for place in values if place not in given and place[-1] != "lpips"]:
         return "differs", f"{len(left_out)} scores are left out, the first: {' '.join(left_out[0])}"
-    wrong = [(place, value) for place, value in told if not _close(place[-1], value, values.get(place), same=same)]
+    wrong = [(place, value) for place, value in scores if not _close(place[-1], value, values.get(place), same=same)]
     if wrong:
-        (place, value), count = wrong[0], f"{len(wrong)} of {len(told)} scores differ"
+        (place, value), count = wrong[0], f"{len(wrong)} of {len(scores)} scores differ"
         pictures = "none" if place not in values else f"{values[place]:.6g}"
-        return "differs", f"{count}, the first: {' '.join(place)} is told as {value:.6g}, pictures have {pictures}"
+        return "differs", f"{count}, the first: {' '.join(place)} is scores as {value:.6g}, pictures have {pictures}"
     without = "" if weights_file() else "; LPIPS is not checked, for its weights are not installed"
     how = "equal" if same else "within what counts as no change (the same scene, rendered elsewhere)"
-    text = f"{len(views)} pictures scored again on {folder}, {len(told)} scores are {how}{without}"
+    text = f"{len(views)} pictures scored again on {folder}, {len(scores)} scores are {how}{without}"
     return "equal" if same else "near", text
 
 
@@ -131,8 +131,8 @@ def _scores(summary: Sequence[Summary], views: Sequence[ViewScore]) -> list[tupl
     return [row for row in scores if row[0][-1] != "lpips" or weights_file() is not None]
 
 
-def _close(metric: str, told: float, measured: float | None, *, same: bool) -> bool:
-    known = METRICS.get(metric)
-    if measured is None or known is None:
+def _close(metric: str, reported: float, measured: float | None, *, same: bool) -> bool:
+    definition = METRICS.get(metric)
+    if measured is None or definition is None:
         return False
-    return abs(told - measured) <= (EQUAL * max(1.0, abs(measured)) if same else known.abs_tol)
+    return abs(reported - measured) <= (EQUAL * max(1.0, abs(measured)) if same else definition.abs_tol)

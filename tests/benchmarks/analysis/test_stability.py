@@ -186,7 +186,7 @@ def test_a_stressed_suite_has_its_clean_captures_first_and_one_per_stress() -> N
     assert len({spec.name for spec in suite.captures}) == 1 + steps
 
 
-def test_a_spoilt_capture_is_made_once_whole_and_again_after_an_accident(
+def test_a_perturbed_capture_is_made_once_whole_and_again_after_an_accident(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clean = write_capture(tmp_path / "clean")
