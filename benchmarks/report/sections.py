@@ -17,6 +17,7 @@ from benchmarks.report.figures import line_figure
 from benchmarks.report.glossary import GLOSSARY
 from benchmarks.report.tables import text_of
 from benchmarks.report.vega import Figure, Series
+from benchmarks.suites.reuse import TRAINED_BY
 from benchmarks.suites.stress import AXES
 
 WHISKERS = "Whiskers: 95 % interval over seeds, or over captures where there are several."
@@ -49,6 +50,10 @@ PROVENANCE_NOTE = (
     f"Protocol {PROTOCOL}: predictions are quantised to 8 bits on black before anything is compared. Code: hash of the "
     "sources that decide a cell. results.csv beside this report has every number; each cell's result.json the scores "
     "of every image. Differences are taken before numbers are rounded."
+)
+REUSED_NOTE = (
+    "{reused} of {cells} trainings are those of an earlier run by other code: for one cell of each of their rows and "
+    "scenes this code made the same pictures, bit for bit."
 )
 
 
@@ -359,7 +364,9 @@ def provenance(results: Sequence[CellResult], command: str) -> Section:
     facts.append(("seeds", ", ".join(str(seed) for seed in sorted({r.config.seed for r in results}))))
     facts.append(("sum of all cells [min]", f"{sum(p.wall_s for p in provenances) / 60:.1f}"))
     facts += [("command", command)] if command else []
-    return Section(title="Provenance", blocks=(_facts("fact", facts), Text(text=PROVENANCE_NOTE, note=True)))
+    reused = sum(TRAINED_BY in p.versions for p in provenances)
+    note = PROVENANCE_NOTE + (f" {REUSED_NOTE.format(reused=reused, cells=len(results))}" if reused else "")
+    return Section(title="Provenance", blocks=(_facts("fact", facts), Text(text=note, note=True)))
 
 
 def glossary() -> Section:

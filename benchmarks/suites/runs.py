@@ -36,6 +36,7 @@ from benchmarks.suites.engine import (
     shard_of,
 )
 from benchmarks.suites.progress import Progress
+from benchmarks.suites.reuse import reuse
 from benchmarks.suites.suites import CellSpec, Suite
 from benchmarks.suites.tables import TableSpec
 from synth.person.cast import VALIDATION
@@ -85,6 +86,7 @@ class RunOptions:
     executor: str = "local"
     shard: str | None = None
     retry_failed: bool = False
+    reuse: tuple[Path, ...] = ()  # runs by other code, whose cells stay where today's code trains the same
     command: str = ""
 
     @property
@@ -101,9 +103,16 @@ def run_suite(suite: Suite, options: RunOptions) -> Run:
         print(note, file=sys.stderr)
     options.out.mkdir(parents=True, exist_ok=True)
     with contextlib.nullcontext() if options.shard else run_lock(options.out):
+        earlier = [cell for folder in options.reuse for cell in read_run(folder).cells]  # perhaps of this very folder
         run = prepared(suite, options)
+        if earlier:
+            reuse(run.cells, earlier, lambda cells: run_missing(cells, suite, options), say=_say)
         run_missing(shard_of(run.cells, options.shard) if options.shard else run.cells, suite, options)
     return run
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
 
 
 def require_utf8(folder: Path) -> None:
@@ -127,6 +136,8 @@ def require_runnable(suite: Suite, options: RunOptions) -> list[str]:
     """
     if options.shard:
         read_shard(options.shard)
+        if options.reuse:
+            raise InputError("--reuse decides on whole rows: expected it without --shard")
     require_executor(options.executor)
     missing = missing_captures(suite, options.data)
     notes = []

@@ -16,13 +16,16 @@ from helpers.waiting import wait_for
 
 import ash.files
 from ash.capture.manifest import read_manifest
+from ash.files import read_json, write_json
 from benchmarks import cli
 from benchmarks.cell import registry
 from benchmarks.cell.sandbox import METHOD_PATH
+from benchmarks.cell.schema import read_result, write_config, write_result
 from benchmarks.commands import arguments
 from benchmarks.commands.captures import SynthCommand
 from benchmarks.suites import captures
 from benchmarks.suites.files import find_suite
+from benchmarks.suites.runs import read_run
 from benchmarks.suites.suites import CaptureSpec
 
 pytestmark = pytest.mark.usefixtures("installed_fakes")
@@ -251,6 +254,32 @@ def test_the_code_version_follows_every_deciding_source(tmp_path: Path, monkeypa
     registry.code_version.cache_clear()
     assert len(seen) == 4
     assert registry._package_folder("ash") == root
+
+
+def test_a_run_reuses_the_trainings_of_other_code_in_its_own_folder(boxes: str, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "run"
+    command = ["run", boxes, "--methods", "fake_good", "--seeds", "2", "--out", str(out)]
+    assert cli.main(command) == arguments.DONE
+    for cell in read_run(out).cells:  # as if other code had trained them
+        config = replace(cell.config, code="0" * 16)
+        result, earlier = read_result(cell.folder), replace(cell, config=config, folder=out / "cells" / config.key)
+        assert result is not None
+        cell.folder.rename(earlier.folder)
+        write_config(earlier)
+        write_result(earlier.folder, replace(result, config=config))
+    write_json(out / "run.json", read_json(out / "run.json") | {"cells": [path.name for path in cells_in(out)]})
+    capsys.readouterr()
+    assert cli.main([*command, "--reuse", str(out)]) == arguments.DONE
+    assert "boxes · fake_good: all 26 pictures are the same, 1 cell reused" in capsys.readouterr().err
+    assert len(cells_in(out)) == 4
+    report = (out / "report.md").read_text()
+    assert "1 of 2 trainings are those of an earlier run by other code" in report
+    assert f"| code of reused trainings | {'0' * 16} |" in report
+    assert "without --shard" in refused(capsys, *command, "--reuse", str(out), "--shard", "1/2")
+
+
+def cells_in(run: Path) -> list[Path]:
+    return sorted((run / "cells").iterdir())
 
 
 def test_two_runs_in_one_folder_do_not_meet(boxes: str, tmp_path: Path, capsys) -> None:
