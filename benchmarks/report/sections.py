@@ -358,14 +358,16 @@ def provenance(results: Sequence[CellResult], command: str) -> Section:
     facts.append(("code", _distinct(r.config.code for r in results)))
     for name in ("processor", "cores", "memory_gb", "system", "gpu", "python"):
         facts.append((name.replace("_gb", " [GB]"), _distinct(p.machine.get(name, "unknown") for p in provenances)))
-    for name in sorted({name for p in provenances for name in p.versions}):
+    trainers = [p.versions[TRAINED_BY] for p in provenances if TRAINED_BY in p.versions]
+    facts += [(TRAINED_BY, _distinct(trainers))] if trainers else []
+    for name in sorted({name for p in provenances for name in p.versions} - {TRAINED_BY}):
         facts.append((name, _distinct(p.versions.get(name, "unknown") for p in provenances)))
     facts.append(("captures", _distinct(f"{r.config.scene} {r.config.size} {r.config.capture[:12]}" for r in results)))
     facts.append(("seeds", ", ".join(str(seed) for seed in sorted({r.config.seed for r in results}))))
     facts.append(("sum of all cells [min]", f"{sum(p.wall_s for p in provenances) / 60:.1f}"))
     facts += [("command", command)] if command else []
-    reused = sum(TRAINED_BY in p.versions for p in provenances)
-    note = PROVENANCE_NOTE + (f" {REUSED_NOTE.format(reused=reused, cells=len(results))}" if reused else "")
+    reused = [REUSED_NOTE.format(reused=len(trainers), cells=len(results))] if trainers else []
+    note = " ".join((PROVENANCE_NOTE, *reused))
     return Section(title="Provenance", blocks=(_facts("fact", facts), Text(text=note, note=True)))
 
 
