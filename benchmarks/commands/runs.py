@@ -70,7 +70,7 @@ class RunCommand:
     # AlexNet's, of torchvision; default: torch's cache, or those that set-up installed
     lpips_weights: LpipsWeights = None
     retry_failed: bool = False  # run cells again that failed before
-    # a run by other code: each row of it is kept where one training by today's code makes the same pictures
+    # another run, whose cells are taken; of other code where today's makes the same pictures for one of each row
     reuse: Repeated[tuple[Path, ...]] = ()
     dry_run: bool = False  # print cells, hours and gigabytes, and do nothing
     list: bool = False  # print the suites as TOML, or only SUITE: a copy is a start for your own

@@ -1,9 +1,9 @@
-"""Reuses cells of earlier runs, trained by other code, where the change of code does not reach them.
+"""Reuses cells of other runs: those of the same code, and those that a change of code does not reach.
 
-Trainings are deterministic: code that computes the same gives the same pictures, bit for bit. Of every row and scene
-one cell is run by today's code. If its training and its pictures are those of the earlier run, the row's other cells on
-that scene are copied from there. They keep their times, commit and machine; `TRAINED_BY` among their versions names the
-code that trained them.
+Trainings are deterministic: code that computes the same gives the same pictures, bit for bit. Where the code is
+another, one cell of every row and scene is run by today's. If its training and its pictures are those of the other run,
+the row's other cells on that scene are copied from there. They keep their times, commit and machine; `TRAINED_BY` among
+their versions names the code that trained them.
 """
 
 import shutil
@@ -19,10 +19,20 @@ TRAINED_BY = "code of reused trainings"  # a version in the provenance of a reus
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Pair:
-    """A cell and its counterpart in the earlier run, which differ in nothing but the code."""
+    """A cell and its counterpart in another run, which differ in nothing but perhaps the code."""
 
     cell: Cell
     earlier: Cell
+
+    @property
+    def is_of_other_code(self) -> bool:
+        """Whether the other run was trained by other code."""
+        return self.earlier.config.code != self.cell.config.code
+
+    @property
+    def is_missing(self) -> bool:
+        """Whether the cell has no result yet."""
+        return result_of(self.cell) is None
 
 
 def reuse(
@@ -32,40 +42,46 @@ def reuse(
     *,
     say: Callable[[str], None],
 ) -> None:
-    """Copy what earlier runs have of the cells, row by row, once `run` has made one of them and it is the same.
+    """Copy what other runs have of the cells: of other code row by row, once `run` has made one and it is the same.
 
     A row that would have to be trained as a whole to find out is left alone.
 
     Raises:
         InputError: a result of either is damaged.
     """
-    rows = _rows(cells, earlier)
-    decisive = {row: pair for row, pairs in rows.items() if (pair := _decisive(pairs)) is not None}
+    pairs = _pairs(cells, earlier)
+    if same := [pair for pair in pairs if not pair.is_of_other_code and pair.is_missing]:
+        for pair in same:
+            _copy(pair)
+        say(f"{_count(same)} of the same code reused")
+    rows: dict[tuple[str, str], list[Pair]] = {}
+    for pair in pairs:
+        if pair.is_of_other_code:
+            rows.setdefault((pair.cell.config.place, pair.cell.config.method), []).append(pair)
+    decisive = {row: each for row, of_row in rows.items() if (each := _decisive(of_row)) is not None}
     run([pair.cell for pair in decisive.values()])
     for row, pair in decisive.items():
-        one, two = result_of(pair.cell), result_of(pair.earlier)
-        if one is None or two is None:  # interrupted
+        here, there = result_of(pair.cell), result_of(pair.earlier)
+        if here is None or there is None:  # interrupted
             continue
-        difference = training_difference(one, two)
-        if difference:
+        if difference := training_difference(here, there):
             say(f"{' · '.join(row)}: trained anew, {difference}")
-            continue
-        waiting = [each for each in rows[row] if result_of(each.cell) is None]
-        for each in waiting:
-            _copy(each)
-        count = f"{len(waiting)} cell{'' if len(waiting) == 1 else 's'}"
-        say(f"{' · '.join(row)}: all {len(two.views)} pictures are the same, {count} reused")
+        else:
+            missing = [each for each in rows[row] if each.is_missing]
+            for each in missing:
+                _copy(each)
+            say(f"{' · '.join(row)}: all {len(here.views)} pictures are the same, {_count(missing)} reused")
 
 
-def _rows(cells: Sequence[Cell], earlier: Iterable[Cell]) -> dict[tuple[str, str], list[Pair]]:
-    """By place and method what both have of each row."""
+def _count(pairs: Sequence[Pair]) -> str:
+    return f"{len(pairs)} cell{'' if len(pairs) == 1 else 's'}"
+
+
+def _pairs(cells: Sequence[Cell], earlier: Iterable[Cell]) -> list[Pair]:
+    """The cells of which another run has a result."""
     there = {_without_code(cell.config): cell for cell in earlier if _is_finished(cell)}
-    rows: dict[tuple[str, str], list[Pair]] = {}
-    for cell in cells:
-        counterpart = there.get(_without_code(cell.config))
-        if counterpart is not None and counterpart.config.code != cell.config.code:
-            rows.setdefault((cell.config.place, cell.config.method), []).append(Pair(cell=cell, earlier=counterpart))
-    return rows
+    counterparts = [(cell, there.get(_without_code(cell.config))) for cell in cells]
+    return [Pair(cell=cell, earlier=counterpart) for cell, counterpart in counterparts if counterpart is not None]
 
 
 def _is_finished(cell: Cell) -> bool:
@@ -82,7 +98,7 @@ def _decisive(pairs: Sequence[Pair]) -> Pair | None:
 
     None where nothing could be reused.
     """
-    missing = [pair for pair in pairs if result_of(pair.cell) is None]
+    missing = [pair for pair in pairs if pair.is_missing]
     trained = [pair for pair in pairs if _trained_here(result_of(pair.cell))]
     return (*trained, *missing)[0] if len(trained[:1]) + len(missing) > 1 else None
 
@@ -105,10 +121,12 @@ def training_difference(one: CellResult, two: CellResult) -> str:
 
 
 def _copy(pair: Pair) -> None:
-    """Copy the earlier cell as the result of this one."""
+    """Copy the cell of the other run as the result of this one."""
     result, target = result_of(pair.earlier), pair.cell.folder
     assert result is not None and result.provenance is not None, "only finished cells are paired"
-    versions = {TRAINED_BY: pair.earlier.config.code} | result.provenance.versions
+    versions = result.provenance.versions
+    if pair.is_of_other_code:
+        versions = {TRAINED_BY: pair.earlier.config.code} | versions
     provenance = replace(result.provenance, versions=versions)
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".reuse-") as made:

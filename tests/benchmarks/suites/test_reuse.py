@@ -108,6 +108,17 @@ def test_what_today_trained_already_decides_and_what_was_reused_does_not(tmp_pat
     assert again.trained == [], "a reused cell alone shows nothing"
 
 
+def test_cells_of_the_same_code_are_copied_at_once(tmp_path: Path) -> None:
+    earlier = finished(tmp_path / "table", ("ash",))
+    run = [cell_of(tmp_path / "new", method, subject, "1") for method in ("ash", "tava") for subject in range(PEOPLE)]
+    trainer = Trainer()
+    assert len(reused(run, earlier, trainer)) == PEOPLE and trainer.trained == []
+    assert trainer.said == ["3 cells of the same code reused"]
+    copied = read_result(run[0].folder)
+    assert copied == result(earlier[0]), "nothing else trained it"
+    assert reused(run, earlier, trainer) and len(trainer.said) == 1, "nothing is left to copy"
+
+
 def test_other_captures_and_failures_are_not_taken(tmp_path: Path) -> None:
     earlier = finished(tmp_path / "old", ("ash",))
     write_result(earlier[1].folder, replace(result(earlier[1]), status="crashed"))
