@@ -14,7 +14,6 @@ import pandas as pd
 from jinja2 import Environment, StrictUndefined
 
 from ash.files import InputError, write_atomic
-from benchmarks.analysis.paper import order_agreement, paper_tables
 from benchmarks.analysis.results import Quantity, compare, foreground, read_csv, samples_of, summarise
 from benchmarks.analysis.statistics import Comparison
 from benchmarks.analysis.style import style_of
@@ -67,20 +66,6 @@ class Numbers:
         if test is None or not samples_of(of_scene, quantity).keys() >= {a, b}:
             raise InputError(f"{self.folder / report}: expected rows {a} and {b} on {scene}")
         return _with_interval(test, metric)
-
-    def tau(self, report: str, scene: str, beside: str) -> str:
-        """Kendall's tau with its interval between the order of our rows and the paper's in its first table of a scene.
-
-        `beside`: its numbers, such as "view_psnr".
-        """
-        spec = next(spec for spec in paper_tables() if spec.scene == scene)
-        column = next(column for column in spec.columns if column.beside == beside)
-        given = {row.method: row.given[beside] for group in spec.rows for row in group}
-        quantity = Quantity(column.split, column.region, column.metric)
-        order = order_agreement(self._of_scene(report, scene), given, quantity)
-        if order is None:
-            raise InputError(f"{self.folder / report}: expected three rows of the paper's first table on {scene}")
-        return order.tau_text
 
     def scores(self, report: str, scene: str) -> str:
         """A table in Markdown: PSNR and LPIPS on all held-out splits, milliseconds and training seconds."""
