@@ -1,9 +1,9 @@
 """Reuses cells of other runs: those of the same code, and those that a change of code does not reach.
 
 Trainings are deterministic: code that computes the same gives the same pictures, bit for bit. Where the code is
-another, one cell of every row and scene is run by today's. If its training and its pictures are those of the other run,
-the row's other cells on that scene are copied from there. They keep their times, commit and machine; `TRAINED_BY` among
-their versions names the code that trained them.
+another, one cell of every row and scene is run by today's. If its last loss and its pictures are those of the other
+run, the row's other cells on that scene are copied from there. They keep their times, commit and machine; `TRAINED_BY`
+among their versions names the code that trained them.
 """
 
 import shutil
@@ -108,13 +108,15 @@ def _trained_here(result: CellResult | None) -> bool:
 
 
 def training_difference(one: CellResult, two: CellResult) -> str:
-    """Why two trainings of one cell are not the same: how they ended, a loss, a picture; empty where they are."""
+    """Why two trainings of one cell are not the same: how they ended, a loss, a picture; empty where they are.
+
+    Of their logs the last lines are compared, for a training that was interrupted has more lines.
+    """
     if not one.status == two.status == "done":
         return f"for it is {one.status} and was {two.status}"
-    courses = [[(point.loss, point.psnr) for point in result.curve] for result in (one, two)]
-    if courses[0] != courses[1]:
-        index = next((i for i, (a, b) in enumerate(zip(*courses, strict=False)) if a != b), min(map(len, courses)))
-        return f"for line {index + 1} of its training log differs"
+    last = [[(point.loss, point.psnr) for point in result.curve[-1:]] for result in (one, two)]
+    if last[0] != last[1]:
+        return "for the last line of its training log differs"
     pictures = [[(v.split, v.camera, v.frame, v.prediction) for v in result.views] for result in (one, two)]
     differ = sum(a != b for a, b in zip(*pictures, strict=False)) + abs(len(one.views) - len(two.views))
     return f"for {differ} of {len(one.views)} pictures differ" if differ else ""

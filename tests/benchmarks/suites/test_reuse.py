@@ -29,11 +29,12 @@ def cell_of(folder: Path, method: str, subject: int, code: str) -> Cell:
     return Cell(config=config, folder=folder / config.key, capture_folder=folder)
 
 
-def result(cell: Cell, *, picture: str = "p", loss: float = 0.5) -> CellResult:
+def result(cell: Cell, *, picture: str = "p", loss: float = 0.5, interrupted: bool = False) -> CellResult:
     config = cell.config
     view = ViewScore(split="novel_view", camera="cam0", frame=0, prediction=f"{picture}{config.subject}", scores={})
     provenance = Provenance(commit=f"commit of {config.code}", machine={}, versions={"torch": "2"}, wall_s=60.0)
-    curve = (CurvePoint(seconds=float(config.code), loss=loss, psnr=20.0),)
+    first = CurvePoint(seconds=0.5, loss=0.75, psnr=10.0)
+    curve = (first,) * (1 + interrupted) + (CurvePoint(seconds=float(config.code), loss=loss, psnr=20.0),)
     return CellResult(config=config, status="done", views=(view,), curve=curve, provenance=provenance)
 
 
@@ -88,7 +89,7 @@ def test_an_equal_picture_of_another_training_is_no_proof(tmp_path: Path) -> Non
     run = [cell_of(tmp_path / "new", "ash", subject, "2") for subject in range(PEOPLE)]
     trainer = Trainer(ash={"loss": 0.25})
     assert reused(run, earlier, trainer) == []
-    assert trainer.said == ["loose · ash: trained anew, for line 1 of its training log differs"]
+    assert trainer.said == ["loose · ash: trained anew, for the last line of its training log differs"]
 
 
 def test_what_today_trained_already_decides_and_what_was_reused_does_not(tmp_path: Path) -> None:
@@ -106,6 +107,12 @@ def test_what_today_trained_already_decides_and_what_was_reused_does_not(tmp_pat
     assert first.trained == ["loose · ash · seed 0"]
     assert reused(run[1:], earlier, again) == ["loose · subject 1 · ash · seed 0"], "left as it was"
     assert again.trained == [], "a reused cell alone shows nothing"
+
+
+def test_an_interrupted_training_has_more_lines_and_is_the_same(tmp_path: Path) -> None:
+    earlier = finished(tmp_path / "old", ("ash",))
+    run = [cell_of(tmp_path / "new", "ash", subject, "2") for subject in range(PEOPLE)]
+    assert len(reused(run, earlier, Trainer(ash={"interrupted": True}))) == PEOPLE - 1
 
 
 def test_cells_of_the_same_code_are_copied_at_once(tmp_path: Path) -> None:
