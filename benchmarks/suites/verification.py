@@ -114,7 +114,7 @@ def _check(cell: Cell, result: CellResult, folder: Path | None, intact: set[Path
     if wrong:
         (place, value), count = wrong[0], f"{len(wrong)} of {len(scores)} scores differ"
         pictures = "none" if place not in values else f"{values[place]:.6g}"
-        return "differs", f"{count}, the first: {' '.join(place)} is scores as {value:.6g}, pictures have {pictures}"
+        return "differs", f"{count}, the first: {' '.join(place)} is reported as {value:.6g}, pictures have {pictures}"
     without = "" if weights_file() else "; LPIPS is not checked, for its weights are not installed"
     how = "equal" if same else "within what counts as no change (the same scene, rendered elsewhere)"
     text = f"{len(views)} pictures scored again on {folder}, {len(scores)} scores are {how}{without}"

@@ -123,9 +123,9 @@ def _fail(result: dict) -> None:
     ("edit", "message"),
     [
         (_repaint, "is not the one that it names"),
-        (change_json("result.json", _improve), "scores differ, the first: train_view foreground psnr is told as"),
+        (change_json("result.json", _improve), "scores differ, the first: train_view foreground psnr is reported as"),
         (change_json("result.json", lambda result: result["views"][0]["scores"].update({"full/psnr": 99})), "differ"),
-        (change_json("result.json", _add), "is told as 1000"),
+        (change_json("result.json", _add), "is reported as 1000"),
         (change_json("result.json", _leave_out), "scores are left out, the first: "),
         (change_json("result.json", lambda result: result["views"][0].update(scores={})), "scores are left out"),
         (change_json("result.json", lambda result: result["views"].reverse()), "are not the 26 views"),
