@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections import Counter
@@ -113,6 +114,17 @@ def _set_aside(cell: Cell) -> None:
     aside = cell.folder.with_name(f"{cell.folder.name}.damaged")
     shutil.rmtree(aside, ignore_errors=True)
     cell.folder.rename(aside)
+
+
+@contextlib.contextmanager
+def copied_folder(source: Path, target: Path) -> Iterator[Path]:
+    """A copy of a cell's folder, to be changed: at the end it takes the place of `target`, or nothing does."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".copy-") as made:
+        whole = Path(shutil.copytree(source, Path(made) / target.name))
+        yield whole
+        shutil.rmtree(target, ignore_errors=True)
+        whole.rename(target)
 
 
 def shard_of(cells: Sequence[AnyCell], shard: str) -> tuple[AnyCell, ...]:

@@ -1,12 +1,11 @@
 """Puts the shards of a run together, from one machine or many."""
 
-import shutil
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 from ash.files import InputError, read_json, write_json
 from benchmarks.cell.schema import read_result, result_of
+from benchmarks.suites.engine import copied_folder
 from benchmarks.suites.runs import RUN_FILE, read_run
 
 
@@ -41,9 +40,6 @@ def merge_runs(shards: Sequence[Path], out: Path) -> None:
     for key, folder in finished.items():
         target = out / "cells" / key
         if not (target / "result.json").exists():
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=target.parent, prefix=".merge-") as made:
-                whole = Path(shutil.copytree(folder, Path(made) / key))
-                shutil.rmtree(target, ignore_errors=True)
-                whole.rename(target)
+            with copied_folder(folder, target):
+                pass
     write_json(out / RUN_FILE, description)

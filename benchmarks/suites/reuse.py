@@ -6,13 +6,11 @@ run, the row's other cells on that scene are copied from there. They keep their 
 among their versions names the code that trained them.
 """
 
-import shutil
-import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from benchmarks.cell.schema import Cell, CellConfig, CellResult, result_of, write_config, write_result
+from benchmarks.suites.engine import copied_folder
 
 TRAINED_BY = "code of reused trainings"  # a version in the provenance of a reused cell
 
@@ -23,6 +21,7 @@ class Pair:
 
     cell: Cell
     earlier: Cell
+    result: CellResult  # of the other run
 
     @property
     def is_of_other_code(self) -> bool:
@@ -59,18 +58,19 @@ def reuse(
         if pair.is_of_other_code:
             rows.setdefault((pair.cell.config.place, pair.cell.config.method), []).append(pair)
     decisive = {row: each for row, of_row in rows.items() if (each := _decisive(of_row)) is not None}
-    run([pair.cell for pair in decisive.values()])
+    if decisive:
+        run([pair.cell for pair in decisive.values()])
     for row, pair in decisive.items():
-        here, there = result_of(pair.cell), result_of(pair.earlier)
-        if here is None or there is None:  # interrupted
+        result = result_of(pair.cell)
+        if result is None:  # interrupted
             continue
-        if difference := training_difference(here, there):
+        if difference := training_difference(result, pair.result):
             say(f"{' · '.join(row)}: trained anew, {difference}")
         else:
             missing = [each for each in rows[row] if each.is_missing]
             for each in missing:
                 _copy(each)
-            say(f"{' · '.join(row)}: all {len(here.views)} pictures are the same, {_count(missing)} reused")
+            say(f"{' · '.join(row)}: all {len(result.views)} pictures are the same, {_count(missing)} reused")
 
 
 def _count(pairs: Sequence[Pair]) -> str:
@@ -79,14 +79,13 @@ def _count(pairs: Sequence[Pair]) -> str:
 
 def _pairs(cells: Sequence[Cell], earlier: Iterable[Cell]) -> list[Pair]:
     """The cells of which another run has a result."""
-    there = {_without_code(cell.config): cell for cell in earlier if _is_finished(cell)}
-    counterparts = [(cell, there.get(_without_code(cell.config))) for cell in cells]
-    return [Pair(cell=cell, earlier=counterpart) for cell, counterpart in counterparts if counterpart is not None]
-
-
-def _is_finished(cell: Cell) -> bool:
-    result = result_of(cell)
-    return result is not None and result.status == "done" and result.provenance is not None
+    finished = {}
+    for cell in earlier:
+        result = result_of(cell)
+        if result is not None and result.status == "done" and result.provenance is not None:
+            finished[_without_code(cell.config)] = (cell, result)
+    places = [(cell, _without_code(cell.config)) for cell in cells]
+    return [Pair(cell=c, earlier=finished[k][0], result=finished[k][1]) for c, k in places if k in finished]
 
 
 def _without_code(config: CellConfig) -> str:
@@ -124,16 +123,13 @@ def training_difference(one: CellResult, two: CellResult) -> str:
 
 def _copy(pair: Pair) -> None:
     """Copy the cell of the other run as the result of this one."""
-    result, target = result_of(pair.earlier), pair.cell.folder
-    assert result is not None and result.provenance is not None, "only finished cells are paired"
-    versions = result.provenance.versions
+    provenance = pair.result.provenance
+    assert provenance is not None, "only cells with one are paired"
+    versions = provenance.versions
     if pair.is_of_other_code:
         versions = {TRAINED_BY: pair.earlier.config.code} | versions
-    provenance = replace(result.provenance, versions=versions)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".reuse-") as made:
-        whole = Path(shutil.copytree(pair.earlier.folder, Path(made) / target.name))
-        write_config(replace(pair.cell, folder=whole))
-        write_result(whole, replace(result, config=pair.cell.config, provenance=provenance))
-        shutil.rmtree(target, ignore_errors=True)
-        whole.rename(target)
+    with copied_folder(pair.earlier.folder, pair.cell.folder) as folder:
+        write_config(replace(pair.cell, folder=folder))
+        write_result(
+            folder, replace(pair.result, config=pair.cell.config, provenance=replace(provenance, versions=versions))
+        )

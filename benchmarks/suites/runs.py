@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -106,13 +107,14 @@ def run_suite(suite: Suite, options: RunOptions) -> Run:
         earlier = [cell for folder in options.reuse for cell in read_run(folder).cells]  # perhaps of this very folder
         run = prepared(suite, options)
         if earlier:
-            reuse(run.cells, earlier, lambda cells: run_missing(cells, suite, options), say=_say)
+            reuse(
+                run.cells,
+                earlier,
+                lambda cells: run_missing(cells, suite, options),
+                say=partial(print, file=sys.stderr),
+            )
         run_missing(shard_of(run.cells, options.shard) if options.shard else run.cells, suite, options)
     return run
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)
 
 
 def require_utf8(folder: Path) -> None:
