@@ -42,6 +42,7 @@ RANKED_SPLITS = ("novel_view", "novel_pose")
 MOTION_SPLITS = ("near_pose", "novel_pose", "far_pose")  # nearest to the training motion first
 HELD_OUT_SPLITS = ("novel_view", *MOTION_SPLITS)
 FRAME_MS = Quantity("speed", "", "frame_ms")
+ONE_CORE = "one core"  # of the CPU, where times compare with those of other rows
 
 
 def foreground(split: str = "novel_view", metric: str = "psnr") -> Quantity:
@@ -169,6 +170,10 @@ def load_outcomes(results: Sequence[CellResult]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=names)
 
 
+def _place(device: str) -> str:
+    return ONE_CORE if device in ("", "cpu") else device
+
+
 def _cell(result: CellResult) -> dict[str, Any]:
     config = result.config
     return {"scene": config.scene, "method": config.method, "capture": config.capture, "seed": config.seed}
@@ -225,6 +230,8 @@ class RunTables:
         self.images, self.outcomes = load_images(plain), load_outcomes(plain)
         self.curves, self.snapshots = load_curves(plain), load_snapshots(plain)
         self.brought = frozenset(result.config.method for result in results if result.brought is not None)
+        self._drawn_on = {result.config.method: result.drawn_on for result in results}
+        self._trained_on = {result.config.method: result.config.device for result in results}
         self.scenes = tuple(self.rows["scene"].unique())
 
     @cached_property
@@ -251,6 +258,20 @@ class RunTables:
         """Methods on a scene: the user's first, then ours in the order of the suite."""
         names = sorted(map(str, self.of(scene)["method"].unique()), key=is_ours)
         return tuple(name for name in names if oracles or not is_oracle(name))
+
+    def drawn_on(self, method: str) -> str:
+        """Where its frames were timed: one core, or a device such as `cuda`."""
+        return _place(self._drawn_on[method])
+
+    def trained_on(self, method: str) -> str:
+        """Where it trained: one core, or a device such as `cuda`."""
+        return _place(self._trained_on[method])
+
+    def drawn_alike(self, methods: Iterable[str]) -> tuple[str, ...]:
+        """Those whose frame times compare: of one core, or where there are none, of the first one's device."""
+        places = {method: self.drawn_on(method) for method in methods}
+        place = ONE_CORE if ONE_CORE in places.values() else next(iter(places.values()), "")
+        return tuple(method for method in places if places[method] == place)
 
     def get(self, scene: str, method: str, quantity: Quantity) -> Any:
         """The row of `summary`, or None where no cell has the quantity."""

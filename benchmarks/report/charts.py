@@ -28,6 +28,7 @@ def speed(
     series: Sequence[Series],
     *,
     notes: dict[str, list[str]],
+    timed_on: str,
 ) -> Panels:
     """Accuracy against speed: a panel per `panel` of `points`; all share both axes.
 
@@ -44,7 +45,7 @@ def speed(
     at = {
         "x": alt.X(
             "ms:Q",
-            title="ms per frame, one core",
+            title=f"ms per frame, {timed_on}",
             scale=alt.Scale(type="log", domain=x, nice=False),
             axis=alt.Axis(values=_log_ticks(x), format="~s"),
         ),

@@ -20,7 +20,8 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
     """Foreground PSNR against milliseconds per frame, for novel views and novel poses."""
     methods = [m for m in tables.methods(scene) if m not in PLANTED and tables.whole(scene, m)]
     styles = vega.series_of(methods)
-    frames = tables.values(scene, FRAME_MS, methods)
+    alike = tables.drawn_alike(methods)
+    frames = tables.values(scene, FRAME_MS, alike)
     points, front, links = [], [], []
     notes: dict[str, list[str]] = {}
     for split in RANKED_SPLITS:
@@ -45,6 +46,7 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
         subtitles += [
             f"{styles[m].title} {span.mean:.1f} dB, below the chart" for m, span in spans.items() if m not in shown
         ]
+        subtitles += [f"{styles[m].title}: timed on {tables.drawn_on(m)}, not shown" for m in styles if m not in alike]
         notes[panel] = subtitles
     if not points:
         return None
@@ -60,7 +62,12 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
         caption += f" Whiskers: 95 % interval over {over}{apart}; one that reaches the edge is cut."
         caption += " Ringed: the smallest sufficient method."
     panels = charts.speed(
-        pd.DataFrame(points).astype({"low": float, "high": float}), front_table, link_table, series, notes=notes
+        pd.DataFrame(points).astype({"low": float, "high": float}),
+        front_table,
+        link_table,
+        series,
+        notes=notes,
+        timed_on=tables.drawn_on(alike[0]),
     )
     return Figure(name=scene, title="Accuracy against speed", caption=caption, panels=panels, series=series)
 

@@ -211,11 +211,12 @@ def _weakest(tables: RunTables, scene: str) -> str:
 
 def _training(tables: RunTables, scene: str) -> str:
     rows = tables.of(scene)
-    seconds = rows[(rows["metric"] == "train_s") & (rows["status"] == "done")]["value"]
-    if not len(seconds):
-        return ""
-    span = dict.fromkeys(f"{value:.0f}" for value in (seconds.min(), seconds.max()))
-    return f"A training took {' to '.join(span)} s on one core."
+    rows = rows[(rows["metric"] == "train_s") & (rows["status"] == "done")]
+    spans = []
+    for place, seconds in rows.groupby(rows["method"].map(tables.trained_on), sort=False)["value"]:
+        span = dict.fromkeys(f"{value:.0f}" for value in (seconds.min(), seconds.max()))
+        spans.append(f"{' to '.join(span)} s on {place}")
+    return f"A training took {listed(spans)}." if spans else ""
 
 
 def _missing(tables: RunTables, scene: str) -> str:
@@ -252,8 +253,11 @@ def _cost(tables: RunTables, scene: str) -> str:
     if len(frame_ms) > FEW_METHODS:
         ends = [pick(frame_ms, key=lambda name: frame_ms[name]) for pick in (min, max)]
         frame_ms = {name: ms for name, ms in frame_ms.items() if name in (*chain(*PAIRS), *ends)}
-    parts = [f"{style_of(method).title} {ms:.0f} ms" for method, ms in frame_ms.items()]
-    return f"A frame takes {listed(parts)} on one core." if parts else ""
+    by_place: dict[str, list[str]] = {}
+    for method, ms in frame_ms.items():
+        by_place.setdefault(tables.drawn_on(method), []).append(f"{style_of(method).title} {ms:.0f} ms")
+    parts = [f"{listed(times)} on {place}" for place, times in by_place.items()]
+    return f"A frame takes {'; '.join(parts)}." if parts else ""
 
 
 def _template(tables: RunTables, scene: str) -> str:

@@ -1,5 +1,6 @@
 """The flag `--device`: what is refused, what `auto` takes, and that the device is part of a cell's identity."""
 
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -8,20 +9,23 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import fakes
-from helpers.cells import cell, config
+from helpers.cells import cell, config, people
 from helpers.commands import refused, refused_last
 
 import ash.devices
 from ash.devices import cuda_error
 from ash.files import InputError
 from benchmarks import cli
+from benchmarks.analysis.pareto import candidates
+from benchmarks.analysis.results import RunTables
 from benchmarks.cell.run import placed_on
-from benchmarks.cell.schema import CellConfig, read_cell, read_result, write_config, write_result
+from benchmarks.cell.schema import CellConfig, Summary, read_cell, read_result, write_config, write_result
 from benchmarks.commands import doctor
 from benchmarks.commands.devices import chosen_device, on_device
 from benchmarks.play.avatars import open_avatars
 from benchmarks.provenance import gpu_name
-from benchmarks.report.sentences import doubts
+from benchmarks.report.figures import speed_figure
+from benchmarks.report.sentences import doubts, facts
 from benchmarks.suites.files import find_suite
 
 without_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
@@ -117,3 +121,26 @@ def test_every_avatar_that_is_played_goes_to_the_device(tube_run: Path) -> None:
 def test_a_report_says_which_milliseconds_are_those_of_a_gpu() -> None:
     results = [replace(cell(method, 30.0), drawn_on=device) for method, device in (("ash", "cuda"), ("ddc", "cpu"))]
     assert doubts(results) == ("ASH: drawn on cuda, so that milliseconds are not those of one core.",)
+
+
+def test_times_of_a_gpu_are_not_called_those_of_one_core_and_do_not_compete_with_them() -> None:
+    results = people({"ash": (25.0, 27.0), "ddc": (24.0, 25.0), "wo_mot": (23.0, 25.0)})
+    trained = Summary(split="speed", region="", metric="train_s", value=90.0)
+    results = [replace(result, summary=(*result.summary, trained)) for result in results]
+    on_gpu = {"changes": {"device": "cuda"}}
+    mixed = [
+        replace(each, config=replace(each.config, **on_gpu), drawn_on="cuda") if each.config.method == "ash" else each
+        for each in results
+    ]
+    tables = RunTables(mixed)
+    lines = dict(facts(tables, "loose"))
+    assert lines["Time"] == (
+        "A training took 90 s on cuda, 90 s on one core."
+        " A frame takes ASH 12 ms on cuda; DDC 12 ms, w/o mot. 12 ms on one core."
+    )
+    assert [each.name for each in candidates(tables, "loose", "novel_view")] == ["ddc", "wo_mot"]
+    figure = speed_figure(tables, "loose")
+    assert figure is not None
+    assert all("ASH: timed on cuda, not shown" in json.dumps(panel.to_dict()) for panel in figure.panels)
+    alone = speed_figure(RunTables([each for each in mixed if each.drawn_on == "cuda"]), "loose")
+    assert alone is not None and "ms per frame, cuda" in json.dumps(alone.panels[0].to_dict())
