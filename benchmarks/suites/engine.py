@@ -85,20 +85,12 @@ class CellPlan:
 
 
 def plan_cells(cells: Sequence[Cell], *, retry_failed: bool = False) -> CellPlan:
-    """Split cells into those with a result and those without.
-
-    A cell whose result is damaged is run again; what lay in its folder is kept beside it, as KEY.damaged.
-    """
+    """Split cells into those with a result and those without; damaged ones are set aside and run again."""
     todo: list[Cell] = []
     done: list[Cell] = []
-    reasons = []
+    reasons = set_damaged_aside(cells)
     for cell in cells:
-        try:
-            result = result_of(cell)
-        except InputError as error:
-            reasons.append(f"{cell.config.title}: run again, its result is damaged ({error})")
-            _set_aside(cell)
-            result = None
+        result = result_of(cell)
         if result is not None and retry_failed and result.status != "done":
             shutil.rmtree(cell.folder)
             reasons.append(f"{cell.config.title}: {result.status} before, tried again")
@@ -107,6 +99,18 @@ def plan_cells(cells: Sequence[Cell], *, retry_failed: bool = False) -> CellPlan
             reasons.append(f"{cell.config.title}: {reason}")
         (todo if result is None else done).append(cell)
     return CellPlan(todo=tuple(todo), done=tuple(done), reasons=tuple(reasons))
+
+
+def set_damaged_aside(cells: Sequence[Cell]) -> list[str]:
+    """Move the folder of each cell whose result is damaged beside it, as KEY.damaged; a line for each that was."""
+    reasons = []
+    for cell in cells:
+        try:
+            result_of(cell)
+        except InputError as error:
+            reasons.append(f"{cell.config.title}: run again, its result is damaged ({error})")
+            _set_aside(cell)
+    return reasons
 
 
 def _set_aside(cell: Cell) -> None:

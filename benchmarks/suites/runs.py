@@ -34,6 +34,7 @@ from benchmarks.suites.engine import (
     read_shard,
     require_executor,
     run_cells,
+    set_damaged_aside,
     shard_of,
 )
 from benchmarks.suites.progress import Progress
@@ -107,12 +108,10 @@ def run_suite(suite: Suite, options: RunOptions) -> Run:
         earlier = [cell for folder in options.reuse for cell in read_run(folder).cells]  # perhaps of this very folder
         run = prepared(suite, options)
         if earlier:
-            reuse(
-                run.cells,
-                earlier,
-                lambda cells: run_missing(cells, suite, options),
-                say=partial(print, file=sys.stderr),
-            )
+            say = partial(print, file=sys.stderr)
+            for reason in set_damaged_aside(run.cells):
+                say(reason)
+            reuse(run.cells, earlier, lambda cells: run_missing(cells, suite, options), say=say)
         run_missing(shard_of(run.cells, options.shard) if options.shard else run.cells, suite, options)
     return run
 

@@ -25,6 +25,7 @@ from benchmarks.commands import arguments
 from benchmarks.commands.captures import SynthCommand
 from benchmarks.suites import captures
 from benchmarks.suites.files import find_suite
+from benchmarks.suites.reuse import TRAINED_BY
 from benchmarks.suites.runs import read_run
 from benchmarks.suites.suites import CaptureSpec
 
@@ -275,6 +276,11 @@ def test_a_run_reuses_the_trainings_of_other_code_in_its_own_folder(boxes: str, 
     report = (out / "report.md").read_text()
     assert "1 of 2 trainings are those of an earlier run by other code" in report
     assert f"| code of reused trainings | {'0' * 16} |" in report
+    damaged = next(each for each in read_run(out).cells if TRAINED_BY in read_result(each.folder).provenance.versions)
+    (damaged.folder / "result.json").write_text("")
+    assert cli.main([*command, "--reuse", str(earlier.folder)]) == arguments.DONE
+    assert "run again, its result is damaged" in capsys.readouterr().err
+    assert read_result(damaged.folder).status == "done"
     assert "without --shard" in refused(capsys, *command, "--reuse", str(out), "--shard", "1/2")
 
 
