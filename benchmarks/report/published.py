@@ -24,7 +24,7 @@ from benchmarks.report.tables import ON_WHOLE_FRAMES, cost_columns, head_of, qua
 
 FOLDER = Path(__file__).parents[2] / "reports"
 NAME = "README.md"
-FACT = re.compile(r"^\| (code|commit|command|processor|cores) \| (.*?) \|$", re.MULTILINE)  # of a report's provenance
+FACT = re.compile(r"^\| (code|commit|command|processor|cores|gpu) \| (.*?) \|$", re.MULTILINE)  # of a report's provenance
 
 
 def read_me(folder: Path = FOLDER) -> str:
@@ -89,7 +89,8 @@ class Numbers:
         commits = ", ".join(sorted(facts["commit"].split(", ")))
         rows = self._rows(report)
         hours = rows[(rows["metric"] == "train_cpu_s") & (rows["split"] == "speed")]["value"].sum() / 3600
-        machine = f"{facts['cores']} cores of {facts['processor']}"
+        gpus = [gpu for gpu in facts["gpu"].split(", ") if gpu != "none"]
+        machine = ", ".join([f"{facts['cores']} cores of {facts['processor']}", *gpus])
         return f"`{facts['command']}`, code of {commits}, {machine}, {hours:.1f} core-hours of training"
 
     def cells(self, report: str) -> int:
