@@ -39,7 +39,7 @@ class Sufficient:
 def candidates(tables: RunTables, scene: str, split: str) -> tuple[Candidate, ...]:
     """The methods that compete on a scene, on the captures that all of them were run on; timed on one device."""
     samples = samples_of(tables.of(scene), foreground(split))
-    frames = tables.values(scene, FRAME_MS, tables.drawn_alike(tables.methods(scene, oracles=False)))
+    frames = tables.values(scene, FRAME_MS, tables.alike(tables.methods(scene, oracles=False), tables.drawn_on))
     names = [name for name in frames if samples.get(name) and tables.whole(scene, name)]
     shared = set.intersection(*(set(samples[name]) for name in names)) if names else set()
     if not shared:

@@ -6,7 +6,7 @@ ended) has a table each.
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -267,9 +267,12 @@ class RunTables:
         """Where it trained: one core, or a device such as `cuda`."""
         return _place(self._trained_on[method])
 
-    def drawn_alike(self, methods: Iterable[str]) -> tuple[str, ...]:
-        """Those whose frame times compare: of one core, or where there are none, of the first one's device."""
-        places = {method: self.drawn_on(method) for method in methods}
+    def alike(self, methods: Iterable[str], place_of: Callable[[str], str]) -> tuple[str, ...]:
+        """Those whose times compare: of one core, or where there are none, of the first one's device.
+
+        `place_of`: `drawn_on` for frames, `trained_on` for trainings.
+        """
+        places = {method: place_of(method) for method in methods}
         place = ONE_CORE if ONE_CORE in places.values() else next(iter(places.values()), "")
         return tuple(method for method in places if places[method] == place)
 

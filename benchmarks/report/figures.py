@@ -20,7 +20,7 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
     """Foreground PSNR against milliseconds per frame, for novel views and novel poses."""
     methods = [m for m in tables.methods(scene) if m not in PLANTED and tables.whole(scene, m)]
     styles = vega.series_of(methods)
-    alike = tables.drawn_alike(methods)
+    alike = tables.alike(methods, tables.drawn_on)
     frames = tables.values(scene, FRAME_MS, alike)
     points, front, links = [], [], []
     notes: dict[str, list[str]] = {}
@@ -50,7 +50,7 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
         notes[panel] = subtitles
     if not points:
         return None
-    series = tuple(styles.values())
+    series = tuple(styles[method] for method in alike)
     front_table = pd.DataFrame(front, columns=["panel", "ms", "psnr"])
     link_table = pd.DataFrame(links, columns=["panel", "link", "ms", "psnr"])
     caption = "Accuracy against speed: up and left is better. Grey staircase: the methods that none beats in both."

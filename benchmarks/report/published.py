@@ -24,7 +24,7 @@ from benchmarks.report.tables import ON_WHOLE_FRAMES, cost_columns, head_of, qua
 
 FOLDER = Path(__file__).parents[2] / "reports"
 NAME = "README.md"
-FACT = re.compile(r"^\| (code|commit|command|processor|cores|gpu) \| (.*?) \|$", re.MULTILINE)  # of a report's provenance
+FACT = re.compile(r"^\| (code|commit|command|processor|cores|gpu) \| (.*?) \|$", re.MULTILINE)  # of its provenance
 
 
 def read_me(folder: Path = FOLDER) -> str:

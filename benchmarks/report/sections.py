@@ -235,7 +235,8 @@ def training_cost(tables: RunTables) -> list[Section]:
     for name, title, x, x_title, table in charts_asked:
         if len(table):
             words = table["split"].map(lambda split: SPLIT_NAMES[split].words)
-            sentences = curves.crossings(table) if name == "budget" else curves.frames_needed(table)
+            alike = table[table["method"].isin(tables.alike(table["method"], tables.trained_on))]
+            sentences = curves.crossings(alike) if name == "budget" else curves.frames_needed(table)
             snapshots = "Snapshots: the learning rate falls only at the end of a training." if name == "budget" else ""
             figure = line_figure(
                 table.assign(panel=table["scene"] + ", " + words, scale=table["scene"]),

@@ -19,12 +19,13 @@ from benchmarks import cli
 from benchmarks.analysis.pareto import candidates
 from benchmarks.analysis.results import RunTables
 from benchmarks.cell.run import placed_on
-from benchmarks.cell.schema import CellConfig, Summary, read_cell, read_result, write_config, write_result
+from benchmarks.cell.schema import CellConfig, Snapshot, Summary, read_cell, read_result, write_config, write_result
 from benchmarks.commands import doctor
 from benchmarks.commands.devices import chosen_device, on_device
 from benchmarks.play.avatars import open_avatars
 from benchmarks.provenance import gpu_name
 from benchmarks.report.figures import speed_figure
+from benchmarks.report.sections import training_cost
 from benchmarks.report.sentences import doubts, facts
 from benchmarks.suites.files import find_suite
 
@@ -124,9 +125,16 @@ def test_a_report_says_which_milliseconds_are_those_of_a_gpu() -> None:
 
 
 def test_times_of_a_gpu_are_not_called_those_of_one_core_and_do_not_compete_with_them() -> None:
-    results = people({"ash": (25.0, 27.0), "ddc": (24.0, 25.0), "wo_mot": (23.0, 25.0)})
+    results = people({"ash": (25.0, 27.0), "ddc": (24.0, 26.0), "wo_mot": (23.0, 25.0)})
     trained = Summary(split="speed", region="", metric="train_s", value=90.0)
-    results = [replace(result, summary=(*result.summary, trained)) for result in results]
+    early = {
+        m: Snapshot(seconds=30, split="novel_view", psnr=level)
+        for m, level in (("wo_mot", 20.0), ("ddc", 21.0), ("ash", 22.0))
+    }
+    results = [
+        replace(result, summary=(*result.summary, trained), snapshots=(early[result.config.method],))
+        for result in results
+    ]
     on_gpu = {"changes": {"device": "cuda"}}
     mixed = [
         replace(each, config=replace(each.config, **on_gpu), drawn_on="cuda") if each.config.method == "ash" else each
@@ -139,6 +147,11 @@ def test_times_of_a_gpu_are_not_called_those_of_one_core_and_do_not_compete_with
         " A frame takes ASH 12 ms on cuda; DDC 12 ms, w/o mot. 12 ms on one core."
     )
     assert [each.name for each in candidates(tables, "loose", "novel_view")] == ["ddc", "wo_mot"]
+    assert tables.alike(("ash", "ddc", "wo_mot"), tables.trained_on) == ("ddc", "wo_mot")
+    assert tables.alike(("ash",), tables.trained_on) == ("ash",)
+    (section,) = training_cost(tables)
+    leads = section.blocks[1].items
+    assert leads and all("DDC is ahead of w/o mot." in lead for lead in leads)
     figure = speed_figure(tables, "loose")
     assert figure is not None
     assert all("ASH: timed on cuda, not shown" in json.dumps(panel.to_dict()) for panel in figure.panels)
