@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.analysis.results import FRAME_MS, RunTables, foreground, samples_of
+from benchmarks.analysis.results import FRAME_MS, RunTables, alike, foreground, samples_of
 from benchmarks.analysis.statistics import Comparison, Samples, compare_samples
 
 SUFFICIENT_DB = 0.5  # a loss that viewers of images do not notice
@@ -39,7 +39,7 @@ class Sufficient:
 def candidates(tables: RunTables, scene: str, split: str) -> tuple[Candidate, ...]:
     """The methods that compete on a scene, on the captures that all of them were run on; timed on one device."""
     samples = samples_of(tables.of(scene), foreground(split))
-    frames = tables.values(scene, FRAME_MS, tables.alike(tables.methods(scene, oracles=False), tables.drawn_on))
+    frames = tables.values(scene, FRAME_MS, alike(tables.methods(scene, oracles=False), tables.drawn_on))
     names = [name for name in frames if samples.get(name) and tables.whole(scene, name)]
     shared = set.intersection(*(set(samples[name]) for name in names)) if names else set()
     if not shared:

@@ -6,7 +6,7 @@ ended) has a table each.
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -171,7 +171,17 @@ def load_outcomes(results: Sequence[CellResult]) -> pd.DataFrame:
 
 
 def _place(device: str) -> str:
-    return ONE_CORE if device in ("", "cpu") else device
+    return ONE_CORE if device == "cpu" else device
+
+
+def alike(methods: Iterable[str], places: Mapping[str, str]) -> tuple[str, ...]:
+    """The methods whose times compare: those of one core, or where there are none, of the first one's device.
+
+    `places`: `RunTables.drawn_on` for frames, `trained_on` for trainings.
+    """
+    there = {method: places[method] for method in methods}
+    place = ONE_CORE if ONE_CORE in there.values() else next(iter(there.values()), "")
+    return tuple(method for method in there if there[method] == place)
 
 
 def _cell(result: CellResult) -> dict[str, Any]:
@@ -230,8 +240,9 @@ class RunTables:
         self.images, self.outcomes = load_images(plain), load_outcomes(plain)
         self.curves, self.snapshots = load_curves(plain), load_snapshots(plain)
         self.brought = frozenset(result.config.method for result in results if result.brought is not None)
-        self._drawn_on = {result.config.method: result.drawn_on for result in results}
-        self._trained_on = {result.config.method: result.config.device for result in results}
+        # Where a method trained and where its frames were timed: `ONE_CORE`, or a device such as `cuda`.
+        self.trained_on = {each.config.method: _place(each.config.device) for each in results}
+        self.drawn_on = {each.config.method: _place(each.drawn_on or each.config.device) for each in results}
         self.scenes = tuple(self.rows["scene"].unique())
 
     @cached_property
@@ -258,23 +269,6 @@ class RunTables:
         """Methods on a scene: the user's first, then ours in the order of the suite."""
         names = sorted(map(str, self.of(scene)["method"].unique()), key=is_ours)
         return tuple(name for name in names if oracles or not is_oracle(name))
-
-    def drawn_on(self, method: str) -> str:
-        """Where its frames were timed: one core, or a device such as `cuda`."""
-        return _place(self._drawn_on[method])
-
-    def trained_on(self, method: str) -> str:
-        """Where it trained: one core, or a device such as `cuda`."""
-        return _place(self._trained_on[method])
-
-    def alike(self, methods: Iterable[str], place_of: Callable[[str], str]) -> tuple[str, ...]:
-        """Those whose times compare: of one core, or where there are none, of the first one's device.
-
-        `place_of`: `drawn_on` for frames, `trained_on` for trainings.
-        """
-        places = {method: place_of(method) for method in methods}
-        place = ONE_CORE if ONE_CORE in places.values() else next(iter(places.values()), "")
-        return tuple(method for method in places if places[method] == place)
 
     def get(self, scene: str, method: str, quantity: Quantity) -> Any:
         """The row of `summary`, or None where no cell has the quantity."""

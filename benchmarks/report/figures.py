@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import pandas as pd
 
 from benchmarks.analysis import curves, pareto
-from benchmarks.analysis.results import FRAME_MS, RANKED_SPLITS, RunTables, foreground, samples_of
+from benchmarks.analysis.results import FRAME_MS, RANKED_SPLITS, RunTables, alike, foreground, samples_of
 from benchmarks.analysis.statistics import intervals
 from benchmarks.analysis.style import EXACT, SPLIT_NAMES
 from benchmarks.cell.registry import WRONG_BY_MM
@@ -20,15 +20,15 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
     """Foreground PSNR against milliseconds per frame, for novel views and novel poses."""
     methods = [m for m in tables.methods(scene) if m not in PLANTED and tables.whole(scene, m)]
     styles = vega.series_of(methods)
-    alike = tables.alike(methods, tables.drawn_on)
-    frames = tables.values(scene, FRAME_MS, alike)
+    timed = alike(methods, tables.drawn_on)
+    frames = tables.values(scene, FRAME_MS, timed)
     points, front, links = [], [], []
     notes: dict[str, list[str]] = {}
     for split in RANKED_SPLITS:
         panel = SPLIT_NAMES[split].words.capitalize()
         samples = samples_of(tables.of(scene), foreground(split))
-        timed = {m: samples[m] for m in frames if m in samples}  # Brought pictures have no time.
-        spans = intervals(timed) if timed else {}
+        drawn = {m: samples[m] for m in frames if m in samples}  # Brought pictures have no time.
+        spans = intervals(drawn) if drawn else {}
         floor = max((span.mean for span in spans.values()), default=0.0) - SPAN_DB
         shown = {m: span for m, span in spans.items() if span.mean >= floor}
         competing = pareto.candidates(tables, scene, split)
@@ -46,11 +46,11 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
         subtitles += [
             f"{styles[m].title} {span.mean:.1f} dB, below the chart" for m, span in spans.items() if m not in shown
         ]
-        subtitles += [f"{styles[m].title}: timed on {tables.drawn_on(m)}, not shown" for m in styles if m not in alike]
+        subtitles += [f"{styles[m].title}: timed on {tables.drawn_on[m]}, not shown" for m in styles if m not in timed]
         notes[panel] = subtitles
     if not points:
         return None
-    series = tuple(styles[method] for method in alike)
+    series = tuple(styles[method] for method in timed)
     front_table = pd.DataFrame(front, columns=["panel", "ms", "psnr"])
     link_table = pd.DataFrame(links, columns=["panel", "link", "ms", "psnr"])
     caption = "Accuracy against speed: up and left is better. Grey staircase: the methods that none beats in both."
@@ -67,7 +67,7 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
         link_table,
         series,
         notes=notes,
-        timed_on=tables.drawn_on(alike[0]),
+        timed_on=tables.drawn_on[timed[0]],
     )
     return Figure(name=scene, title="Accuracy against speed", caption=caption, panels=panels, series=series)
 

@@ -7,7 +7,7 @@ import pandas as pd
 
 from benchmarks.analysis import ablation_matrix, curves, paper, pareto, stability, template_error
 from benchmarks.analysis.differences import differences
-from benchmarks.analysis.results import RANKED_SPLITS, Quantity, RunTables
+from benchmarks.analysis.results import RANKED_SPLITS, Quantity, RunTables, alike
 from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell.metrics import METRICS, PROTOCOL
 from benchmarks.cell.schema import CellResult
@@ -235,8 +235,8 @@ def training_cost(tables: RunTables) -> list[Section]:
     for name, title, x, x_title, table in charts_asked:
         if len(table):
             words = table["split"].map(lambda split: SPLIT_NAMES[split].words)
-            alike = table[table["method"].isin(tables.alike(table["method"], tables.trained_on))]
-            sentences = curves.crossings(alike) if name == "budget" else curves.frames_needed(table)
+            compared = table[table["method"].isin(alike(table["method"], tables.trained_on))]
+            sentences = curves.crossings(compared) if name == "budget" else curves.frames_needed(table)
             snapshots = "Snapshots: the learning rate falls only at the end of a training." if name == "budget" else ""
             figure = line_figure(
                 table.assign(panel=table["scene"] + ", " + words, scale=table["scene"]),

@@ -255,7 +255,7 @@ def _cost(tables: RunTables, scene: str) -> str:
         frame_ms = {name: ms for name, ms in frame_ms.items() if name in (*chain(*PAIRS), *ends)}
     by_place: dict[str, list[str]] = {}
     for method, ms in frame_ms.items():
-        by_place.setdefault(tables.drawn_on(method), []).append(f"{style_of(method).title} {ms:.0f} ms")
+        by_place.setdefault(tables.drawn_on[method], []).append(f"{style_of(method).title} {ms:.0f} ms")
     parts = [f"{listed(times)} on {place}" for place, times in by_place.items()]
     return f"A frame takes {'; '.join(parts)}." if parts else ""
 

@@ -88,9 +88,10 @@ def plan_cells(cells: Sequence[Cell], *, retry_failed: bool = False) -> CellPlan
     """Split cells into those with a result and those without; damaged ones are set aside and run again."""
     todo: list[Cell] = []
     done: list[Cell] = []
-    reasons = set_damaged_aside(cells)
+    reasons = []
     for cell in cells:
-        result = result_of(cell)
+        result, damage = sound_result(cell)
+        reasons += [damage] if damage else []
         if result is not None and retry_failed and result.status != "done":
             shutil.rmtree(cell.folder)
             reasons.append(f"{cell.config.title}: {result.status} before, tried again")
@@ -101,16 +102,13 @@ def plan_cells(cells: Sequence[Cell], *, retry_failed: bool = False) -> CellPlan
     return CellPlan(todo=tuple(todo), done=tuple(done), reasons=tuple(reasons))
 
 
-def set_damaged_aside(cells: Sequence[Cell]) -> list[str]:
-    """Move the folder of each cell whose result is damaged beside it, as KEY.damaged; a line for each that was."""
-    reasons = []
-    for cell in cells:
-        try:
-            result_of(cell)
-        except InputError as error:
-            reasons.append(f"{cell.config.title}: run again, its result is damaged ({error})")
-            _set_aside(cell)
-    return reasons
+def sound_result(cell: Cell) -> tuple[CellResult | None, str]:
+    """The result of a cell, if there is one. A damaged one is moved beside it, as KEY.damaged, and a line says so."""
+    try:
+        return result_of(cell), ""
+    except InputError as error:
+        _set_aside(cell)
+        return None, f"{cell.config.title}: run again, its result is damaged ({error})"
 
 
 def _set_aside(cell: Cell) -> None:

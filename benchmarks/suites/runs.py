@@ -34,8 +34,8 @@ from benchmarks.suites.engine import (
     read_shard,
     require_executor,
     run_cells,
-    set_damaged_aside,
     shard_of,
+    sound_result,
 )
 from benchmarks.suites.progress import Progress
 from benchmarks.suites.reuse import reuse
@@ -109,8 +109,8 @@ def run_suite(suite: Suite, options: RunOptions) -> Run:
         run = prepared(suite, options)
         if earlier:
             say = partial(print, file=sys.stderr)
-            for reason in set_damaged_aside(run.cells):
-                say(reason)
+            for damage in filter(None, (sound_result(cell)[1] for cell in run.cells)):
+                say(damage)
             reuse(run.cells, earlier, lambda cells: run_missing(cells, suite, options), say=say)
         run_missing(shard_of(run.cells, options.shard) if options.shard else run.cells, suite, options)
     return run

@@ -17,7 +17,7 @@ from ash.devices import cuda_error
 from ash.files import InputError
 from benchmarks import cli
 from benchmarks.analysis.pareto import candidates
-from benchmarks.analysis.results import RunTables
+from benchmarks.analysis.results import RunTables, alike
 from benchmarks.cell.run import placed_on
 from benchmarks.cell.schema import CellConfig, Snapshot, Summary, read_cell, read_result, write_config, write_result
 from benchmarks.commands import doctor
@@ -147,8 +147,8 @@ def test_times_of_a_gpu_are_not_called_those_of_one_core_and_do_not_compete_with
         " A frame takes ASH 12 ms on cuda; DDC 12 ms, w/o mot. 12 ms on one core."
     )
     assert [each.name for each in candidates(tables, "loose", "novel_view")] == ["ddc", "wo_mot"]
-    assert tables.alike(("ash", "ddc", "wo_mot"), tables.trained_on) == ("ddc", "wo_mot")
-    assert tables.alike(("ash",), tables.trained_on) == ("ash",)
+    assert alike(("ash", "ddc", "wo_mot"), tables.trained_on) == ("ddc", "wo_mot")
+    assert alike(("ash",), tables.trained_on) == ("ash",)
     (section,) = training_cost(tables)
     leads = section.blocks[1].items
     assert leads and all("DDC is ahead of w/o mot." in lead for lead in leads)
