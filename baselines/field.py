@@ -14,7 +14,7 @@ Formulas are those of the publications. The docstrings of the rows, at the end, 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
@@ -219,10 +219,8 @@ def march(field: Field, rays: Rays, grid: ShellGrid, *, samples: int, jitter: Te
     of the field; the samples are constants.
     """
     stretches = stretches_in(grid, rays)
-    order = torch.arange(samples, device=rays.origins.device)
-    lengths = stretches.place(
-        ((order + 0.5) if jitter is None else (order + jitter)).expand(len(rays.origins), -1) / samples
-    )
+    share = (torch.arange(samples, device=rays.origins.device) + (0.5 if jitter is None else jitter)) / samples
+    lengths = stretches.place(share.expand(len(rays.origins), -1))
     density, rgb = _ask(field, rays, lengths)
     left = _light_left(density, stretches.length / samples)
     weights = left[:, :-1] - left[:, 1:]
@@ -245,9 +243,7 @@ def march_naive(field: Field, rays: Rays, grid: ShellGrid, *, steps: int) -> Mar
     return Marched(rgb=rgb, alpha=alpha, length=seen[:, 0] / alpha.clamp(min=1e-6))
 
 
-def _ask(
-    field: Field, rays: Rays, lengths: Float[Tensor, "r n"]
-) -> tuple[Float[Tensor, "r n"], Float[Tensor, "r n 3"]]:
+def _ask(field: Field, rays: Rays, lengths: Float[Tensor, "r n"]) -> tuple[Tensor, Tensor]:
     count, samples = lengths.shape
     directions = rays.directions[:, None].expand(-1, samples, -1).reshape(-1, 3)
     density, rgb = field(rays.at(lengths).reshape(-1, 3), directions)
@@ -300,9 +296,15 @@ class Mlp(nn.Sequential):
         for layer in (*linear, last):
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu" if layer is not last else "linear")
             nn.init.zeros_(layer.bias)
-        with torch.no_grad():
-            last.weight.mul_(head)
-        super().__init__(*(part for layer in linear for part in (layer, nn.ReLU())), last)
+        last.weight.data.mul_(head)
+        super().__init__(*(part for layer in linear for part in (layer, nn.ReLU(inplace=True))), last)
+
+    def beside(self, inputs: Float[Tensor, "m i"], shared: Float[Tensor, " s"]) -> Float[Tensor, "m o"]:
+        """`forward` of `inputs`, each with the same numbers after it."""
+        first, *others = list[Any](self)
+        inner, outer = first.weight.split([inputs.shape[1], len(shared)], 1)
+        hidden = nn.functional.linear(inputs, inner, torch.addmv(first.bias, outer, shared))
+        return reduce(lambda before, part: part(before), others, hidden)
 
 
 class Radiance(nn.Module):
@@ -345,8 +347,11 @@ class Bones:
             turns, shifts = matrices[self.joints].unflatten(1, (3, 4)).split([3, 1], 2)
             starts, ends = ((turns @ side[..., None] + shifts)[..., 0] for side in (starts, ends))
         along = ends - starts
-        share = ((points[:, None] - starts) * along).sum(-1) / along.square().sum(-1).clamp(min=1e-9)
-        return (points[:, None] - starts - share.clamp(0, 1)[..., None] * along).norm(dim=-1)
+        length = along.square().sum(-1).clamp(min=1e-9)
+        reach = torch.addmm(-(starts * along).sum(-1), points, along.T)  # (point - start) . along
+        away = torch.addmm(starts.square().sum(-1), points, starts.T, alpha=-2) + points.square().sum(-1, keepdim=True)
+        share = (reach / length).clamp(0, 1)
+        return (away - share * (2 * reach - share * length)).clamp(min=0).sqrt()
 
 
 def bones_of(skeleton: Skeleton) -> Bones:
@@ -397,7 +402,7 @@ class ForwardField(MovingModule):
         """Forward skinning, and the offset that is part of it."""
         code = encode(rest, SKIN_OCTAVES)
         blended = (self.skin(code).softmax(-1) @ frame.matrices).unflatten(1, (3, 4))
-        offset = self.offset(torch.cat([code, frame.code.expand(len(rest), -1)], 1))
+        offset = self.offset.beside(code, frame.code)
         turned = (blended[..., :3] * rest[:, None]).sum(-1)
         return turned + blended[..., 3] + 0.1 * offset, offset
 
@@ -423,9 +428,8 @@ class ForwardField(MovingModule):
             scale = (step * gained).sum(-1, keepdim=True)
             row = (step[:, None] @ turn)[:, 0] / torch.where(scale.abs() < 1e-12, torch.inf, scale)
             turn = turn + (step - gained)[..., None] * row[:, None]
-            rest, inverse, error = (
-                whole.index_copy(0, rows, part) for whole, part in ((rest, at), (inverse, turn), (error, after))
-            )
+            changed = (rest, at), (inverse, turn), (error, after)
+            rest, inverse, error = (whole.index_copy(0, rows, part) for whole, part in changed)
         are_roots = (error.norm(dim=-1) <= ROOT_M) | (config.root_steps == 0)
         return rest.reshape(-1, count, 3), are_roots.reshape(-1, count)
 
@@ -439,14 +443,13 @@ class ForwardField(MovingModule):
         """
         with torch.enable_grad():
             at = root.detach().requires_grad_()
-            posed = self.pose(at, frame)[0]
-            rows = [torch.autograd.grad(posed[:, axis].sum(), at, retain_graph=axis < 2)[0] for axis in range(3)]
+            posed, offset = self.pose(at, frame)
+            rows = [torch.autograd.grad(posed[:, axis].sum(), at, retain_graph=True)[0] for axis in range(3)]
         a, b, c = torch.stack(rows, 1).unbind(2)  # columns of J
         inverse = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], 1)
         determinant = (a * inverse[:, 0]).sum(-1)
         solid = determinant > SOLID
         inverse = inverse / torch.where(solid, determinant, torch.inf)[:, None, None]
-        posed, offset = self.pose(root.detach(), frame)
         return root.detach() - (inverse @ (posed - points)[..., None])[..., 0], offset, solid
 
     def at(self, frame: JointFrame) -> Field:
@@ -460,11 +463,11 @@ class ForwardField(MovingModule):
             root = roots.gather(1, best[..., None].expand(-1, -1, 3))[:, 0]
             valid = are_roots.gather(1, best)[:, 0]
             if self.config.root_steps:
-                root, self.offsets, solid = self.implicit(root, points, frame)
+                root, offsets, solid = self.implicit(root, points, frame)
+                self.offsets = offsets if torch.is_grad_enabled() else offsets.detach()
                 valid = valid & solid
             density, rgb = self.radiance(root, root.new_zeros(len(root), 0))
-            code = torch.cat([encode(root, SKIN_OCTAVES), frame.code.expand(len(root), -1)], 1)
-            return density * valid, rgb * (2 * self.shade(code).sigmoid())
+            return density * valid, rgb * (2 * self.shade.beside(encode(root, SKIN_OCTAVES), frame.code).sigmoid())
 
         return ask
 
@@ -587,8 +590,7 @@ class FieldModel(MovingModule):
             bottleneck = GLOBAL_FEATURES if model.global_features else 0
             sizes: dict[str, Any] = {"width": model.width, "levels": model.levels, "norm": model.norm}
             self.network = UNet(6 * model.window, field.channels, bottleneck_features=bottleneck, **sizes)
-        side = model.decoded_texels if self.has_texture else 1
-        start = torch.zeros(field.channels if self.has_texture else 0, side, side)
+        start = torch.zeros(field.channels, *2 * [model.decoded_texels]) if self.has_texture else torch.zeros(0, 1, 1)
         self.base_texture = nn.Parameter(start, requires_grad=model.base and self.has_texture)
 
     @torch.no_grad()
@@ -749,9 +751,7 @@ class FieldAvatar(TrainedAvatar):
             chosen.append(tried[first])
             targets.append(batch.targets[view].reshape(size, 3)[pixels[first]])
             behinds.append(behind.expand(camera.height, camera.width, 3).reshape(size, 3)[pixels[first]])
-        origins, directions = (
-            torch.cat([getattr(some, name) for some in chosen]) for name in ("origins", "directions")
-        )
+        origins, directions = torch.cat([r.origins for r in chosen]), torch.cat([r.directions for r in chosen])
         return Rays(origins=origins, directions=directions), torch.cat(targets), torch.cat(behinds)
 
     def _pull_loss(self, texture: Tensor, inputs: FieldInputs, batch: Batch, random: np.random.Generator) -> Tensor:
@@ -858,7 +858,7 @@ def _volume(name: str, preset: str) -> VolumeConfig:
 def _row(name: str) -> MethodFactory[FieldConfig]:
     def config(preset: str) -> FieldConfig:
         ash = named(preset)
-        training = replace(ash.training, warmup="none", warmup_steps=0, background="random", score_from=1000)
+        training = replace(ash.training, warmup="none", warmup_steps=0, background="random", score_from=3000)
         if preset in ("paper", "official"):
             training = replace(training, steps=300_000, learning_rate=5e-4 if name == "tava" else 2e-4)
         return FieldConfig(

@@ -29,6 +29,7 @@ from baselines.field import (
     FieldConfig,
     ForwardField,
     JointFrame,
+    Mlp,
     Rays,
     SurfaceLookup,
     build_shell_grid,
@@ -188,6 +189,31 @@ def newton(net: ForwardField, points: Tensor, frame: JointFrame, start: Tensor) 
     for _ in range(8):
         start = net.implicit(start, points, frame)[0].detach()
     return start
+
+
+def test_distances_to_bones_are_those_to_their_nearest_points() -> None:
+    net, frame = elbow()
+    points = torch.rand(50, 3, generator=torch.manual_seed(10)).double() * 2 - 0.5
+    along = net.bones.along(torch.linspace(0, 1, 2001).double()[None, :, None].expand(len(net.bones.joints), -1, -1))
+    joints = frame.matrices[net.bones.joints].unflatten(1, (3, 4))
+    posed = along @ joints[..., :3].transpose(1, 2) + joints[:, None, :, 3]
+    for found, lines in (
+        (net.bones.distances(points, None), along),
+        (net.bones.distances(points, frame.matrices), posed),
+    ):
+        expected = (points[:, None, None] - lines).norm(dim=-1).amin(2)
+        torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
+    single = replace(net.bones, starts=net.bones.starts.float(), ends=net.bones.ends.float())
+    torch.testing.assert_close(
+        single.distances(points.float(), None).double(), net.bones.distances(points, None), atol=1e-3, rtol=0
+    )
+
+
+def test_numbers_that_all_points_share_are_inputs_like_others() -> None:
+    torch.manual_seed(11)
+    net = Mlp(7, 2, width=8, layers=2)
+    inputs, shared = torch.randn(5, 4), torch.randn(3)
+    torch.testing.assert_close(net.beside(inputs, shared), net(torch.cat([inputs, shared.expand(5, -1)], 1)))
 
 
 def test_a_root_is_posed_to_where_it_was_asked_for() -> None:
