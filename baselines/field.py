@@ -243,10 +243,10 @@ def march_naive(field: Field, rays: Rays, grid: ShellGrid, *, steps: int) -> Mar
     return Marched(rgb=rgb, alpha=alpha, length=seen[:, 0] / alpha.clamp(min=1e-6))
 
 
-def _ask(field: Field, rays: Rays, lengths: Float[Tensor, "r n"]) -> tuple[Tensor, Tensor]:
-    count, samples = lengths.shape
+def _ask(field: Field, rays: Rays, at: Float[Tensor, "r n"]) -> tuple[Float[Tensor, "r n"], Float[Tensor, "r n 3"]]:
+    count, samples = at.shape
     directions = rays.directions[:, None].expand(-1, samples, -1).reshape(-1, 3)
-    density, rgb = field(rays.at(lengths).reshape(-1, 3), directions)
+    density, rgb = field(rays.at(at).reshape(-1, 3), directions)
     return density.reshape(count, samples), rgb.reshape(count, samples, 3)
 
 

@@ -14,7 +14,6 @@ import pandas as pd
 from jinja2 import Environment, StrictUndefined
 
 from ash.files import InputError, write_atomic
-from benchmarks.analysis.paper import order_agreement, paper_tables
 from benchmarks.analysis.results import Quantity, compare, foreground, read_csv, samples_of, summarise
 from benchmarks.analysis.statistics import Comparison
 from benchmarks.analysis.style import style_of
@@ -77,24 +76,6 @@ class Numbers:
             for method in methods
         ]
         return _markdown(["", *(": ".join(head_of(quantity)) for quantity in quantities)], cells)
-
-    def orders(self, report: str, label: str) -> str:
-        """Kendall's tau to the order of a paper's table, by the numbers that it gives, as a table in Markdown."""
-        spec = next(spec for spec in paper_tables() if spec.label == label)
-        of_scene, lines = self._of_scene(report, spec.scene), []
-        ran = set(of_scene["method"])
-        rows = {row.method if row.method in ran else row.instead: row.given for group in spec.rows for row in group}
-        for column in (column for column in spec.columns if column.beside):
-            given = {method: numbers[column.beside] for method, numbers in rows.items() if column.beside in numbers}
-            region = column.region or _quantity(column.split, column.metric).region
-            quantity = Quantity(column.split, region, column.metric)
-            found = order_agreement(of_scene, given, quantity)
-            if found is None:
-                raise InputError(f"{self.folder / report}: expected three rows of {label} that ran on the same people")
-            place = next(each for each in spec.columns if each.given == column.beside)
-            head = f"{place.group}: {place.title}"
-            lines.append([head, found.tau_text, str(found.rows), str(found.people), f"{found.chance:.0%}"])
-        return _markdown([spec.scene, "tau", "rows", "people", "by chance"], lines)
 
     def claims(self) -> str:
         """The claims that were judged, as a table in Markdown."""

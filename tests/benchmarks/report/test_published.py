@@ -46,20 +46,6 @@ def test_numbers_are_those_of_the_csv(numbers: Numbers) -> None:
     assert "| ASH | 27.00 | n/a |" in numbers.scores("mine", "loose")
 
 
-def test_the_order_of_rows_is_that_of_the_reports_page() -> None:
-    """Row w/o mot. stands for the paper's, which saw less footage."""
-    shown = Numbers(FOLDER).orders("table", "tab:components")
-    page = (FOLDER / "table" / "report.md").read_text().replace("\\[", "[").replace("\\]", "]")
-    assert len(shown.splitlines()) == 6
-    for line in shown.splitlines()[2:]:
-        assert line in page
-
-
-def test_an_order_needs_three_rows(numbers: Numbers) -> None:
-    with pytest.raises(InputError, match="expected three rows of tab:loose that ran on the same people"):
-        numbers.orders("mine", "tab:loose")
-
-
 def test_rows_of_two_reports_are_compared(numbers: Numbers) -> None:
     (numbers.folder / "other").mkdir()
     (numbers.folder / "other" / "results.csv").write_text(csv_of(load(people({"smpl": (23.0, 25.0, 27.0)}))))
