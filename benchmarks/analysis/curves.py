@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.analysis.results import HELD_OUT_SPLITS, foreground, samples_of
-from benchmarks.analysis.statistics import independent, intervals, mean_interval
+from benchmarks.analysis.statistics import intervals
 from benchmarks.analysis.style import SPLIT_NAMES, listed, style_of
 from benchmarks.suites.stress import FOOTAGE_FRAMES
 
@@ -38,6 +38,24 @@ def during_training(curves: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["method", "seconds", "psnr"])
 
 
+def on_equal_captures(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows (scene, method, capture, ...) in which all methods of a scene have the same captures.
+
+    Methods that lack some of a scene's captures stand, with all that have theirs, in a scene of its own, such as
+    "loose, 1 of 3 captures".
+    """
+    parts = [rows.head(0)]
+    for scene, here in rows.groupby("scene", sort=False):
+        total = here["capture"].nunique()
+        captures_of = here.groupby("method", sort=False)["capture"].agg(frozenset)
+        for captures in sorted(dict.fromkeys(captures_of), key=len, reverse=True):
+            methods = [method for method, own in captures_of.items() if captures <= own]
+            part = here[here["method"].isin(methods) & here["capture"].isin(captures)]
+            name = scene if len(captures) == total else f"{scene}, {len(captures)} of {total} captures"
+            parts.append(part.assign(scene=name))
+    return pd.concat(parts)
+
+
 def time_to_quality(snapshots: pd.DataFrame) -> pd.DataFrame:
     """Scene, split, method, seconds, psnr, low, high, at the seconds of all snapshots on the scene.
 
@@ -45,13 +63,14 @@ def time_to_quality(snapshots: pd.DataFrame) -> pd.DataFrame:
     """
     rows = []
     for (scene, split), here in snapshots.groupby(["scene", "split"], sort=False):
-        marks = np.unique(here["seconds"].round())
-        for method, runs in here.groupby("method", sort=False):
-            for mark in marks:
+        for mark in np.unique(here["seconds"].round()):
+            samples = {}
+            for method, runs in here.groupby("method", sort=False):
                 scores = runs.groupby(["capture", "seed"]).apply(_score_at, mark, include_groups=False)
                 if scores.notna().all():
-                    values = independent(scores.groupby("capture").agg(list).to_dict())
-                    rows.append((scene, split, method, mark, *mean_interval(values)))
+                    samples[str(method)] = scores.groupby("capture").agg(list).to_dict()
+            if samples:
+                rows += [(scene, split, method, mark, *each) for method, each in intervals(samples).items()]
     return _table(rows, "scene", "split", "method", "seconds")
 
 
@@ -103,9 +122,10 @@ def data_scaling(rows: pd.DataFrame) -> pd.DataFrame:
     for (scene, severity), here in rows[rows["scene"].isin(scenes)].groupby(["scene", "severity"], sort=False):
         counts = here[here["metric"] == "train_frames"].groupby("method")["value"].max()
         for split in HELD_OUT_SPLITS:
-            for method, samples in samples_of(here, foreground(split)).items():
+            samples = samples_of(here, foreground(split))
+            for method, interval in intervals(samples).items() if samples else ():
                 frames = int(counts.get(method, FOOTAGE_FRAMES - severity))
-                records.append((scene, split, method, frames, *mean_interval(independent(samples))))
+                records.append((scene, split, method, frames, *interval))
     table = _table(records, "scene", "split", "method", "frames")
     order = table["split"].map(HELD_OUT_SPLITS.index)
     return table.assign(order=order).sort_values(["scene", "order", "method", "frames"]).drop(columns="order")

@@ -74,7 +74,12 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
 
 def training_figure(tables: RunTables, scene: str) -> Figure | None:
     """Foreground PSNR of reserved training views over seconds of training, the mean over trainings of a method."""
-    table = curves.during_training(tables.curves[tables.curves["scene"] == scene])
+    alike_captures = curves.on_equal_captures(tables.curves[tables.curves["scene"] == scene])
+    panels = {
+        str(name): curves.during_training(rows).assign(panel=name)
+        for name, rows in alike_captures.groupby("scene", sort=False)
+    }
+    table = pd.concat(panels.values()) if panels else pd.DataFrame(columns=["method"])
     methods = [m for m in tables.methods(scene) if (table["method"] == m).sum() > 1]
     if not methods:
         return None
@@ -83,7 +88,7 @@ def training_figure(tables: RunTables, scene: str) -> Figure | None:
     if over := tables.unit(scene):
         caption += f" Means over {over}, from the last one's first score to the end of the first that ends."
     return line_figure(
-        table[table["method"].isin(methods)].assign(panel=title),
+        table[table["method"].isin(methods)],
         vega.series_of(methods),
         name=f"training_{scene}",
         title=title,
@@ -93,6 +98,7 @@ def training_figure(tables: RunTables, scene: str) -> Figure | None:
         y_title="PSNR of reserved views [dB]",
         size=(charts.WIDTH - 80, 260),
         log=True,
+        columns=1,
     )
 
 

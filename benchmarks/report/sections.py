@@ -21,6 +21,7 @@ from benchmarks.suites.reuse import TRAINED_BY
 from benchmarks.suites.stress import AXES
 
 WHISKERS = "Whiskers: 95 % interval over seeds, or over captures where there are several."
+APART = "The common effect of a capture is removed."
 LIMIT_DB = 2.0  # differences from which on a matrix has the deepest colour
 MANY_ROWS = 3  # from which on the smallest sufficient one is asked for
 MATRIX_NOTE = (
@@ -226,7 +227,8 @@ def template_errors(tables: RunTables) -> list[Section]:
 
 def training_cost(tables: RunTables) -> list[Section]:
     """Quality against training seconds and against training frames, where a suite made them."""
-    seconds, frames = curves.time_to_quality(tables.snapshots), curves.data_scaling(tables.all_rows)
+    seconds = curves.time_to_quality(curves.on_equal_captures(tables.snapshots))
+    frames = curves.data_scaling(tables.all_rows)
     charts_asked = (
         ("budget", "Accuracy against training seconds", "seconds", "seconds of training", seconds),
         ("footage", "Novel poses against the number of training frames", "frames", "training frames", frames),
@@ -236,13 +238,14 @@ def training_cost(tables: RunTables) -> list[Section]:
         if len(table):
             words = table["split"].map(lambda split: SPLIT_NAMES[split].words)
             compared = table[table["method"].isin(alike(table["method"], tables.trained_on))]
+            compared = compared[compared["scene"].isin(tables.scenes)]
             sentences = curves.crossings(compared) if name == "budget" else curves.frames_needed(table)
             snapshots = "Snapshots: the learning rate falls only at the end of a training." if name == "budget" else ""
             figure = line_figure(
                 table.assign(panel=table["scene"] + ", " + words, scale=table["scene"]),
                 name=name,
                 title=title,
-                caption=" ".join(filter(None, ("Foreground PSNR.", snapshots, WHISKERS))),
+                caption=" ".join(filter(None, ("Foreground PSNR.", snapshots, WHISKERS, APART))),
                 x=x,
                 x_title=x_title,
                 log=True,
@@ -253,7 +256,7 @@ def training_cost(tables: RunTables) -> list[Section]:
 
 def novelty(tables: RunTables) -> list[Section]:
     """Quality by how far a pose lies from the training poses, where novel poses are diverse enough for a curve."""
-    table = curves.novelty(tables.images)
+    table = curves.novelty(curves.on_equal_captures(tables.images))
     if not len(table):
         return []
     figure = line_figure(
@@ -262,8 +265,7 @@ def novelty(tables: RunTables) -> list[Section]:
         title="Quality against novelty",
         caption="Foreground PSNR by how far a pose lies from the nearest training pose: the mean over the joints of "
         "the angle between their rotations, the heading removed. At zero: novel views of training poses. The frames of "
-        f"near, new and far novel poses stand in bins of equal number, each at its mean. {WHISKERS} The common "
-        "effect of a capture is removed.",
+        f"near, new and far novel poses stand in bins of equal number, each at its mean. {WHISKERS} {APART}",
         x="novelty_deg",
         x_title="novelty of the pose [degrees]",
     )

@@ -19,6 +19,8 @@ from benchmarks.report.vega import Figure
 STATIC = {30: 23.0, 60: 24.0, 120: 24.0}
 LEARNED = {30: 22.0, 60: 23.5, 120: 25.0, 240: 26.0}
 
+OF_CAPTURES = (("loose", "ash", "abc"), ("loose", "ddc", "abc"), ("loose", "slow", "b"), ("tight", "ash", "d"))
+
 
 def trained(method: str, course: dict[int, float], *, seed: int = 0) -> CellResult:
     """A cell with snapshots of these scores; the last is its end."""
@@ -39,6 +41,37 @@ def test_a_training_curve_is_the_mean_over_people_while_all_of_them_train() -> N
     assert both["psnr"].tolist() == pytest.approx([23.0, 24.5, 26.5])
     alone = curves.during_training(first.assign(method="ddc", seed=1))
     assert alone["psnr"].tolist() == first["psnr"].tolist()
+
+
+def test_methods_that_lack_captures_stand_with_the_others_on_the_captures_that_they_have() -> None:
+    rows = pd.DataFrame(
+        [(scene, method, capture) for scene, method, captures in OF_CAPTURES for capture in captures],
+        columns=["scene", "method", "capture"],
+    )
+    found = curves.on_equal_captures(rows)
+    by_method = {key: "".join(part["capture"]) for key, part in found.groupby(["scene", "method"])}
+    assert by_method == {
+        ("loose", "ash"): "abc",
+        ("loose", "ddc"): "abc",
+        ("loose, 1 of 3 captures", "ash"): "b",
+        ("loose, 1 of 3 captures", "ddc"): "b",
+        ("loose, 1 of 3 captures", "slow"): "b",
+        ("tight", "ash"): "d",
+    }
+    assert curves.on_equal_captures(rows.head(0)).empty
+
+
+def test_intervals_over_captures_leave_out_what_a_capture_does_to_all_methods() -> None:
+    runs = [
+        replace(run, config=replace(run.config, capture=capture))
+        for capture, level in (("a", 0.0), ("b", 4.0), ("c", 9.0))
+        for method, gain in (("ash", 0.1 * level), ("wo_mot", 0.0))
+        for run in [trained(method, {s: p + level + gain for s, p in STATIC.items()})]
+    ]
+    table = curves.time_to_quality(load_snapshots(runs)).set_index(["method", "split", "seconds"])
+    halves = (table.high - table.psnr).loc[:, "novel_view", 60]
+    paired = 4.3026528 * np.std([0.0, 0.4, 0.9], ddof=1) / 3**0.5  # of the differences, t of 2 degrees
+    np.testing.assert_allclose(halves, paired / 2**0.5, rtol=1e-5)
 
 
 def test_methods_cross_where_their_scores_are_equal() -> None:
