@@ -55,6 +55,7 @@ class RunCommand:
     suite: Positional[str] = ""  # quick (the default), ci, table, ... or FILE.toml
     methods: Names = ()  # only these rows, or installed methods besides
     scenes: Names = ()  # only these rows, or other scenes
+    stresses: Names = ()  # of its perturbations of captures only these, at all severities
     capture: Repeated[tuple[Path, ...]] = ()  # in place of the scenes: a finished capture; may be repeated
     size: str | None = None  # of scenes: ci, factor, quick, long, table or paper
     preset: str | None = None  # budget of the methods
@@ -123,6 +124,7 @@ class RunCommand:
         return suite.narrowed(
             scenes=self._scenes(suite),
             methods=self.methods,
+            stresses=self.stresses,
             size=self.size,
             preset=self.preset,
             seeds=self.seeds,

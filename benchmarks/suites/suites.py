@@ -174,19 +174,31 @@ class Suite:
                     )
 
     def narrowed(
-        self, *, scenes: tuple[SceneSpec, ...] = (), methods: tuple[str, ...] = (), **others: object
+        self,
+        *,
+        scenes: tuple[SceneSpec, ...] = (),
+        methods: tuple[str, ...] = (),
+        stresses: tuple[str, ...] = (),
+        **others: object,
     ) -> "Suite":
         """The suite with other rows and values where they are given; a method that is no row of it becomes one.
 
-        Methods that are given run on every scene, also on one that has a choice of its own.
+        Methods that are given run on every scene, also on one that has a choice of its own. Of the suite's stresses
+        those of the given axes stay, at all their severities.
 
         Raises:
-            InputError: a method that is neither a row nor installed.
+            InputError: a method that is neither a row nor installed, or an axis that the suite has not.
         """
         rows = {row.name: row for row in self.methods}
         chosen = tuple(rows[name] if name in rows else MethodSpec(name=find_method(name).name) for name in methods)
         given: dict[str, object] = {name: value for name, value in others.items() if value is not None}
         given |= {"scenes": scenes} if scenes else {}
+        axes = tuple(dict.fromkeys(stress.axis for stress in self.stresses))
+        for axis in stresses:
+            if axis not in axes:
+                known = suggest(axis, axes) if axes else "expected none"
+                raise InputError(f"suite {self.name}: no stress {axis!r}, {known}")
+        given |= {"stresses": tuple(each for each in self.stresses if each.axis in stresses)} if stresses else {}
         if chosen:
             given |= {"methods": chosen, "scenes": tuple(replace(scene, methods=()) for scene in scenes or self.scenes)}
         return replace(self, **given)  # type: ignore[arg-type]

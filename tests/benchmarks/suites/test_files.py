@@ -225,6 +225,17 @@ def test_a_suite_is_narrowed_and_widened() -> None:
         suite.narrowed(methods=("nosuch",))
 
 
+def test_a_suite_is_narrowed_to_some_of_its_stresses() -> None:
+    suite = find_suite("stability")
+    some = suite.narrowed(stresses=("tracking", "cameras"))
+    assert {each.axis for each in suite.stresses} > {each.axis for each in some.stresses} == {"tracking", "cameras"}
+    assert len(some.captures) == 1 + 3 + 3 and len(suite.narrowed(stresses=()).captures) == len(suite.captures)
+    with pytest.raises(InputError, match="suite stability: no stress 'traking', did you mean tracking"):
+        suite.narrowed(stresses=("traking",))
+    with pytest.raises(InputError, match="suite quick: no stress 'tracking', expected none"):
+        find_suite("quick").narrowed(stresses=("tracking",))
+
+
 def test_names_of_variants_are_fit_for_files() -> None:
     assert varied_name("ash", (("model.texels", 128), ("training.warmup", "none"))) == "ash+texels=128+warmup=none"
     assert varied_name("tight", (("rig.distortion", (0.1, 0, 0, 0)),)) == "tight+distortion=0.1,0,0,0"
