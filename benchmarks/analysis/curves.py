@@ -5,14 +5,14 @@ pose from training.
 """
 
 from collections.abc import Iterator
-from itertools import combinations, pairwise
+from itertools import pairwise
 
 import numpy as np
 import pandas as pd
 
 from benchmarks.analysis.results import HELD_OUT_SPLITS, foreground, samples_of
 from benchmarks.analysis.statistics import intervals
-from benchmarks.analysis.style import SPLIT_NAMES, listed, style_of
+from benchmarks.analysis.style import REFERENCES, SPLIT_NAMES, listed, reference_of, style_of
 from benchmarks.suites.stress import FOOTAGE_FRAMES
 
 FOOTAGE_AXIS, STATIC = "footage", "wo_mot"
@@ -81,21 +81,30 @@ def _score_at(run: pd.DataFrame, seconds: float) -> float:
 
 
 def crossings(table: pd.DataFrame) -> list[str]:
-    """Sentences: from when on one method is ahead of another, or that it is throughout.
+    """Sentences on every method and the one that it is compared with: from when on one is ahead, or that it always is.
 
     Between two snapshots the difference is taken to change linearly in the logarithm of the seconds.
     """
     crossed, never = [], []
     for (scene, split), here in table.groupby(["scene", "split"], sort=False):
         wide = here.pivot(index="seconds", columns="method", values="psnr")
-        for first, second in combinations(dict.fromkeys(here["method"]), 2):
-            lead = (wide[first] - wide[second]).dropna()
+        methods = tuple(map(str, here["method"].unique()))
+        for method in methods:
+            reference = reference_of(method, methods)
+            if reference is None or method == REFERENCES[0]:  # Which is the other side of all its comparisons.
+                continue
+            lead = (wide[reference] - wide[method]).dropna()
             where = f"On {scene}, {SPLIT_NAMES[split].words}, "
-            for seconds, value in _sign_changes(lead):
-                crossed.append(f"{where}{_ahead(first, second, value)} from {seconds:.0f} s of training on.")
-            if len(lead) and ((lead > 0).all() or (lead < 0).all()):
+            changes = list(_sign_changes(lead))
+            if changes:
+                seconds, value = changes[-1]
+                before = " The lead had changed before." if changes[1:] else ""
+                crossed.append(
+                    f"{where}{_ahead(reference, method, value)} from {seconds:.0f} s of training on.{before}"
+                )
+            elif len(lead) and ((lead > 0).all() or (lead < 0).all()):
                 span = f"{abs(lead).min():.1f} to {abs(lead).max():.1f}"
-                never.append(f"{where}{_ahead(first, second, lead.iloc[0])} at every time, by {span} dB.")
+                never.append(f"{where}{_ahead(reference, method, lead.iloc[0])} at every time, by {span} dB.")
     return crossed + never
 
 

@@ -86,6 +86,23 @@ def test_methods_cross_where_their_scores_are_equal() -> None:
     above = {s: p + 1 for s, p in STATIC.items()}
     table = curves.time_to_quality(load_snapshots([trained("wo_mot", STATIC), trained("ash", above)]))
     assert curves.crossings(table)[0].endswith("ASH is ahead of w/o mot. at every time, by 1.0 to 1.0 dB.")
+    back = {30: 24.0, 60: 23.0, 120: 25.0}
+    (view, _) = curves.crossings(
+        curves.time_to_quality(load_snapshots([trained("wo_mot", STATIC), trained("ash", back)]))
+    )
+    assert "ASH is ahead of w/o mot. from 85 s" in view and view.endswith("The lead had changed before.")
+    four = [trained(name, STATIC) for name in ("ash", "ddc", "ash_plus", "ddc_plus")]
+    ranked = [
+        replace(run, snapshots=tuple(replace(s, psnr=s.psnr + k) for s in run.snapshots)) for k, run in enumerate(four)
+    ]
+    said = curves.crossings(
+        curves.time_to_quality(load_snapshots(ranked)).query("split == 'novel_view' and seconds < 120")
+    )
+    assert [each.split(", ")[2].removesuffix(" at every time") for each in said] == [
+        "DDC is ahead of ASH",
+        "ASH+ is ahead of ASH",
+        "DDC+ is ahead of ASH+",
+    ], "each pair, not all of them"
 
 
 def test_seeds_give_intervals_and_are_averaged_within_captures() -> None:
