@@ -27,6 +27,7 @@ COLUMNS = (
     *("subject", "capture"),
 )
 KEYS = ["scene", "method", "split", "region", "metric"]
+CaptureNames = Mapping[str, str] | None  # of captures' folders by the cell's key; by default those that suites give
 PLACE = re.compile(r"(?P<scene>\S+)(?: (?P<axis>\w+)=(?P<severity>\S+))?")  # `CellConfig.place`
 
 
@@ -50,11 +51,8 @@ def foreground(split: str = "novel_view", metric: str = "psnr") -> Quantity:
     return Quantity(split, "foreground", metric)
 
 
-def load(results: Sequence[CellResult], captures: Mapping[str, str] | None = None) -> pd.DataFrame:
-    """One row per number of every cell: `COLUMNS`, then `axis`, `severity` and `status` of the cell.
-
-    `captures`: the name of the capture's folder by the cell's key; by default the name that suites give it.
-    """
+def load(results: Sequence[CellResult], captures: CaptureNames = None) -> pd.DataFrame:
+    """One row per number of every cell: `COLUMNS`, then `axis`, `severity` and `status` of the cell."""
     rows = [
         {
             "scene": config.place,
@@ -68,7 +66,7 @@ def load(results: Sequence[CellResult], captures: Mapping[str, str] | None = Non
             "direction": METRICS[row.metric].direction,
             "protocol": config.protocol,
             "subject": config.subject,
-            "capture": (captures or {}).get(config.key, _capture_name(config)),
+            "capture": _capture_of(config, captures),
             "axis": config.axis,
             "severity": config.severity,
             "status": result.status,
@@ -80,8 +78,9 @@ def load(results: Sequence[CellResult], captures: Mapping[str, str] | None = Non
     return pd.DataFrame(rows, columns=[*COLUMNS, "axis", "severity", "status"])
 
 
-def _capture_name(config: CellConfig) -> str:
-    return capture_name(config.scene, config.size, config.capture_seed, config.subject)
+def _capture_of(config: CellConfig, captures: CaptureNames) -> str:
+    name = capture_name(config.scene, config.size, config.capture_seed, config.subject)
+    return name if captures is None else captures.get(config.key, name)
 
 
 def csv_of(table: pd.DataFrame) -> str:
@@ -107,14 +106,14 @@ def read_csv(path: Path) -> pd.DataFrame:
     return table.assign(status=failed.map({True: "crashed", False: "done"}))
 
 
-def load_images(results: Sequence[CellResult]) -> pd.DataFrame:
+def load_images(results: Sequence[CellResult], captures: CaptureNames = None) -> pd.DataFrame:
     """One row per scored image: its cell, `split`, `camera`, `frame`, and foreground scores.
 
     `novelty_deg`: that of its pose, NaN where the result has none.
     """
     rows = [
         {
-            **_cell(result),
+            **_cell(result, captures),
             "split": view.split,
             "camera": view.camera,
             "frame": view.frame,
@@ -128,10 +127,10 @@ def load_images(results: Sequence[CellResult]) -> pd.DataFrame:
     return table if "novelty_deg" in table else table.assign(novelty_deg=math.nan)
 
 
-def load_curves(results: Sequence[CellResult]) -> pd.DataFrame:
+def load_curves(results: Sequence[CellResult], captures: CaptureNames = None) -> pd.DataFrame:
     """One row per point of the training logs that has a PSNR: its cell, `seconds` of training, `psnr` in dB."""
     rows = [
-        {**_cell(result), "seconds": point.seconds, "psnr": point.psnr}
+        {**_cell(result, captures), "seconds": point.seconds, "psnr": point.psnr}
         for result in results
         for point in result.curve
         if point.psnr is not None and point.seconds > 0
@@ -139,7 +138,7 @@ def load_curves(results: Sequence[CellResult]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["scene", "method", "capture", "seed", "seconds", "psnr"])
 
 
-def load_snapshots(results: Sequence[CellResult]) -> pd.DataFrame:
+def load_snapshots(results: Sequence[CellResult], captures: CaptureNames = None) -> pd.DataFrame:
     """One row per snapshot and split of the trainings that left any, their ends included: cell, `seconds`, `psnr`."""
     rows = []
     for result in results:
@@ -148,17 +147,17 @@ def load_snapshots(results: Sequence[CellResult]) -> pd.DataFrame:
             points = [(point.split, point.seconds, point.psnr) for point in result.snapshots]
             points += [(split, end, result.value(*foreground(split))) for split in HELD_OUT_SPLITS]
             named = (dict(zip(("split", "seconds", "psnr"), point, strict=True)) for point in points)
-            rows += [{**_cell(result), **point} for point in named if None not in point.values()]
+            rows += [{**_cell(result, captures), **point} for point in named if None not in point.values()]
     return pd.DataFrame(rows, columns=["scene", "method", "capture", "seed", "split", "seconds", "psnr"])
 
 
-def load_outcomes(results: Sequence[CellResult]) -> pd.DataFrame:
+def load_outcomes(results: Sequence[CellResult], captures: CaptureNames = None) -> pd.DataFrame:
     """One row per cell that says how its training ended: at a `plateau` or not, with `dead` decoders (the same output
     in every frame), and what its `template` was learned from.
     """
     rows = [
         {
-            **_cell(result),
+            **_cell(result, captures),
             "plateau": end.ended_by == "plateau",
             "dead": end.carries_nothing,
             "template": end.template or "",
@@ -184,9 +183,10 @@ def alike(methods: Iterable[str], places: Mapping[str, str]) -> tuple[str, ...]:
     return tuple(method for method in there if there[method] == place)
 
 
-def _cell(result: CellResult) -> dict[str, Any]:
+def _cell(result: CellResult, captures: CaptureNames) -> dict[str, Any]:
     config = result.config
-    return {"scene": config.scene, "method": config.method, "capture": config.capture, "seed": config.seed}
+    capture = _capture_of(config, captures)
+    return {"scene": config.scene, "method": config.method, "capture": capture, "seed": config.seed}
 
 
 def samples_of(rows: pd.DataFrame, quantity: Quantity) -> dict[str, Samples]:
@@ -233,12 +233,12 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
 class RunTables:
     """The tables of a run, and look-ups in them."""
 
-    def __init__(self, results: Sequence[CellResult], captures: Mapping[str, str] | None = None) -> None:
+    def __init__(self, results: Sequence[CellResult], captures: CaptureNames = None) -> None:
         self.all_rows = load(results, captures)
         self.rows = self.all_rows[self.all_rows["axis"] == ""]  # of unperturbed captures
         plain = [result for result in results if not result.config.axis]
-        self.images, self.outcomes = load_images(plain), load_outcomes(plain)
-        self.curves, self.snapshots = load_curves(plain), load_snapshots(plain)
+        self.images, self.outcomes = load_images(plain, captures), load_outcomes(plain, captures)
+        self.curves, self.snapshots = load_curves(plain, captures), load_snapshots(plain, captures)
         self.brought = frozenset(result.config.method for result in results if result.brought is not None)
         # Where a method trained and where its frames were timed: `ONE_CORE`, or a device such as `cuda`.
         self.trained_on = {each.config.method: _place(each.config.device) for each in results}

@@ -8,11 +8,11 @@ from ash.files import InputError
 from benchmarks.analysis.headings import BINS, by_heading, changes, heading_deg
 from benchmarks.analysis.results import MOTION_SPLITS, RunTables
 from benchmarks.analysis.style import style_of
-from benchmarks.cell.schema import CellResult, ViewScore
+from benchmarks.cell.schema import Cell, CellResult, ViewScore, printable
 from benchmarks.report import pictures
 from benchmarks.report.content import Block, Bullets, Section, Strips, Table, Text
 from benchmarks.report.people import FEW, REFERENCE, is_rival
-from benchmarks.report.pictures import Album, Frames
+from benchmarks.report.pictures import Album, Frames, Shown
 from benchmarks.suites.runs import Run
 
 SHEET = "pictures_headings.webp"
@@ -21,7 +21,7 @@ NOTE = (
     "of a training frame. Columns hold other poses: compare within a column. The paper's motion input is in the world, "
     "so its networks learn what they see together with where the person faces."
 )
-Degrees = Mapping[tuple[str, int], float]  # of a held-out frame, by the identity of its capture
+Degrees = Mapping[tuple[str, int], float]  # of a held-out frame, by the name of its capture
 
 
 def new_headings(
@@ -55,13 +55,13 @@ def new_headings(
 def _degrees(run: Run) -> dict[tuple[str, int], float]:
     """From the heading of each frame of a new pose to the nearest of training."""
     degrees: dict[tuple[str, int], float] = {}
-    folders = {cell.config.capture: cell.capture_folder for cell in run.cells if not cell.config.axis}
-    for identity, folder in folders.items():
+    folders = {_name(cell): cell.capture_folder for cell in run.cells if not cell.config.axis}
+    for name, folder in folders.items():
         with suppress(InputError):
             splits = (capture := load_capture(folder)).splits
-            frames = [frame for name in MOTION_SPLITS if name in splits for frame in splits[name].frames]
+            frames = [frame for split in MOTION_SPLITS if split in splits for frame in splits[split].frames]
             turned_deg = heading_deg(capture.motion, train=splits["train"].frames, test=frames)
-            degrees |= {(identity, frame): float(each) for frame, each in zip(frames, turned_deg, strict=True)}
+            degrees |= {(name, frame): float(each) for frame, each in zip(frames, turned_deg, strict=True)}
     return degrees
 
 
@@ -74,10 +74,10 @@ def _farthest(run: Run, results: Sequence[CellResult], scene: str, degrees: Degr
             for method, each in by_method.items()
             if each.cell.config.place == scene
             and (method == REFERENCE or is_rival(method))
-            and any(_turned(each.result, degrees))
+            and any(_turned(each, degrees))
         ][: FEW + 1]
         if shown:
-            farthest.append((*max(_turned(shown[0].result, degrees), key=lambda turned: turned[0]), shown))
+            farthest.append((*max(_turned(shown[0], degrees), key=lambda turned: turned[0]), shown))
     if not farthest:
         return None
     _, view, shown = max(farthest, key=lambda each: each[0])
@@ -86,8 +86,13 @@ def _farthest(run: Run, results: Sequence[CellResult], scene: str, degrees: Degr
     return None
 
 
-def _turned(result: CellResult, degrees: Degrees) -> Iterator[tuple[float, ViewScore]]:
+def _turned(shown: Shown, degrees: Degrees) -> Iterator[tuple[float, ViewScore]]:
     """The views of new poses that have a score, with how far they are turned."""
-    for view in result.views:
+    for view in shown.result.views:
         if view.split in MOTION_SPLITS and ("foreground", "psnr") in view.scores:
-            yield degrees.get((result.config.capture, view.frame), 0.0), view
+            yield degrees.get((_name(shown.cell), view.frame), 0.0), view
+
+
+def _name(cell: Cell) -> str:
+    """The capture's, as tables have it."""
+    return printable(cell.capture_folder.name)

@@ -63,8 +63,8 @@ def test_methods_that_lack_captures_stand_with_the_others_on_the_captures_that_t
 
 def test_intervals_over_captures_leave_out_what_a_capture_does_to_all_methods() -> None:
     runs = [
-        replace(run, config=replace(run.config, capture=capture))
-        for capture, level in (("a", 0.0), ("b", 4.0), ("c", 9.0))
+        replace(run, config=replace(run.config, subject=subject))
+        for subject, level in enumerate((0.0, 4.0, 9.0))
         for method, gain in (("ash", 0.1 * level), ("wo_mot", 0.0))
         for run in [trained(method, {s: p + level + gain for s, p in STATIC.items()})]
     ]
@@ -113,8 +113,8 @@ def test_seeds_give_intervals_and_are_averaged_within_captures() -> None:
     assert (table.high > table.psnr).all() and (table.low < table.psnr).all()
     assert np.isnan(curves.time_to_quality(load_snapshots(cells[:1])).low).all()
     runs = [
-        replace(run, config=replace(run.config, capture=capture))
-        for capture, shift in (("a", 0.0), ("b", 4.0))
+        replace(run, config=replace(run.config, subject=subject))
+        for subject, shift in enumerate((0.0, 4.0))
         for seed in (0, 1)
         for run in [trained("ash", {s: p + shift + seed for s, p in LEARNED.items()}, seed=seed)]
     ]
@@ -170,7 +170,7 @@ def test_a_curve_settles_where_it_never_leaves_the_last_three_tenths_again() -> 
 MOTION = {"near_pose": (3.0, 4.0, 5.0), "novel_pose": (10.0, 11.0, 12.0), "far_pose": (18.0, 20.0, 22.0)}
 
 
-def moving(method: str, seed: int, slope: float, *, capture: str = "c", level: float = 30.0) -> CellResult:
+def moving(method: str, seed: int, slope: float, *, subject: int = 0, level: float = 30.0) -> CellResult:
     """PSNR falls by `slope` dB per degree, and one seed is half a decibel better than the next."""
     views = [
         ViewScore(
@@ -188,7 +188,7 @@ def moving(method: str, seed: int, slope: float, *, capture: str = "c", level: f
         Summary(split=split, region="foreground", metric="psnr", value=level - slope * float(np.mean(degrees)))
         for split, degrees in [("novel_view", (0.0,)), *MOTION.items()]
     ]
-    place = replace(config(method, seed), capture=capture * 64)
+    place = replace(config(method, seed), subject=subject)
     return CellResult(config=place, status="done", summary=tuple(summary), views=tuple(views))
 
 
@@ -207,9 +207,7 @@ def test_intervals_of_novelty_are_over_seeds_of_one_capture_and_over_several_cap
     seeds = curves.novelty(load_images([moving("ash", seed, 0.5) for seed in range(3)]))
     np.testing.assert_allclose(seeds["psnr"], [29.5, 27.5, 24, 19.5])
     np.testing.assert_allclose(seeds["high"] - seeds["psnr"], 4.3026528 * 0.5 / np.sqrt(3), rtol=1e-5)
-    several = [
-        moving("ash", seed, 0.5, capture=name, level=30 + gain) for gain, name in enumerate("cd") for seed in (0, 1)
-    ]
+    several = [moving("ash", seed, 0.5, subject=gain, level=30 + gain) for gain in (0, 1) for seed in (0, 1)]
     captures = curves.novelty(load_images(several))
     half = 12.7062047 * np.std([0, 1], ddof=1) / np.sqrt(2)
     np.testing.assert_allclose(captures["high"] - captures["psnr"], half, rtol=1e-5)

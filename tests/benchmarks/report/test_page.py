@@ -114,7 +114,8 @@ def test_the_page_is_whole_and_needs_nothing_else(run: Run) -> None:
 def test_headings_far_from_those_of_training_are_told_apart(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "New headings" not in (run.folder / "report.md").read_text()
     monkeypatch.setattr(headings, "EDGES_DEG", (-2.0, -1.0))  # All lie beyond.
-    (turned,), sheets = new_headings(run, results_of(run), RunTables(results_of(run)), Album())
+    run_tables = RunTables(results_of(run), {cell.config.key: cell.capture_folder.name for cell in run.cells})
+    (turned,), sheets = new_headings(run, results_of(run), run_tables, Album())
     _, table, _, strips = turned.blocks
     assert isinstance(table, Table) and isinstance(strips, Strips)
     assert list(table.frame.columns) == ["beyond 60 deg, 3 frames [dB]"]
