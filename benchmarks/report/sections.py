@@ -236,9 +236,10 @@ def training_cost(tables: RunTables) -> list[Section]:
     sections = []
     for name, title, x, x_title, table in charts_asked:
         if len(table):
+            on_all = table["scene"].isin(tables.scenes)  # captures of a scene, not only some of them
+            compared = table[on_all & table["method"].isin(alike(table["method"], tables.trained_on))]
+            table = table[on_all | table["split"].isin(RANKED_SPLITS)]
             words = table["split"].map(lambda split: SPLIT_NAMES[split].words)
-            compared = table[table["method"].isin(alike(table["method"], tables.trained_on))]
-            compared = compared[compared["scene"].isin(tables.scenes)]
             sentences = curves.crossings(compared) if name == "budget" else curves.frames_needed(table)
             snapshots = "Snapshots: the learning rate falls only at the end of a training." if name == "budget" else ""
             figure = line_figure(
