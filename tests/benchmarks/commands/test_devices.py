@@ -125,11 +125,11 @@ def test_a_report_says_which_milliseconds_are_those_of_a_gpu() -> None:
 
 
 def test_times_of_a_gpu_are_not_called_those_of_one_core_and_do_not_compete_with_them() -> None:
-    results = people({"ash": (25.0, 27.0), "ddc": (24.0, 26.0), "wo_mot": (23.0, 25.0)})
+    results = people({"ash": (25.0, 27.0), "ddc": (24.0, 26.0), "ash_plus": (23.0, 25.0)})
     trained = Summary(split="speed", region="", metric="train_s", value=90.0)
     early = {
         m: Snapshot(seconds=30, split="novel_view", psnr=level)
-        for m, level in (("wo_mot", 20.0), ("ddc", 21.0), ("ash", 22.0))
+        for m, level in (("ash_plus", 20.0), ("ddc", 21.0), ("ash", 22.0))
     }
     results = [
         replace(result, summary=(*result.summary, trained), snapshots=(early[result.config.method],))
@@ -144,14 +144,14 @@ def test_times_of_a_gpu_are_not_called_those_of_one_core_and_do_not_compete_with
     lines = dict(facts(tables, "loose"))
     assert lines["Time"] == (
         "A training took 90 s on cuda, 90 s on one core."
-        " A frame takes ASH 12 ms on cuda; DDC 12 ms, w/o mot. 12 ms on one core."
+        " A frame takes ASH 12 ms on cuda; DDC 12 ms, ASH+ 12 ms on one core."
     )
-    assert [each.name for each in candidates(tables, "loose", "novel_view")] == ["ddc", "wo_mot"]
-    assert alike(("ash", "ddc", "wo_mot"), tables.trained_on) == ("ddc", "wo_mot")
+    assert [each.name for each in candidates(tables, "loose", "novel_view")] == ["ddc", "ash_plus"]
+    assert alike(("ash", "ddc", "ash_plus"), tables.trained_on) == ("ddc", "ash_plus")
     assert alike(("ash",), tables.trained_on) == ("ash",)
     (section,) = training_cost(tables)
     leads = section.blocks[1].items
-    assert leads and all("DDC is ahead of w/o mot." in lead for lead in leads)
+    assert leads and all("DDC is ahead of ASH+" in lead for lead in leads)
     figure = speed_figure(tables, "loose")
     assert figure is not None
     assert all("ASH: timed on cuda, not shown" in json.dumps(panel.to_dict()) for panel in figure.panels)
