@@ -4,6 +4,7 @@
 pose from training.
 """
 
+from collections import Counter
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -12,7 +13,7 @@ import pandas as pd
 
 from benchmarks.analysis.results import HELD_OUT_SPLITS, foreground, samples_of
 from benchmarks.analysis.statistics import intervals
-from benchmarks.analysis.style import REFERENCES, SPLIT_NAMES, listed, reference_of, style_of
+from benchmarks.analysis.style import SPLIT_NAMES, listed, reference_of, style_of
 from benchmarks.suites.stress import FOOTAGE_FRAMES
 
 FOOTAGE_AXIS, STATIC = "footage", "wo_mot"
@@ -25,33 +26,36 @@ def _table(rows: list[tuple], *columns: str) -> pd.DataFrame:
 
 
 def during_training(curves: pd.DataFrame) -> pd.DataFrame:
-    """Method, seconds, psnr: the mean over a method's trainings (captures, seeds), from where the last of them has its
-    first score to where the first of them ends. Between two scores a training's changes linearly.
+    """Scene, method, seconds, psnr: the mean over a method's trainings (captures, seeds), from where the last of them
+    has its first score to where the first of them ends. Between two scores a training's changes linearly.
     """
     rows = []
-    for method, trainings in curves.groupby("method", sort=False):
+    for (scene, method), trainings in curves.groupby(["scene", "method"], sort=False):
         runs = [run.sort_values("seconds") for _, run in trainings.groupby(["capture", "seed"])]
         start, end = (pick(run["seconds"].iloc[place] for run in runs) for pick, place in ((max, 0), (min, -1)))
         marks = runs[0]["seconds"] if len(runs) == 1 else np.geomspace(start, end, min(map(len, runs)))
         scores = [np.interp(marks, run["seconds"], run["psnr"]) for run in runs]
-        rows += [(method, *point) for point in zip(marks, np.mean(scores, axis=0), strict=True)]
-    return pd.DataFrame(rows, columns=["method", "seconds", "psnr"])
+        rows += [(scene, method, *point) for point in zip(marks, np.mean(scores, axis=0), strict=True)]
+    return pd.DataFrame(rows, columns=["scene", "method", "seconds", "psnr"])
 
 
 def on_equal_captures(rows: pd.DataFrame) -> pd.DataFrame:
     """Rows (scene, method, capture, ...) in which all methods of a scene have the same captures.
 
     Methods that lack some of a scene's captures stand, with all that have theirs, in a scene of its own, such as
-    "loose, 1 of 3 captures".
+    "loose, 1 of 3 captures"; where others have as many of other captures, in "loose, 1 of 3 captures (2)".
     """
     parts = [rows.head(0)]
     for scene, here in rows.groupby("scene", sort=False):
         total = here["capture"].nunique()
         captures_of = here.groupby("method", sort=False)["capture"].agg(frozenset)
+        alike: Counter[int] = Counter()
         for captures in sorted(dict.fromkeys(captures_of), key=len, reverse=True):
+            alike[len(captures)] += 1
             methods = [method for method, own in captures_of.items() if captures <= own]
             part = here[here["method"].isin(methods) & here["capture"].isin(captures)]
-            name = scene if len(captures) == total else f"{scene}, {len(captures)} of {total} captures"
+            number = f" ({alike[len(captures)]})" if alike[len(captures)] > 1 else ""
+            name = scene if len(captures) == total else f"{scene}, {len(captures)} of {total} captures{number}"
             parts.append(part.assign(scene=name))
     return pd.concat(parts)
 
@@ -69,8 +73,7 @@ def time_to_quality(snapshots: pd.DataFrame) -> pd.DataFrame:
                 scores = runs.groupby(["capture", "seed"]).apply(_score_at, mark, include_groups=False)
                 if scores.notna().all():
                     samples[str(method)] = scores.groupby("capture").agg(list).to_dict()
-            if samples:
-                rows += [(scene, split, method, mark, *each) for method, each in intervals(samples).items()]
+            rows += [(scene, split, method, mark, *each) for method, each in intervals(samples).items()]
     return _table(rows, "scene", "split", "method", "seconds")
 
 
@@ -91,7 +94,7 @@ def crossings(table: pd.DataFrame) -> list[str]:
         methods = tuple(map(str, here["method"].unique()))
         for method in methods:
             reference = reference_of(method, methods)
-            if reference is None or method == REFERENCES[0]:  # Which is the other side of all its comparisons.
+            if reference is None:
                 continue
             lead = (wide[reference] - wide[method]).dropna()
             where = f"On {scene}, {SPLIT_NAMES[split].words}, "
@@ -131,8 +134,7 @@ def data_scaling(rows: pd.DataFrame) -> pd.DataFrame:
     for (scene, severity), here in rows[rows["scene"].isin(scenes)].groupby(["scene", "severity"], sort=False):
         counts = here[here["metric"] == "train_frames"].groupby("method")["value"].max()
         for split in HELD_OUT_SPLITS:
-            samples = samples_of(here, foreground(split))
-            for method, interval in intervals(samples).items() if samples else ():
+            for method, interval in intervals(samples_of(here, foreground(split))).items():
                 frames = int(counts.get(method, FOOTAGE_FRAMES - severity))
                 records.append((scene, split, method, frames, *interval))
     table = _table(records, "scene", "split", "method", "frames")

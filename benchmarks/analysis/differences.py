@@ -8,7 +8,7 @@ import pandas as pd
 
 from benchmarks.analysis.results import RANKED_SPLITS, RunTables, compare, foreground
 from benchmarks.analysis.statistics import Comparison, corrected
-from benchmarks.analysis.style import REFERENCES, reference_of
+from benchmarks.analysis.style import reference_of
 
 COLUMNS = ["scene", "split", "reference", "method", *Comparison.__dataclass_fields__, "verdict", "needed"]
 
@@ -30,8 +30,7 @@ def differences(
             ({"scene": scene, "split": split, "reference": reference, "method": method}, comparison)
             for split in splits
             for method in methods
-            if method != REFERENCES[0]
-            and (reference := reference_of(method, methods)) is not None
+            if (reference := reference_of(method, methods)) is not None
             and (comparison := compare(tables.of(scene), reference, method, foreground(split))) is not None
         ]
         for (row, _), each in zip(compared, corrected([each for _, each in compared]), strict=True):

@@ -164,9 +164,11 @@ def intervals(samples: Mapping[str, Samples]) -> dict[str, Interval]:
     the correction of Morey 2008), because subjects differ by more than methods do. Otherwise Student's interval.
     """
     by_method = {method: mean_interval(independent(seeds)) for method, seeds in samples.items()}
+    if len(samples) < 2:
+        return by_method
     first, *others = samples.values()
     shared = [capture for capture in first if all(capture in other for other in others)]
-    if not others or len(shared) < 2:
+    if len(shared) < 2:
         return by_method
     values = np.array([[np.mean(seeds[capture]) for capture in shared] for seeds in samples.values()])
     variances = (values - values.mean(0)).var(1, ddof=1) * len(samples) / len(others)

@@ -176,7 +176,12 @@ def style_of(method: str) -> MethodStyle:
 
 
 def reference_of(method: str, methods: Collection[str]) -> str | None:
-    """Which of the methods of a run a method is compared with: ASH or ASH+, of its own pair first; None: neither."""
+    """Which of the methods of a run a method is compared with: ASH or ASH+, of its own pair first.
+
+    None: neither is there, or it is ASH, with which the others are compared.
+    """
+    if method == REFERENCES[0]:
+        return None
     first = STYLES[method].reference if is_ours(method) and method in STYLES else REFERENCES[0]
     references = [name for name in (first, *REFERENCES) if name in methods and name != method]
     return references[0] if references else None

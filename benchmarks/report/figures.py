@@ -28,7 +28,7 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
         panel = SPLIT_NAMES[split].words.capitalize()
         samples = samples_of(tables.of(scene), foreground(split))
         drawn = {m: samples[m] for m in frames if m in samples}  # Brought pictures have no time.
-        spans = intervals(drawn) if drawn else {}
+        spans = intervals(drawn)
         floor = max((span.mean for span in spans.values()), default=0.0) - SPAN_DB
         shown = {m: span for m, span in spans.items() if span.mean >= floor}
         competing = pareto.candidates(tables, scene, split)
@@ -74,12 +74,7 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
 
 def training_figure(tables: RunTables, scene: str) -> Figure | None:
     """Foreground PSNR of reserved training views over seconds of training, the mean over trainings of a method."""
-    alike_captures = curves.on_equal_captures(tables.curves[tables.curves["scene"] == scene])
-    panels = {
-        str(name): curves.during_training(rows).assign(panel=name)
-        for name, rows in alike_captures.groupby("scene", sort=False)
-    }
-    table = pd.concat(panels.values()) if panels else pd.DataFrame(columns=["method"])
+    table = curves.during_training(curves.on_equal_captures(tables.curves[tables.curves["scene"] == scene]))
     methods = [m for m in tables.methods(scene) if (table["method"] == m).sum() > 1]
     if not methods:
         return None
@@ -88,7 +83,7 @@ def training_figure(tables: RunTables, scene: str) -> Figure | None:
     if over := tables.unit(scene):
         caption += f" Means over {over}, from the last one's first score to the end of the first that ends."
     return line_figure(
-        table[table["method"].isin(methods)],
+        table[table["method"].isin(methods)].rename(columns={"scene": "panel"}),
         vega.series_of(methods),
         name=f"training_{scene}",
         title=title,

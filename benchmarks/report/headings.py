@@ -8,12 +8,12 @@ from ash.files import InputError
 from benchmarks.analysis.headings import BINS, by_heading, changes, heading_deg
 from benchmarks.analysis.results import MOTION_SPLITS, RunTables
 from benchmarks.analysis.style import style_of
-from benchmarks.cell.schema import Cell, CellResult, ViewScore, printable
+from benchmarks.cell.schema import CellResult, ViewScore
 from benchmarks.report import pictures
 from benchmarks.report.content import Block, Bullets, Section, Strips, Table, Text
 from benchmarks.report.people import FEW, REFERENCE, is_rival
 from benchmarks.report.pictures import Album, Frames, Shown
-from benchmarks.suites.runs import Run
+from benchmarks.suites.runs import Run, capture_name_of
 
 SHEET = "pictures_headings.webp"
 NOTE = (
@@ -55,7 +55,7 @@ def new_headings(
 def _degrees(run: Run) -> dict[tuple[str, int], float]:
     """From the heading of each frame of a new pose to the nearest of training."""
     degrees: dict[tuple[str, int], float] = {}
-    folders = {_name(cell): cell.capture_folder for cell in run.cells if not cell.config.axis}
+    folders = {capture_name_of(cell): cell.capture_folder for cell in run.cells if not cell.config.axis}
     for name, folder in folders.items():
         with suppress(InputError):
             splits = (capture := load_capture(folder)).splits
@@ -90,9 +90,4 @@ def _turned(shown: Shown, degrees: Degrees) -> Iterator[tuple[float, ViewScore]]
     """The views of new poses that have a score, with how far they are turned."""
     for view in shown.result.views:
         if view.split in MOTION_SPLITS and ("foreground", "psnr") in view.scores:
-            yield degrees.get((_name(shown.cell), view.frame), 0.0), view
-
-
-def _name(cell: Cell) -> str:
-    """The capture's, as tables have it."""
-    return printable(cell.capture_folder.name)
+            yield degrees.get((capture_name_of(shown.cell), view.frame), 0.0), view

@@ -15,7 +15,6 @@ from markupsafe import Markup, escape
 from ash.files import InputError, write_atomic
 from benchmarks.analysis.results import RunTables, csv_of
 from benchmarks.analysis.style import titles_of
-from benchmarks.cell.schema import printable
 from benchmarks.report import author_table, content, escaping, glossary, sections, sentences, tables, vega
 from benchmarks.report.content import Section
 from benchmarks.report.headings import new_headings
@@ -23,7 +22,7 @@ from benchmarks.report.pictures import Album
 from benchmarks.report.scene import FEW_WORST, MANY, WORST, SceneData, scene_report
 from benchmarks.report.vega import Figure
 from benchmarks.suites.archive import write_archive
-from benchmarks.suites.runs import Run, results_of
+from benchmarks.suites.runs import Run, capture_name_of, results_of
 
 PUBLISHED = ("report.md", "results.csv", "tables.tex", "chart_*.svg", "pictures_*.webp", "worst_*.webp")
 PICTURE_SUFFIXES = (".svg", ".webp")
@@ -45,7 +44,7 @@ def write_report(run: Run, chosen_on: Run | None = None) -> list[str]:
 
 def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
     results = results_of(run)
-    run_tables = RunTables(results, {cell.config.key: printable(cell.capture_folder.name) for cell in run.cells})
+    run_tables = RunTables(results, {cell.config.key: capture_name_of(cell) for cell in run.cells})
     own = author_table.of_tables(run_tables, run.table)
     album = Album()
     many = sum(len(run_tables.methods(scene)) for scene in run_tables.scenes) > MANY

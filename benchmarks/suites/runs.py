@@ -383,6 +383,11 @@ def require_for_choosing(run: Run) -> Run:
     return run
 
 
+def capture_name_of(cell: Cell) -> str:
+    """What a report calls the capture of a cell: its folder."""
+    return printable(cell.capture_folder.name)
+
+
 def results_of(run: Run) -> list[CellResult]:
     """The results of a run's finished cells, in the suite's order.
 

@@ -36,10 +36,10 @@ def test_a_training_curve_is_the_mean_over_people_while_all_of_them_train() -> N
     """One person is scored from 10 s to 90 s, the other from 5 s to 40 s; alone a curve is what was scored."""
     first = pd.DataFrame({"capture": "a", "seconds": [10.0, 20.0, 90.0], "psnr": [20.0, 22.0, 29.0]})
     second = pd.DataFrame({"capture": "b", "seconds": [5.0, 10.0, 40.0], "psnr": [25.0, 26.0, 29.0]})
-    both = curves.during_training(pd.concat([first, second]).assign(method="ash", seed=0))
+    both = curves.during_training(pd.concat([first, second]).assign(scene="loose", method="ash", seed=0))
     assert both["seconds"].tolist() == pytest.approx([10, 20, 40]) and set(both["method"]) == {"ash"}
     assert both["psnr"].tolist() == pytest.approx([23.0, 24.5, 26.5])
-    alone = curves.during_training(first.assign(method="ddc", seed=1))
+    alone = curves.during_training(first.assign(scene="loose", method="ddc", seed=1))
     assert alone["psnr"].tolist() == first["psnr"].tolist()
 
 
@@ -59,6 +59,8 @@ def test_methods_that_lack_captures_stand_with_the_others_on_the_captures_that_t
         ("tight", "ash"): "d",
     }
     assert curves.on_equal_captures(rows.head(0)).empty
+    apart = pd.DataFrame({"scene": "loose", "method": ["ash", "ddc"], "capture": ["a", "b"]})
+    assert list(curves.on_equal_captures(apart)["scene"]) == ["loose, 1 of 2 captures", "loose, 1 of 2 captures (2)"]
 
 
 def test_intervals_over_captures_leave_out_what_a_capture_does_to_all_methods() -> None:
