@@ -61,13 +61,15 @@ def on_equal_captures(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def time_to_quality(snapshots: pd.DataFrame) -> pd.DataFrame:
-    """Scene, split, method, seconds, psnr, low, high, at the seconds of all snapshots on the scene.
+    """Scene, split, method, seconds, psnr, low, high, at the seconds of snapshots and at the last end of a training.
 
     A training that ended earlier keeps its last score; before its first snapshot a method has no row.
     """
     rows = []
     for (scene, split), here in snapshots.groupby(["scene", "split"], sort=False):
-        for mark in np.unique(here["seconds"].round()):
+        ends = here.groupby(["method", "capture", "seed"])["seconds"].transform("max")
+        marks = here["seconds"][here["seconds"].lt(ends) | here["seconds"].eq(ends.max())].round()
+        for mark in np.unique(marks):
             samples = {}
             for method, runs in here.groupby("method", sort=False):
                 scores = runs.groupby(["capture", "seed"]).apply(_score_at, mark, include_groups=False)

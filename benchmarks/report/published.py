@@ -14,6 +14,7 @@ import pandas as pd
 from jinja2 import Environment, StrictUndefined
 
 from ash.files import InputError, write_atomic
+from benchmarks.analysis.paper import order_agreement, paper_tables
 from benchmarks.analysis.results import Quantity, compare, foreground, read_csv, samples_of, summarise
 from benchmarks.analysis.statistics import Comparison
 from benchmarks.analysis.style import style_of
@@ -76,6 +77,17 @@ class Numbers:
             for method in methods
         ]
         return _markdown(["", *(": ".join(head_of(quantity)) for quantity in quantities)], cells)
+
+    def order(self, report: str, scene: str, split: str, metric: str) -> str:
+        """Kendall's tau of our rows to the order of the paper's comparison, with its interval over people."""
+        spec = next(spec for spec in paper_tables() if spec.label == f"tab:{scene}")
+        column = next(column for column in spec.columns if (column.split, column.metric) == (split, metric))
+        given = {row.method: row.given[column.beside] for group in spec.rows for row in group}
+        quantity = Quantity(split, column.region, metric) if column.region else foreground(split, metric)
+        order = order_agreement(self._of_scene(report, scene), given, quantity)
+        if order is None:
+            raise InputError(f"{self.folder / report}: expected three rows of the paper on one person in {scene}")
+        return order.tau_text
 
     def claims(self) -> str:
         """The claims that were judged, as a table in Markdown."""

@@ -249,7 +249,9 @@ def training_cost(tables: RunTables) -> list[Section]:
                 caption=" ".join(filter(None, ("Foreground PSNR.", snapshots, WHISKERS, APART))),
                 x=x,
                 x_title=x_title,
+                size=(250, 200),
                 log=True,
+                columns=3,
             )
             sections.append(Section(title=title, blocks=(figure, Bullets(items=tuple(sentences)))))
     return sections

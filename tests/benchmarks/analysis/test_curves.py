@@ -76,6 +76,13 @@ def test_intervals_over_captures_leave_out_what_a_capture_does_to_all_methods() 
     np.testing.assert_allclose(halves, paired / 2**0.5, rtol=1e-5)
 
 
+def test_an_early_end_of_a_training_makes_no_mark_for_the_others() -> None:
+    cells = [trained("ash", LEARNED), trained("ddc", {30: 22.0, 60: 23.0, 65: 23.5})]
+    views = curves.time_to_quality(load_snapshots(cells)).query("split == 'novel_view'")
+    assert views[views.method == "ash"].seconds.tolist() == [30, 60, 120, 240]
+    assert views[views.method == "ddc"].psnr.tolist() == [22.0, 23.0, 23.5, 23.5]
+
+
 def test_methods_cross_where_their_scores_are_equal() -> None:
     """ASH is 0.5 dB behind after a minute and 1 dB ahead after two: a third of the way, in the logarithm."""
     table = curves.time_to_quality(load_snapshots([trained("wo_mot", STATIC), trained("ash", LEARNED)]))

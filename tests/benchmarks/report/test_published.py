@@ -52,6 +52,15 @@ def test_rows_of_two_reports_are_compared(numbers: Numbers) -> None:
     assert numbers.difference("mine+other", "loose", "smpl", "ash") == "-2.00 dB [-2.00, -2.00]"
 
 
+def test_the_order_of_rows_is_compared_with_the_paper_s(numbers: Numbers) -> None:
+    """From the worst, the paper has TAVA, DDC, ASH: one person swaps the first two, one has a tie: 1/3, 1 and 0.816."""
+    with pytest.raises(InputError, match="expected three rows of the paper on one person in loose"):
+        numbers.order("mine", "loose", "novel_view", "psnr")
+    (numbers.folder / "other").mkdir()
+    (numbers.folder / "other" / "results.csv").write_text(csv_of(load(people({"tava": (24.5, 24.0, 27.0)}))))
+    assert numbers.order("mine+other", "loose", "novel_view", "psnr") == "+0.72 [-0.14, +1.00]"
+
+
 def test_rows_that_did_not_run_and_other_protocols_are_refused(numbers: Numbers) -> None:
     with pytest.raises(InputError, match="expected rows ash and wo_mot on loose"):
         numbers.difference("mine", "loose", "ash", "wo_mot")
