@@ -90,10 +90,17 @@ class Numbers:
         return order.tau_text
 
     def claims(self) -> str:
-        """The claims that were judged, as a table in Markdown."""
+        """The claims that were judged, a row each with a column for each scene, as a table in Markdown."""
         table = pd.read_csv(self.folder / "claims" / "claims.csv", keep_default_na=False, na_values=[""])
         shown = printed(table[table["effect"].notna()])
-        return _markdown(["claim", *shown.columns], [[str(name), *map(str, row)] for name, *row in shown.itertuples()])
+        shown["text"] = [
+            f"{row.verdict}: {row.difference}{row.paper and f', paper {row.paper}'}, {row.people} people"
+            f"{row.needed and f', {row.needed} needed'}"
+            for row in shown.itertuples()
+        ]
+        wide = shown.set_index(["contrast", "scene"], append=True)["text"].unstack(sort=False).fillna("")
+        heads = ["claim", "contrast", *wide.columns]
+        return _markdown(heads, [[*name, *row] for name, *row in wide.itertuples()], numbers=False)
 
     def origin(self, report: str) -> str:
         """Command, commit, machine and core-hours of training of a published report."""
@@ -168,8 +175,8 @@ def _with_interval(test: Comparison, metric: str) -> str:
     return f"{number(test.mean)} {measure.unit}{interval}"
 
 
-def _markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [heads, ["---", *["---:"] * (len(heads) - 1)], *rows]
+def _markdown(heads: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: bool = True) -> str:
+    lines = [heads, ["---", *["---:" if numbers else "---"] * (len(heads) - 1)], *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 

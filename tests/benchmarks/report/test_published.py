@@ -52,6 +52,22 @@ def test_rows_of_two_reports_are_compared(numbers: Numbers) -> None:
     assert numbers.difference("mine+other", "loose", "smpl", "ash") == "-2.00 dB [-2.00, -2.00]"
 
 
+def test_a_claim_is_a_row_with_a_column_for_each_scene(numbers: Numbers) -> None:
+    (numbers.folder / "claims").mkdir()
+    (numbers.folder / "claims" / "claims.csv").write_text(
+        "name,scene,contrast,paper,effect,low,high,people,unit,verdict,needed\n"
+        "1 views,tight,ash - ddc,4.63,-0.7,-1.1,-0.3,5,dB,not shown,8\n"
+        "1 views,loose,ash - ddc,,1.2,0.6,1.8,5,dB,confirmed,\n"
+        "2 speed,,ash - ddc,,,,,0,ms,cannot be judged here,\n"
+    )
+    assert numbers.claims().splitlines() == [
+        "| claim | contrast | tight | loose |",
+        "| --- | --- | --- | --- |",
+        "| 1 views | ash - ddc | not shown: -0.7 dB [-1.1, -0.3], paper +4.63 dB, 5 people, 8 needed "
+        "| confirmed: +1.2 dB [+0.6, +1.8], 5 people |",
+    ]
+
+
 def test_the_order_of_rows_is_compared_with_the_paper_s(numbers: Numbers) -> None:
     """From the worst, the paper has TAVA, DDC, ASH: one person swaps the first two, one has a tie: 1/3, 1 and 0.816."""
     with pytest.raises(InputError, match="expected three rows of the paper on one person in loose"):
