@@ -140,7 +140,7 @@ def _camera_rows(path: Path, content: Any) -> list[dict[str, Any]]:
                 row["viewmat"] = _orthonormal(row)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         raise InputError(
             f"{path}: expected a list of cameras: of a capture, 3D Gaussian Splatting (cameras.json) or nerfstudio"
             f" (transforms.json) ({type(error).__name__}: {error})"

@@ -51,11 +51,11 @@ def _undressed(number: int) -> TemplateMesh:
     body = pack(body, chart, density, gutter=0.004)
     faces, uv_faces = decimate(body, target=dressing.TEMPLATE_VERTICES, keep=np.ones(len(body.vertices)))
     used, corners = np.unique(faces, return_inverse=True)
-    used, uv_corners = np.unique(uv_faces, return_inverse=True)
+    uvs_used, uv_corners = np.unique(uv_faces, return_inverse=True)
     return TemplateMesh(
         vertices=body.vertices[used],
         faces=corners.reshape(-1, 3),
-        uvs=body.uvs[used],
+        uvs=body.uvs[uvs_used],
         uv_faces=uv_corners.reshape(-1, 3),
         skin_weights=body.weights[used],
     )

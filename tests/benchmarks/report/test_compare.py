@@ -14,12 +14,13 @@ from helpers.cells import cell, people
 from helpers.waiting import wait_for
 
 from ash.capture.formats import load_capture
+from ash.capture.manifest import read_manifest
 from ash.files import InputError
 from benchmarks import cli
 from benchmarks.cell.schema import Cell, CellResult, result_of, write_config, write_result
 from benchmarks.report.compare import changes, failures_in_words, printed, verdict_of, write_comparison
 from benchmarks.suites import runs as runs_module
-from benchmarks.suites.captures import truth_of
+from benchmarks.suites.captures import SHOWS_THE_SAME, truth_of
 from benchmarks.suites.runs import Run, gathered, read_run, write_run
 
 Rows = dict[tuple[str, str], list[tuple[Cell, CellResult]]]
@@ -185,3 +186,10 @@ def test_subjects_are_compared_in_pairs() -> None:
     assert change.verdict == "better" and change.change == pytest.approx(0.3)
     two, others = people(0.0), people(0.3)
     assert views({k: v[:1] for k, v in two.items()}, {k: v[1:2] for k, v in others.items()}).verdict == ""
+
+
+def test_captures_that_differ_in_their_bare_body_alone_show_the_same(runs: tuple[Path, Path]) -> None:
+    manifest = read_manifest(read_run(runs[0]).cells[0].capture_folder)
+    (later, earlier), *_ = SHOWS_THE_SAME.items()
+    truths = [truth_of(replace(manifest, source=source)) for source in (later, earlier, "0123456789abcdef")]
+    assert truths[0] == truths[1] != truths[2]

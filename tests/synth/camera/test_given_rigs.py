@@ -102,3 +102,9 @@ def test_other_coefficients_are_refused_by_camera_and_field(tmp_path: Path) -> N
     path = ours(tmp_path / "rig.json", distortion=[-0.1, 0.02, 0.001, 0.0, -0.02])
     with pytest.raises(InputError, match=r"rig\.json: camera cam0: k3 is -0\.02, expected 0"):
         rig_from_file(path)
+
+
+def test_whole_numbers_beyond_the_range_of_floats_are_refused(tmp_path: Path) -> None:
+    path = ours(tmp_path / "rig.json", viewmat=[[10**400, 0, 0, 0], *np.eye(4)[1:].tolist()])
+    with pytest.raises(InputError, match=r"rig\.json: expected a list of cameras: .*too large"):
+        rig_from_file(path)

@@ -1,12 +1,15 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from helpers.scenes import small_scene
 
 from ash.capture.formats import read_template
 from synth.capture import make_body
 from synth.person.bare import MANNEQUIN_CLOTH, bare_template
+from synth.person.dressing import TEMPLATE_VERTICES
 from synth.presets import scene
 
 
@@ -27,3 +30,13 @@ def test_a_capture_brings_the_bare_body(small_capture: Path):
     joints = len(make_body(small_scene()).skeleton.names)
     found = read_template(small_capture / "body.npz", joints=joints)
     np.testing.assert_array_equal(found.vertices, bare_template(small_scene()).vertices)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_vertices_and_faces_of_the_bare_body_belong_together(number: int) -> None:
+    bare = bare_template(replace(scene("tight", size="ci"), subject=number))
+    assert len(np.unique(bare.faces)) == len(bare.vertices) == TEMPLATE_VERTICES
+    assert len(np.unique(bare.uv_faces)) == len(bare.uvs)
+    mesh = trimesh.Trimesh(bare.vertices, bare.faces, process=False)
+    assert mesh.edges_unique_length.max() < 0.1  # metres
+    assert 1.4 < mesh.area < 2.4  # square metres
