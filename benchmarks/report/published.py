@@ -25,7 +25,7 @@ from benchmarks.report.tables import ON_WHOLE_FRAMES, cost_columns, head_of, qua
 
 FOLDER = Path(__file__).parents[2] / "reports"
 NAME = "README.md"
-FACT = re.compile(r"^\| (code|commit|command|processor|cores|gpu) \| (.*?) \|$", re.MULTILINE)  # of its provenance
+FACT = re.compile(r"^\| (code|commit|processor|gpu) \| (.*?) \|$", re.MULTILINE)  # of its provenance
 
 
 def read_me(folder: Path = FOLDER) -> str:
@@ -102,15 +102,13 @@ class Numbers:
         heads = ["claim", "contrast", *wide.columns]
         return _markdown(heads, [[*name, *row] for name, *row in wide.itertuples()], numbers=False)
 
-    def origin(self, report: str) -> str:
-        """Command, commit, machine and core-hours of training of a published report."""
+    def training(self, report: str) -> str:
+        """Core-hours of training of a published report, and its processors and GPUs."""
         facts = self._facts(report)
-        commits = ", ".join(sorted(facts["commit"].split(", ")))
         rows = self._rows(report)
         hours = rows[(rows["metric"] == "train_cpu_s") & (rows["split"] == "speed")]["value"].sum() / 3600
         gpus = [gpu for gpu in facts["gpu"].split(", ") if gpu != "none"]
-        machine = ", ".join([f"{facts['cores']} cores of {facts['processor']}", *gpus])
-        return f"`{facts['command']}`, code of {commits}, {machine}, {hours:.1f} core-hours of training"
+        return ", ".join([f"{hours:.1f} core-hours", facts["processor"], *gpus])
 
     def cells(self, report: str) -> int:
         """How many trainings a report has."""
