@@ -71,10 +71,13 @@ class Numbers:
     def scores(self, report: str, scene: str) -> str:
         """A table in Markdown: PSNR and LPIPS on all held-out splits, milliseconds and training seconds."""
         quantities = [*quality_columns(("psnr", "lpips")), *cost_columns(("frame_ms", "train_cpu_s"))]
-        methods = list(dict.fromkeys(self._of_scene(report, scene)["method"]))
+        people = self._of_scene(report, scene).groupby("method", sort=False)["subject"].nunique()
         cells = [
-            [style_of(method).title, *(self._score(report, scene, method, quantity) for quantity in quantities)]
-            for method in methods
+            [
+                style_of(method).title + (f" ({count} people)" if count < people.max() else ""),
+                *(self._score(report, scene, method, quantity) for quantity in quantities),
+            ]
+            for method, count in people.items()
         ]
         return _markdown(["", *(": ".join(head_of(quantity)) for quantity in quantities)], cells)
 
