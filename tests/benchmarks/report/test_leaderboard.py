@@ -88,8 +88,8 @@ def test_it_sorts_filters_and_shows_any_picture(board: Path, visit: Visitor) -> 
     assert sent.inner_text().split().count("n/a") < unknown
     page.select_option("#region", "full")
     assert page.locator("#board thead", has_text="(whole frame)").count() == 0
-    sent.locator("a").click()
-    assert page.locator("#strip figure").count() == 2
+    sent.locator("a").click()  # The page follows its address a moment later.
+    page.wait_for_function("document.querySelectorAll('#strip figure').length === 2")
     page.select_option("#method", "")
     page.select_option("#images", "novel_pose")
     page.click("[data-step='1']")
