@@ -163,6 +163,7 @@ class ImportCommand:
     footage: Positional[Path]  # the folder
     out: Folder  # of the capture, new or empty
     name: str = ""  # of the scene in tables; default: the name of --out
+    subject: Seed = 0  # who it is; captures of one --name and several subjects are people of one scene
     cameras: File | None = None  # our cameras.json, nerfstudio's, 3DGS's or COLMAP's cameras.txt; default: FOOTAGE's
     test_cameras: Names = ()  # held out; default: a quarter, 1 to 8
     test_frames: Annotated[str | None, Argument(metavar="A:B")] = None  # B not included; default: the last sequence
@@ -178,6 +179,7 @@ class ImportCommand:
                 self.footage,
                 self.out,
                 name=self.name,
+                subject=self.subject,
                 cameras=self.cameras,
                 test_cameras=self.test_cameras,
                 test_frames=_first_and_last(self.test_frames),

@@ -52,6 +52,7 @@ def import_footage(
     out: Path,
     *,
     name: str = "",
+    subject: int = 0,
     cameras: Path | None = None,
     test_cameras: Sequence[str] = (),
     test_frames: tuple[int, int] | None = None,
@@ -59,10 +60,10 @@ def import_footage(
 ) -> tuple[Capture, list[Overlap]]:
     """Write footage as a capture without truth into `out`, which appears when all of it is good.
 
-    `name`: of the scene, by default that of `out`; `cameras`: their file, where it is not one of those that the folder
-    is searched for; `test_cameras`: held out, by default a quarter, 1 to 8; `test_frames`: held out, from the first to
-    before the second, by default those of the last sequence of several; `least_iou`: what each camera's masks and the
-    posed template must reach, 0 to 1.
+    `name`: of the scene, by default that of `out`; `subject`: who it is, from 0; `cameras`: their file, where it is not
+    one of those that the folder is searched for; `test_cameras`: held out, by default a quarter, 1 to 8;
+    `test_frames`: held out, from the first to before the second, by default those of the last sequence of several;
+    `least_iou`: what each camera's masks and the posed template must reach, 0 to 1.
 
     Raises:
         InputError: a part is missing or damaged, its lengths are no metres, `out` is not empty, or the name is not
@@ -105,7 +106,7 @@ def import_footage(
         write_skeleton(made / "skeleton.json", skeleton)
         write_template(made / "template.npz", template)
         write_motion(made / "motion.npz", motion)
-        _write_manifest(made, scene, motion, splits)
+        _write_manifest(made, scene, subject, motion, splits)
         overlaps = template_overlaps(load_capture(made))
         if apart := [row for row in overlaps if row.iou < least_iou]:
             raise Problems(
@@ -122,12 +123,20 @@ def import_footage(
     return load_capture(out), overlaps
 
 
-def _write_manifest(folder: Path, scene: str, motion: Motion, splits: dict[str, Split]) -> None:
+def _write_manifest(folder: Path, scene: str, subject: int, motion: Motion, splits: dict[str, Split]) -> None:
     files, novelty = hash_files(folder), None
     if "novel_pose" in splits:
         novelty = float(np.mean(novelty_deg(motion, train=splits["train"].frames, test=splits["novel_pose"].frames)))
     source = f"imported {hash_of(files)[:16]}"  # Tells captures apart that no scene describes.
-    Manifest(scene=scene, seed=0, splits=splits, files=files, source=source, pose_novelty_deg=novelty).write(folder)
+    Manifest(
+        scene=scene,
+        seed=0,
+        splits=splits,
+        files=files,
+        source=source,
+        parameters={"subject": subject} if subject else {},
+        pose_novelty_deg=novelty,
+    ).write(folder)
 
 
 def _require_metres(

@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from ash.capture.formats import load_capture
 from ash.capture.manifest import Manifest, is_capture, read_manifest, verify_capture
@@ -120,6 +121,15 @@ def require_kept_apart(suite: Suite) -> None:
 
 def truth_of(manifest: Manifest) -> str:
     """A name for what a capture shows that does not depend on the machine that rendered it."""
-    perturbation = {name: value for name, value in manifest.perturbed.items() if name != "of"}
     source = SHOWS_THE_SAME.get(manifest.source, manifest.source)
-    return hash_of([manifest.identity or None, source or None, perturbation])
+    return hash_of([manifest.identity or None, source or None, _perturbation(manifest)])
+
+
+def recipe_of(manifest: Manifest) -> str:
+    """A name for what decides a capture but its subject."""
+    parameters = {name: value for name, value in manifest.parameters.items() if name != "subject"}
+    return hash_of([manifest.size, manifest.seed, parameters, _perturbation(manifest)])
+
+
+def _perturbation(manifest: Manifest) -> dict[str, Any]:
+    return {name: value for name, value in manifest.perturbed.items() if name != "of"}

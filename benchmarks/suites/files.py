@@ -33,8 +33,9 @@ from ash.fields import WRITTEN, Changes, for_json, suggest
 from ash.files import InputError, hash_of, open_regular
 from benchmarks.aliases import OLD_SIZES, OLD_SUITES
 from benchmarks.cell.registry import brought_folder, configured, find_method, methods
+from benchmarks.suites.captures import recipe_of, subject_of
 from benchmarks.suites.stress import Stress
-from benchmarks.suites.suites import AS_GIVEN, MethodSpec, SceneSpec, Suite, varied_name
+from benchmarks.suites.suites import AS_GIVEN, MethodSpec, SceneSpec, Suite, people_of_one, varied_name
 from benchmarks.suites.tables import TableSpec, tables_of
 
 FOLDER = Path(__file__).parent
@@ -286,15 +287,25 @@ class _Reader:
 def given_capture(folder: Path, *, name: str = "") -> SceneSpec:
     """A finished capture as a row of a suite; it is called as its scene is, where no name is given."""
     manifest = read_manifest(folder)
-    return SceneSpec(name=name or manifest.scene, size=manifest.size or AS_GIVEN, folder=folder)
+    return SceneSpec(
+        name=name or manifest.scene,
+        size=manifest.size or AS_GIVEN,
+        folder=folder,
+        subject=subject_of(manifest),
+        recipe=recipe_of(manifest),
+    )
 
 
 def given_captures(folders: Sequence[Path]) -> tuple[SceneSpec, ...]:
-    """Finished captures as rows; of several that are called alike, each is called as its folder is."""
+    """Finished captures as rows, called as their scenes are: those that differ in the subject alone are people of one.
+
+    Others that are called alike are called as their folders are.
+    """
     rows = [given_capture(folder) for folder in folders]
-    names = [row.name for row in rows]
     return tuple(
-        row if names.count(row.name) == 1 else given_capture(folder, name=folder.resolve().name)
+        row
+        if people_of_one([other for other in rows if other.name == row.name])
+        else replace(row, name=folder.resolve().name)
         for row, folder in zip(rows, folders, strict=True)
     )
 

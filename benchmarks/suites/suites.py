@@ -1,7 +1,7 @@
 """What a suite is: a matrix of scenes x methods x seeds. `benchmarks.suites.files` reads it; ours are `*.toml` here."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,6 +26,8 @@ class SceneSpec:
     size: str = ""  # none: the suite's
     changes: Changes = ()  # in `synth.scene.Scene`
     folder: Path | None = None  # of a finished capture
+    subject: int = 0  # whom the finished capture shows
+    recipe: str = ""  # hash of what decides the finished capture but its subject
     methods: tuple[str, ...] = ()  # rows of the suite that run on it; none: all
 
 
@@ -108,12 +110,14 @@ class Suite:
 
     def __post_init__(self) -> None:
         """Refuse what makes no table."""
-        for what, rows in (("scene", self.scenes), ("method", self.methods)):
-            names = [row.name for row in rows]
+        scenes, methods = [row.name for row in self.scenes], [row.name for row in self.methods]
+        several = [name for name in scenes if not people_of_one([row for row in self.scenes if row.name == name])]
+        twice = [name for name in methods if methods.count(name) > 1]
+        for what, names, alike in (("scene", scenes, several), ("method", methods, twice)):
             if not names:
                 raise InputError(f"expected at least one {what}")
-            if twice := [name for name in names if names.count(name) > 1]:
-                raise InputError(f"two {what}s are called {twice[0]!r}, expected a name of its own for each")
+            if alike:
+                raise InputError(f"two {what}s are called {alike[0]!r}, expected a name of its own for each")
         known = tuple(method.name for method in self.methods)
         for scene in self.scenes:
             for name in scene.methods:
@@ -141,7 +145,7 @@ class Suite:
             CaptureSpec(
                 scene=scene.name,
                 size=scene.size or self.size,
-                subject=subject,
+                subject=scene.subject if scene.folder else subject,
                 stress=stress,
                 of="" if scene.of == scene.name else scene.of,
                 changes=scene.changes,
@@ -156,11 +160,12 @@ class Suite:
     @property
     def cells(self) -> Iterator[CellSpec]:
         """Seeds outermost: whoever interrupts early has one whole table, not three thirds of one."""
-        chosen = {scene.name: scene.methods for scene in self.scenes}
+        chosen = {(scene.name, scene.folder): scene.methods for scene in self.scenes}
         for seed in range(self.seeds):
             for capture in self.captures:
+                wanted = chosen[capture.scene, capture.folder]
                 for method in self.methods:
-                    if chosen[capture.scene] and method.name not in chosen[capture.scene]:
+                    if wanted and method.name not in wanted:
                         continue
                     if seed and brought_folder(method.of) is not None:
                         continue  # The same pictures again would pass for a second training.
@@ -202,6 +207,11 @@ class Suite:
         if chosen:
             given |= {"methods": chosen, "scenes": tuple(replace(scene, methods=()) for scene in scenes or self.scenes)}
         return replace(self, **given)  # type: ignore[arg-type]
+
+
+def people_of_one(rows: Sequence[SceneSpec]) -> bool:
+    """Whether captures are of one scene, each of another person; a scene that is to be made has all its people."""
+    return len({row.subject for row in rows}) == len(rows) and len({row.recipe for row in rows}) == 1
 
 
 def varied_name(of: str, changes: Changes) -> str:

@@ -20,6 +20,7 @@ from benchmarks import cli
 from benchmarks.cell.schema import CellResult, read_result
 from benchmarks.importing.cameras import read_any_cameras
 from benchmarks.importing.overlap import silhouette, template_overlaps
+from benchmarks.suites.files import given_captures
 from benchmarks.suites.runs import read_run
 from synth.export.formats import export
 
@@ -87,6 +88,14 @@ def test_the_whole_chain_gives_the_scores_of_the_capture_and_none_that_needs_tru
     report = (tmp_path / "run" / "report.md").read_text()
     assert "n/a" in report and "imported" in report
     assert "oracle is shown the truth" in refused(capsys, "train", "ash_truth", str(out))
+
+
+def test_people_who_were_imported_are_people_of_one_scene(footage: Path, tmp_path: Path) -> None:
+    outs = [tmp_path / name for name in ("a", "b")]
+    for subject, out in enumerate(outs):
+        imported = ["import", str(footage), "--out", str(out), "--name", "studio", "--subject", str(subject), *TEST]
+        assert cli.main(imported) == cli.DONE
+    assert [(row.name, row.subject) for row in given_captures(outs)] == [("studio", 0), ("studio", 1)]
 
 
 def test_cameras_of_four_formats_are_the_same(capture: Path, tmp_path: Path) -> None:

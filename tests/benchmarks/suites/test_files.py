@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from helpers import fakes
 
+from ash.capture.manifest import read_manifest
 from ash.files import InputError
 from benchmarks.analysis.style import is_ours, style_of, titles_of, user_rows
 from benchmarks.cell.registry import WRONG_BY_MM, is_oracle
@@ -87,6 +88,27 @@ def test_a_capture_that_is_there_is_a_scene(tmp_path: Path) -> None:
     suite = read_suite(written(tmp_path, GOOD.replace('"tight",', f"{{ capture = {str(capture)!r} }},", 1)))
     assert suite.captures[0].folder == capture and suite.captures[0].scene == "boxes"
     assert [row.name for row in given_captures([capture, capture])] == ["mine", "mine"]
+
+
+def test_captures_that_differ_in_the_subject_alone_are_people_of_one_scene(tmp_path: Path) -> None:
+    first, second, brighter = (fakes.write_capture(tmp_path / name) for name in ("first", "second", "brighter"))
+    for folder, subject, light in ((first, 0, 1.0), (second, 4, 1.0), (brighter, 5, 2.0)):
+        replace(read_manifest(folder), parameters={"subject": subject, "light": light}).write(folder)
+    names = [(row.name, row.subject) for row in given_captures([first, second])]
+    assert names == [("boxes", 0), ("boxes", 4)]
+    assert [row.name for row in given_captures([first, second, brighter])] == ["first", "second", "brighter"]
+
+    captures = f"{{ capture = {str(first)!r} }}, {{ capture = {str(second)!r}, methods = ['mesh'] }}"
+    suite = read_suite(written(tmp_path, GOOD.replace('"tight",', captures + ",", 1)))
+    cells = [cell for cell in suite.cells if cell.capture.scene == "boxes" and not cell.seed]
+    assert {(cell.capture.subject, cell.method) for cell in cells if not cell.capture.stress} == {
+        (0, "ash"),
+        (0, "ash+width=4"),
+        (0, "mesh"),
+        (4, "mesh"),
+    }
+    with pytest.raises(InputError, match="two scenes are called 'boxes'"):
+        read_suite(written(tmp_path, GOOD.replace('"tight",', captures.replace("second", "brighter") + ",", 1)))
 
 
 @pytest.mark.parametrize(
