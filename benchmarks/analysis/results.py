@@ -214,6 +214,17 @@ def compare(rows: pd.DataFrame, a: str, b: str, quantity: Quantity) -> Compariso
     )
 
 
+def fewer_captures(rows: pd.DataFrame) -> dict[str, str]:
+    """Methods that have fewer captures than others, with what their means are of, such as "3 of 5 people".
+
+    `rows`: of one scene.
+    """
+    whom = rows.groupby("capture")["subject"].first()
+    counts = rows.groupby("method", sort=False)["capture"].nunique()
+    unit = "people" if whom.is_unique else "captures"
+    return {str(method): f"{count} of {len(whom)} {unit}" for method, count in counts.items() if count < len(whom)}
+
+
 def summarise(rows: pd.DataFrame) -> pd.DataFrame:
     """Every quantity of every method and scene (the index): `value` (mean), `half_width` of its 95 % interval (NaN for
     a single value), `least`, `greatest` and `n`; over captures, or the seeds of a single one.

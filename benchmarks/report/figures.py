@@ -1,11 +1,20 @@
 """The charts of a scene: its numbers as the tables that `charts.py` draws, with captions."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import pandas as pd
 
 from benchmarks.analysis import curves, pareto
-from benchmarks.analysis.results import FRAME_MS, RANKED_SPLITS, RunTables, alike, foreground, samples_of
+from benchmarks.analysis.results import (
+    FRAME_MS,
+    RANKED_SPLITS,
+    RunTables,
+    alike,
+    fewer_captures,
+    foreground,
+    samples_of,
+)
 from benchmarks.analysis.statistics import intervals
 from benchmarks.analysis.style import EXACT, SPLIT_NAMES
 from benchmarks.cell.registry import WRONG_BY_MM
@@ -19,7 +28,11 @@ SPAN_DB = 9.0  # below the best point: lower points are named in the subtitle an
 def speed_figure(tables: RunTables, scene: str) -> Figure | None:
     """Foreground PSNR against milliseconds per frame, for novel views and novel poses."""
     methods = [m for m in tables.methods(scene) if m not in PLANTED and tables.whole(scene, m)]
-    styles = vega.series_of(methods)
+    fewer = fewer_captures(tables.of(scene))
+    styles = {
+        method: replace(series, title=f"{series.title} ({fewer[method]})") if method in fewer else series
+        for method, series in vega.series_of(methods).items()
+    }
     timed = alike(methods, tables.drawn_on)
     frames = tables.values(scene, FRAME_MS, timed)
     points, front, links = [], [], []

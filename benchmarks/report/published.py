@@ -15,7 +15,7 @@ from jinja2 import Environment, StrictUndefined
 
 from ash.files import InputError, write_atomic
 from benchmarks.analysis.paper import order_agreement, paper_tables
-from benchmarks.analysis.results import Quantity, compare, foreground, read_csv, samples_of, summarise
+from benchmarks.analysis.results import Quantity, compare, fewer_captures, foreground, read_csv, samples_of, summarise
 from benchmarks.analysis.statistics import Comparison
 from benchmarks.analysis.style import style_of
 from benchmarks.cell.metrics import METRICS, PROTOCOL
@@ -71,13 +71,14 @@ class Numbers:
     def scores(self, report: str, scene: str) -> str:
         """A table in Markdown: PSNR and LPIPS on all held-out splits, milliseconds and training seconds."""
         quantities = [*quality_columns(("psnr", "lpips")), *cost_columns(("frame_ms", "train_cpu_s"))]
-        people = self._of_scene(report, scene).groupby("method", sort=False)["subject"].nunique()
+        of_scene = self._of_scene(report, scene)
+        fewer = fewer_captures(of_scene)
         cells = [
             [
-                style_of(method).title + (f" ({count} people)" if count < people.max() else ""),
+                style_of(method).title + (f" ({fewer[method]})" if method in fewer else ""),
                 *(self._score(report, scene, method, quantity) for quantity in quantities),
             ]
-            for method, count in people.items()
+            for method in of_scene["method"].unique()
         ]
         return _markdown(["", *(": ".join(head_of(quantity)) for quantity in quantities)], cells)
 

@@ -16,6 +16,7 @@ from benchmarks.analysis.results import (
     Quantity,
     RunTables,
     compare,
+    fewer_captures,
     foreground,
 )
 from benchmarks.analysis.statistics import corrected
@@ -147,7 +148,8 @@ def facts(tables: RunTables, scene: str) -> list[tuple[str, str]]:
 
 
 def _ranked(tables: RunTables, scene: str) -> list[str]:
-    return [name for name in tables.methods(scene, oracles=False) if tables.whole(scene, name)]
+    fewer = fewer_captures(tables.of(scene))
+    return [name for name in tables.methods(scene, oracles=False) if tables.whole(scene, name) and name not in fewer]
 
 
 def _scores(tables: RunTables, scene: str) -> str:

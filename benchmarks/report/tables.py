@@ -6,7 +6,7 @@ from typing import Any
 
 import pandas as pd
 
-from benchmarks.analysis.results import HELD_OUT_SPLITS, RANKED_SPLITS, Quantity, RunTables, foreground
+from benchmarks.analysis.results import HELD_OUT_SPLITS, RANKED_SPLITS, Quantity, RunTables, fewer_captures, foreground
 from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell.metrics import METRICS, Metric
 from benchmarks.cell.registry import is_oracle
@@ -48,13 +48,15 @@ def build(
 ) -> Table:
     """The table of a scene without the quantities that no method has. `exposed`: methods that were not isolated.
 
-    Best and second best are marked where rows have several values; of one value each none is known to be better.
+    Best and second best are marked where rows have several values; of one value each none is known to be better, nor
+    is a mean over fewer captures.
     """
     methods = sorted(tables.methods(scene), key=is_oracle)  # Stable: the order of methods within each half.
     columns = {q: [tables.get(scene, method, q) for method in methods] for q in quantities}
     columns = {q: rows for q, rows in columns.items() if any(row is not None for row in rows)}
     lost = [tables.failed(scene, method) == tables.cells["cells"][scene, method] for method in methods]
-    names = [_name(tables, scene, method, exposed=method in exposed) for method in methods]
+    fewer = fewer_captures(tables.of(scene))
+    names = [_name(tables, scene, method, exposed=method in exposed, fewer=fewer.get(method, "")) for method in methods]
     texts: dict[tuple[str, str], list[str]] = {}
     marks: dict[tuple[int, int], Mark] = {}
     for column, (quantity, rows) in enumerate(columns.items()):
@@ -62,9 +64,8 @@ def build(
         texts[head_of(quantity)] = [
             "failed" if gone else text_of(row, measure) for row, gone in zip(rows, lost, strict=True)
         ]
-        means = {
-            i: row.value for i, row in enumerate(rows) if row is not None and not lost[i] and not is_oracle(methods[i])
-        }
+        apart = [gone or method in fewer or is_oracle(method) for gone, method in zip(lost, methods, strict=True)]
+        means = {i: row.value for i, row in enumerate(rows) if row is not None and not apart[i]}
         if tables.unit(scene):
             marks |= {(i, column): mark for i, mark in _marks(means, measure).items()}
     frame = pd.DataFrame(texts, index=names)
@@ -123,9 +124,10 @@ def plain(table: Table) -> str:
     return "\n".join(line.rstrip() for line in (spans, *lines))
 
 
-def _name(tables: RunTables, scene: str, method: str, *, exposed: bool) -> str:
+def _name(tables: RunTables, scene: str, method: str, *, exposed: bool, fewer: str) -> str:
     failed = tables.failed(scene, method)
-    notes = [f"{failed} of {tables.cells['cells'][scene, method]} failed"] if failed else []
+    notes = [fewer] if fewer else []
+    notes += [f"{failed} of {tables.cells['cells'][scene, method]} failed"] if failed else []
     notes += ["not isolated"] if exposed else []
     notes += [BROUGHT_NOTE] if method in tables.brought else []
     return f"{style_of(method).title} ({', '.join(notes)})" if notes else style_of(method).title

@@ -51,7 +51,7 @@ def test_a_row_of_fewer_people_than_others_says_so(numbers: Numbers) -> None:
     made = load(people({"ash": (25.0, 27.0, 29.0), "smpl": (24.0, 25.0)}))
     (numbers.folder / "fewer" / "results.csv").write_text(csv_of(made))
     text = numbers.scores("fewer", "loose")
-    assert "| ASH | 27.00 |" in text and "(2 people) | 24.50 |" in text
+    assert "| ASH | 27.00 |" in text and "(2 of 3 people) | 24.50 |" in text
 
 
 def test_rows_of_two_reports_are_compared(numbers: Numbers) -> None:

@@ -110,6 +110,20 @@ def test_several_captures_of_a_scene_are_the_unit_and_their_seeds_are_averaged()
     assert tables.get("loose", "ash", foreground()).n == 2
 
 
+def test_a_mean_over_fewer_people_says_so_and_is_not_ranked() -> None:
+    results = [
+        replace(result(psnr=psnr), config=replace(config(method), subject=subject))
+        for method, scores in {"ash": (24.0, 26.0, 27.0), "ddc": (23.0, 24.0, 25.0), "wo_mot": (29.0, 30.0)}.items()
+        for subject, psnr in enumerate(scores)
+    ]
+    table = build(RunTables(results), "loose", quality_columns(("psnr",)), title="")
+    assert [(name, mark) for name, ((_, mark),) in table.rows] == [
+        ("ASH", "best"),
+        ("DDC", "second"),
+        ("w/o mot. (2 of 3 people)", ""),
+    ]
+
+
 def test_scores_are_means_with_students_interval() -> None:
     tables = RunTables([result(seed=seed, psnr=psnr) for seed, psnr in enumerate((24.0, 25.0, 27.0))])
     score = tables.get("loose", "ash", foreground())
