@@ -2,7 +2,7 @@
 
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -24,7 +24,7 @@ FILE = Path(__file__).with_name("claims.toml")
 NO_SCENE = "no run of this scene"
 COLUMNS = [
     *("name", "scene", "says", "where", "contrast", "paper", "effect", "low", "high", "p", "people", "unit"),
-    *("verdict", "needed", "because", "run"),
+    *("verdict", "needed", "because"),
 ]
 # What each verdict of `compare` on `a` makes of what was expected of it. What is missing was not shown.
 DECIDES: dict[Expected, dict[str, Verdict]] = {
@@ -84,17 +84,18 @@ def read_claims(path: Path = FILE) -> tuple[Claim, ...]:
     return claims
 
 
-def judge(claims: Sequence[Claim], runs: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+def judge(claims: Sequence[Claim], rows: pd.DataFrame) -> pd.DataFrame:
     """Every claim on every scene of it: `COLUMNS`, `effect` is `a` minus `b`, `needed` people would decide.
 
-    `runs`: rows as `analysis.results.load` has them, by the name of their run. A claim is judged within one run, that
-    with the most people; people for validation decide nothing. p is corrected over all claims (Holm). A claim about a
-    single person is not judged, for one person says nothing about others.
+    `rows`: as `analysis.results.load` has them; people for validation decide nothing. p is corrected over all claims
+    (Holm). A claim about a single person is not judged, for one person says nothing about others.
     """
-    contrasts = [(claim, scene, *_compared_in(claim, scene, runs)) for claim in claims for scene in claim.scenes]
-    tests = iter(corrected([test for _, _, test, _, _ in contrasts if test is not None]))
+    rows = rows[rows["subject"] < VALIDATION]
+    of_scene = {scene: rows[rows["scene"] == scene] for claim in claims for scene in claim.scenes}
+    contrasts = [(claim, scene, *_compared(claim, of_scene[scene])) for claim in claims for scene in claim.scenes]
+    tests = iter(corrected([test for _, _, test, _ in contrasts if test is not None]))
     records = []
-    for claim, scene, test, missing, run in contrasts:
+    for claim, scene, test, missing in contrasts:
         record: dict[str, Any] = {
             "name": claim.name,
             "scene": scene,
@@ -105,31 +106,18 @@ def judge(claims: Sequence[Claim], runs: Mapping[str, pd.DataFrame]) -> pd.DataF
             "unit": METRICS[claim.metric].unit,
             "verdict": "cannot be judged here",
             "because": missing,
-            "run": run,
         }
         if test is not None:
             test = next(tests)
             record |= {"effect": test.mean, "low": test.low, "high": test.high, "p": test.p, "people": test.captures}
-            short = _short_of_plateau(claim, scene, runs[run])
-            record["verdict"], record["because"] = _verdict(claim, scene, test, short)
+            record["verdict"], record["because"] = _verdict(
+                claim, scene, test, _short_of_plateau(claim, of_scene[scene])
+            )
             if record["verdict"] == "not shown":
                 beyond = claim.least if claim.expect in ("better", "worse") else 0.0
                 record["needed"] = test.captures_needed(beyond or 0.0)
         records.append(record)
     return pd.DataFrame(records, columns=COLUMNS)
-
-
-def _compared_in(claim: Claim, scene: str, runs: Mapping[str, pd.DataFrame]) -> tuple[Comparison | None, str, str]:
-    """The comparison in the run that has the most people; or None, and why there is none; and the run's name."""
-    compared = [
-        (name, *_compared(claim, rows[(rows["scene"] == scene) & (rows["subject"] < VALIDATION)]))
-        for name, rows in runs.items()
-    ]
-    judged = [(test, name) for name, test, _ in compared if test is not None]
-    if not judged:
-        return None, next((why for _, _, why in compared if why != NO_SCENE), NO_SCENE), ""
-    test, name = max(judged, key=lambda each: each[0].captures)  # the first of equals
-    return test, "", name
 
 
 def _compared(claim: Claim, rows: pd.DataFrame) -> tuple[Comparison | None, str]:
@@ -156,9 +144,9 @@ def _compared(claim: Claim, rows: pd.DataFrame) -> tuple[Comparison | None, str]
     return (test, "") if test.captures else (None, "one person")
 
 
-def _short_of_plateau(claim: Claim, scene: str, rows: pd.DataFrame) -> str:
-    """Which of the two rows ended a training before its plateau; empty where none did."""
-    ended = rows[(rows["scene"] == scene) & (rows["metric"] == "plateau") & (rows["value"] < 1)]
+def _short_of_plateau(claim: Claim, rows: pd.DataFrame) -> str:
+    """Which of the two rows ended a training before its plateau; empty where none did. `rows`: of one scene."""
+    ended = rows[(rows["metric"] == "plateau") & (rows["value"] < 1)]
     short = [style_of(row).title for row in (claim.a, claim.b) if (ended["method"] == row).any()]
     return f"not at their plateau when training ended: {', '.join(short)}" if short else ""
 

@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -252,12 +253,12 @@ class CompareCommand:
 class ClaimsCommand:
     """Judge claims by the rows of runs: what the ASH paper says, and what our README says.
 
-    A claim is a contrast of two rows on a scene, judged in pairs over people. Runs that one report can hold are judged
-    as one run; of others, a claim is judged by the run that has the most people.
+    A claim is a contrast of two rows on a scene, judged in pairs over people; all runs are judged as one. Of a row that
+    several have, trained differently or on other captures, the first run's cells count.
     Exit code 1 where a claim that held in an earlier judgement (--before) does not hold any more.
     """
 
-    runs: Positional[tuple[Path, ...]]  # folders of runs
+    runs: Positional[tuple[Path, ...]]  # folders of runs, packs, or cells.zip of a published report
     claims: File | None = None  # other claims, as benchmarks/analysis/claims.toml has ours
     before: File | None = None  # the claims.csv of an earlier judgement
     out: Folder = Path("runs/claims")  # where claims.html, claims.md and claims.csv go
@@ -266,17 +267,24 @@ class ClaimsCommand:
         """Print the verdicts, and write the page."""
         from benchmarks.analysis.claims import FILE, read_claims
         from benchmarks.report.claims import write_claims
-        from benchmarks.suites.runs import gathered, read_run
+        from benchmarks.suites.archive import unpacked
+        from benchmarks.suites.runs import gathered
 
         if not self.runs:
             raise InputError("expected the folder of a run")
-        runs = [read_run(run) for run in self.runs]
-        if len(runs) > 1:
-            try:
-                runs = [gathered(self.runs, Path(", ".join(map(str, self.runs))), command="")]
-            except InputError as error:
-                print(f"each run is judged by itself ({error})", file=sys.stderr)
-        lines, lost = write_claims(runs, read_claims(self.claims or FILE), self.out, self.before)
+        places = [run.parent if run.is_file() else run for run in self.runs]
+        pages = ([path for name in ("report.html", "report.md") if (path := place / name).exists()] for place in places)
+        with ExitStack() as open_packs:
+            folders = [open_packs.enter_context(unpacked(run)) if run.is_file() else run for run in self.runs]
+            run = gathered(folders, self.out, command="", leave_out=partial(print, file=sys.stderr))
+            lines, lost = write_claims(
+                run,
+                read_claims(self.claims or FILE),
+                self.out,
+                before=self.before,
+                reports=[page for first in pages for page in first[:1]],
+                command=typed(),
+            )
         print("\n".join([*lines, str(self.out / "claims.html")]))
         for claim in lost:
             print(f"no longer holds: {claim}", file=sys.stderr)

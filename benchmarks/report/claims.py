@@ -1,7 +1,7 @@
 """Claims on trial: a page and a table of what the rows of runs say of each."""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.schema import ViewScore
 from benchmarks.report import tables
 from benchmarks.report.compare import Rows, Views, cells_by_row, same_person, shared_views
-from benchmarks.report.content import Block, Bullets, Mark, Section, Strip, Strips, Table, Text
+from benchmarks.report.content import Block, Bullets, Facts, Links, Mark, Section, Strip, Strips, Table, Text
 from benchmarks.report.page import render
 from benchmarks.report.pictures import Album
 from benchmarks.suites.runs import Run
@@ -34,18 +34,25 @@ IN_IMAGES = ("psnr", "ssim", "flip", "lpips", "iou")
 
 
 def write_claims(
-    runs: Sequence[Run], claims: Sequence[Claim], out: Path, before: Path | None = None
+    run: Run,
+    claims: Sequence[Claim],
+    out: Path,
+    *,
+    before: Path | None = None,
+    reports: Sequence[Path] = (),
+    command: str = "",
 ) -> tuple[list[str], list[str]]:
     """Write claims.csv, claims.md and claims.html to `out`.
 
-    `before`: an earlier claims.csv. Returns lines for the terminal, and the claims that held before and do not now.
+    `before`: an earlier claims.csv; `reports`: pages of the run's parts, to be linked; `command`: what does it again.
+    Returns lines for the terminal, and the claims that held before and do not now.
 
     Raises:
-        InputError: a run has no finished cell, or `before` is no claims.csv.
+        InputError: the run has no finished cell, or `before` is no claims.csv.
     """
     earlier = None if before is None else _read(before)
-    rows = {str(run.folder): cells_by_row(run) for run in runs}
-    table = judge(claims, {name: _table(of_run) for name, of_run in rows.items()})
+    rows = cells_by_row(run)
+    table = judge(claims, _table(rows))
     lost = [] if earlier is None else broken(earlier, table)
     write_atomic(out / "claims.csv", table.to_csv(index=False, float_format="%.6g").encode())
     counts = table["verdict"].value_counts()
@@ -62,9 +69,11 @@ def write_claims(
     blocks.append(Bullets(items=tuple(_told(claim, table[table["name"] == claim.name]) for claim in claims)))
     if lost:
         blocks.insert(0, Bullets(items=tuple(lost)))
-    folders = dict.fromkeys(cell.folder.parents[1] for run in runs for cell in run.cells)
-    if links := [os.path.relpath(path, out) for folder in folders if (path := folder / "report.html").exists()]:
-        blocks.append(Text(text=f"Reports of the runs: {', '.join(links)}."))
+    if command:
+        blocks.append(Facts(items=(("Again", command),)))
+    if reports:
+        links = tuple((f"Report of {path.parent.name}", Path(os.path.relpath(path, out))) for path in reports)
+        blocks.append(Links(items=links))
     groups = tuple(_pictures(claims, table, rows, album))
     page = [*blocks, *([Strips(file="", title="", groups=groups)] if groups else [])]
     for form, content in (("html", page), ("md", blocks)):
@@ -123,18 +132,18 @@ def _read(path: Path) -> pd.DataFrame:
 
 
 def _pictures(
-    claims: Sequence[Claim], table: pd.DataFrame, runs: Mapping[str, Rows], album: Album
+    claims: Sequence[Claim], table: pd.DataFrame, rows: Rows, album: Album
 ) -> Iterator[tuple[str, tuple[Strip, ...]]]:
     """Of each claim about pictures that was judged: truth and both rows, in the view of the median difference."""
     by_name = {claim.name: claim for claim in claims}
     strips: dict[tuple[str, ...], Strip | None] = {}
-    for name, scene, effect, run in zip(*(table[column] for column in ("name", "scene", "effect", "run")), strict=True):
+    for name, scene, effect in zip(*(table[column] for column in ("name", "scene", "effect")), strict=True):
         claim = by_name[name]
         if pd.isna(effect) or claim.metric not in IN_IMAGES:
             continue
-        key = (run, scene, claim.a, claim.b, claim.split)
+        key = (scene, claim.a, claim.b, claim.split)
         if key not in strips:
-            pair = same_person(runs[run][scene, claim.a], runs[run][scene, claim.b])
+            pair = same_person(rows[scene, claim.a], rows[scene, claim.b])
             median = partial(_median, split=claim.split)
             strips[key] = next((f.strip(album) for f in shared_views(pair, median)), None) if pair else None
         if (strip := strips[key]) is not None:

@@ -5,6 +5,7 @@ A table is a DataFrame of texts. The page and the Markdown are two templates ove
 
 from dataclasses import dataclass, field
 from itertools import groupby
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import pandas as pd
@@ -29,6 +30,14 @@ class Bullets:
 
     kind: ClassVar[str] = "bullets"
     items: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Links:
+    """A list of texts that link to files, by paths relative to the page."""
+
+    kind: ClassVar[str] = "links"
+    items: tuple[tuple[str, Path], ...]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -105,7 +114,7 @@ class Flipbook:
     chart: Figure
 
 
-Block = Text | Bullets | Facts | Table | Figure | Strips | Flipbook
+Block = Text | Bullets | Links | Facts | Table | Figure | Strips | Flipbook
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

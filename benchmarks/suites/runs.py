@@ -4,7 +4,8 @@ import contextlib
 import os
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -305,11 +306,14 @@ def read_run(folder: Path) -> Run:
     return Run(folder=folder, cells=cells, absent=absent, titles=titles, table=file.table, **names)
 
 
-def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
+def gathered(
+    folders: Sequence[Path], out: Path, *, command: str, leave_out: Callable[[str], None] | None = None
+) -> Run:
     """The finished cells of several runs as one, to be reported in `out`; a cell that several have is taken once.
 
     Where one scene's name stands for different captures of a subject, each is called as its capture's folder is. The
-    commands of the runs and then `command` are the command of the whole.
+    commands of the runs and then `command` are the command of the whole. `leave_out`: is told which cells are left out,
+    where an earlier run has their row trained differently or their scene from other captures; none: see Raises.
 
     Raises:
         InputError: a folder is no run, people for validation are among others, or two cells of one name were trained
@@ -317,6 +321,8 @@ def gathered(folders: Sequence[Path], out: Path, *, command: str) -> Run:
     """
     runs = [read_run(folder) for folder in folders]
     cells = list({cell.config.key: cell for run in runs for cell in run.cells}.values())
+    if leave_out is not None:
+        cells = _first_of_each(cells, leave_out)
     mixed = mixed_places(cell.config for cell in cells)
     if len({cell.config.subject >= VALIDATION for cell in cells}) > 1:
         raise InputError(
@@ -345,18 +351,43 @@ def require_one_of_each(cells: Iterable[Cell]) -> None:
     Raises:
         InputError: names both folders.
     """
+    for cell, other in _clashes(cells):
+        raise InputError(
+            f"{cell.folder}: expected one cell {cell.config.title}, another with other settings or code is"
+            f" {other.folder}; `train --row NAME` names a row, `compare` compares runs"
+        )
+
+
+def _first_of_each(cells: Sequence[Cell], leave_out: Callable[[str], None]) -> list[Cell]:
+    """The finished cells that agree with those before them in their scene's captures and in their row's settings."""
+    cells = [cell for cell in cells if (cell.folder / "result.json").exists()]
+    truths: dict[tuple[str, int], str] = {}
+    alike = [
+        cell
+        for cell in cells
+        if truths.setdefault((cell.config.place, cell.config.subject), cell.config.truth) == cell.config.truth
+    ]
+    kept = {cell.folder for cell in alike} - {cell.folder for cell, _ in _clashes(alike)}
+    left = Counter((cell.config.method, cell.config.place) for cell in cells if cell.folder not in kept)
+    for (method, place), count in left.items():
+        leave_out(f"{method} on {place}: {count} left out, an earlier run has others in their place")
+    return [cell for cell in cells if cell.folder in kept]
+
+
+def _clashes(cells: Iterable[Cell]) -> Iterator[tuple[Cell, Cell]]:
+    """Cells that differ from an earlier one of their name, or of their row in how it was trained; and that one."""
     names: dict[tuple[Any, ...], Cell] = {}
     rows: dict[tuple[str, str], Cell] = {}
     for cell in cells:
         config = cell.config
-        twin = names.setdefault((config.place, config.subject, config.capture_seed, config.method, config.seed), cell)
-        first = rows.setdefault((config.place, config.method), cell)
-        if twin is not cell or _settings(first) != _settings(cell):
-            other = first if twin is cell else twin
-            raise InputError(
-                f"{cell.folder}: expected one cell {config.title}, another with other settings or code is"
-                f" {other.folder}; `train --row NAME` names a row, `compare` compares runs"
-            )
+        row = (config.place, config.method)
+        if row in rows and _settings(rows[row]) != _settings(cell):
+            yield cell, rows[row]
+            continue
+        twin = names.setdefault((*row, config.subject, config.capture_seed, config.seed), cell)
+        if twin is not cell:
+            yield cell, twin
+        rows.setdefault(row, cell)
 
 
 def _settings(cell: Cell) -> tuple[Any, ...]:

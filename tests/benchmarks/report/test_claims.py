@@ -17,6 +17,7 @@ from benchmarks.analysis.results import load
 from benchmarks.cell.schema import Cell, result_of, write_config, write_result
 from benchmarks.commands.arguments import FAILED
 from benchmarks.report.claims import write_claims
+from benchmarks.suites.archive import write_archive
 from benchmarks.suites.files import find_suite, suite_files
 from benchmarks.suites.runs import Run, read_run, write_run
 from benchmarks.suites.suites import Suite
@@ -67,8 +68,8 @@ def rows(a: Sequence[float], b: Sequence[float]) -> pd.DataFrame:
 CLAIM = Claim(name="n", says="s", where="w", a="ash", b="ddc", scenes=("loose",))
 
 
-def verdict(claim: Claim, *tables: pd.DataFrame) -> str:
-    (row,) = judge([claim], {f"run {i}": table for i, table in enumerate(tables)}).itertuples()
+def verdict(claim: Claim, table: pd.DataFrame) -> str:
+    (row,) = judge([claim], table).itertuples()
     return str(row.verdict)
 
 
@@ -103,7 +104,7 @@ def test_a_contrast_decides(expect: str, a: Sequence[float], found: str) -> None
 
 def test_what_is_not_shown_says_how_many_people_would_decide() -> None:
     def needed(claim: Claim, a: Sequence[float]) -> float:
-        return float(judge([claim], {"run": rows(a, OTHER)}).needed.item())
+        return float(judge([claim], rows(a, OTHER)).needed.item())
 
     assert needed(CLAIM, UNCLEAR) > 3 and math.isnan(needed(CLAIM, BETTER)) and math.isnan(needed(CLAIM, SAME))
     wide = (29.0, 31.1, 32.2)  # Better, but not surely by a decibel and a half.
@@ -126,15 +127,15 @@ def test_by_more_than_so_much_asks_for_the_whole_interval() -> None:
 def test_trainings_that_ended_before_their_plateau_are_told() -> None:
     table = rows(BETTER, OTHER)
     ended = table.drop_duplicates(["method", "capture"]).assign(split="speed", region="", metric="plateau", value=1.0)
-    assert judge([CLAIM], {"run": pd.concat([table, ended])}).because.item() == ""
+    assert judge([CLAIM], pd.concat([table, ended])).because.item() == ""
     short = ended.assign(value=(ended["method"] != "ash").astype(float))
-    because = judge([CLAIM], {"run": pd.concat([table, short])}).because.item()
+    because = judge([CLAIM], pd.concat([table, short])).because.item()
     assert because == "not at their plateau when training ended: ASH"
 
 
 def test_what_cannot_be_judged_says_why() -> None:
     told = [
-        judge([CLAIM], {"run": table}).because.item()
+        judge([CLAIM], table).because.item()
         for table in (
             rows((30.0,), (20.0,)),
             load(cells.people({"ash": BETTER})),
@@ -152,21 +153,15 @@ def test_what_cannot_be_judged_says_why() -> None:
     ]
 
 
-def test_it_is_judged_in_the_run_that_has_the_most_people() -> None:
-    few, many = rows(OTHER[:2], BETTER[:2]), rows(BETTER, OTHER)
-    table = judge([CLAIM], {"alone": load(cells.people({"ash": BETTER})), "few": few, "many": many})
-    assert table[["run", "people", "verdict"]].to_numpy().tolist() == [["many", 3, "confirmed"]]
-
-
 def test_p_is_corrected_over_all_claims() -> None:
     many = [replace(CLAIM, name=str(k)) for k in range(20)]
     table = rows((28.9, 30.3, 30.9), OTHER)  # p is 0.016
-    assert judge([CLAIM], {"run": table}).verdict.item() == "confirmed"
-    assert set(judge(many, {"run": table}).verdict) == {"not shown"}
+    assert judge([CLAIM], table).verdict.item() == "confirmed"
+    assert set(judge(many, table).verdict) == {"not shown"}
 
 
 def test_a_claim_that_held_and_does_not_any_more_is_named() -> None:
-    held, lost = (judge([CLAIM], {"run": rows(a, OTHER)}) for a in (BETTER, SAME))
+    held, lost = (judge([CLAIM], rows(a, OTHER)) for a in (BETTER, SAME))
     assert broken(held, held) == [] and broken(lost, held) == []
     assert broken(held, lost) == ["n, loose: confirmed before, contradicted now"]
 
@@ -219,14 +214,16 @@ scenes = ["boxes"]
 def test_a_page_shows_what_was_judged(two_people: Run, tmp_path: Path) -> None:
     file = tmp_path / "claims.toml"
     file.write_text(BOXES)
-    lines, lost = write_claims([two_people], read_claims(file), tmp_path / "judged")
+    lines, lost = write_claims(
+        two_people, read_claims(file), tmp_path / "judged", reports=[tmp_path / "run" / "report.html"]
+    )
     assert "confirmed 1" in lines[-1] and lost == []
     page = (tmp_path / "judged" / "claims.html").read_text()
-    assert "the view of the median difference" in page and "run/report.html" in page
+    assert "the view of the median difference" in page and 'href="../run/report.html"' in page
     assert "80 % power" in page and "more detail is more accurate" in (tmp_path / "judged" / "claims.md").read_text()
 
 
-def part_of(run: Run, method: str, folder: Path, **other: str) -> Path:
+def part_of(run: Run, method: str, folder: Path, /, **other: str) -> Path:
     """A run of one row of another, perhaps trained in another way."""
     made = []
     for cell in (cell for cell in run.cells if cell.config.method == method):
@@ -240,20 +237,41 @@ def part_of(run: Run, method: str, folder: Path, **other: str) -> Path:
 
 
 @pytest.mark.parametrize("other_way", [{"preset": "brief"}, {"code": "0123456789abcdef"}, {"capture": "rendered anew"}])
-def test_rows_of_two_runs_are_compared_where_one_report_can_hold_them(
+def test_rows_of_several_runs_are_compared_and_of_one_trained_in_two_ways_the_first(
     two_people: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], other_way: dict[str, str]
 ) -> None:
-    """Not where a row was trained in two ways."""
     file = tmp_path / "claims.toml"
     file.write_text(BOXES)
     good, bad = (part_of(two_people, f"fake_{name}", tmp_path / name) for name in ("good", "bad"))
-    other = part_of(two_people, "fake_good", tmp_path / "other_way", **other_way)
-    asked = ["claims", str(good), str(bad), "--claims", str(file), "--out", str(tmp_path / "judged")]
-    assert cli.main(asked) == cli.DONE
-    assert "confirmed 1" in capsys.readouterr().out
-    assert cli.main([*asked, str(other)]) == cli.DONE
+    worse = part_of(two_people, "fake_bad", tmp_path / "worse", method="fake_good", **other_way)
+    asked = ["--claims", str(file), "--out", str(tmp_path / "judged")]
+    assert cli.main(["claims", str(good), str(bad), *asked]) == cli.DONE
+    alone = capsys.readouterr().out
+    assert "confirmed 1" in alone
+    assert cli.main(["claims", str(good), str(bad), str(worse), *asked]) == cli.DONE
     printed = capsys.readouterr()
-    assert "cannot be judged here 1" in printed.out and "each run is judged by itself" in printed.err
+    assert printed.out == alone and "fake_good on boxes: 2 left out" in printed.err
+    assert cli.main(["claims", str(worse), str(bad), str(good), *asked]) == cli.DONE
+    printed = capsys.readouterr()
+    assert "contradicted 1" in printed.out and "fake_good on boxes: 2 left out" in printed.err
+
+
+def test_published_reports_are_judged_from_their_numbers(
+    two_people: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "claims.toml"
+    file.write_text(BOXES)
+    published = []
+    for name in ("good", "bad"):
+        made = read_run(part_of(two_people, f"fake_{name}", tmp_path / "runs" / name))
+        published.append(tmp_path / name / "cells.zip")
+        write_archive(made, published[-1])
+        (tmp_path / name / "report.md").write_text("# Report")
+    asked = ["--claims", str(file), "--out", str(tmp_path / "judged")]
+    assert cli.main(["claims", *map(str, published), *asked]) == cli.DONE
+    assert "confirmed 1" in capsys.readouterr().out
+    page = (tmp_path / "judged" / "claims.md").read_text()
+    assert "[Report of good](<../good/report.md>)" in page and "../bad/report.md" in page
 
 
 def test_the_command(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

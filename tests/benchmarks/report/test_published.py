@@ -1,11 +1,13 @@
 """What is published under reports/: its front page has the numbers of its csv files and says whose code made them."""
 
+import re
 from pathlib import Path
 
 import pytest
 from helpers.cells import people
 
 from ash.files import InputError
+from benchmarks import cli
 from benchmarks.analysis.results import csv_of, load
 from benchmarks.cell.registry import code_version
 from benchmarks.report.published import FOLDER, NAME, Numbers, read_me
@@ -23,6 +25,16 @@ def test_the_readme_has_the_numbers_of_the_reports() -> None:
         assert numbers.difference("table", scene, "ash_plus", "ash") in text
     for ablation in ("wo_disp", "smpl"):
         assert numbers.difference("table", "loose", ablation, "ash") in text
+
+
+def test_the_claims_are_judged_by_the_numbers_of_the_reports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the command that stands on their page, but for where it writes."""
+    monkeypatch.chdir(FOLDER.parent)
+    page = (FOLDER / "claims" / "claims.md").read_text().replace("\\", "")
+    again = re.search(r"\*\*Again\.\*\* \S+ (claims .*) --out reports/claims$", page, re.MULTILINE)
+    assert again is not None
+    assert cli.main([*again[1].split(), "--out", str(tmp_path)]) == cli.DONE
+    assert (tmp_path / "claims.csv").read_text() == (FOLDER / "claims" / "claims.csv").read_text()
 
 
 def test_every_report_is_on_the_front_page() -> None:
