@@ -85,13 +85,14 @@ class Frames:
 
 
 def first_cells(run: Run, results: Sequence[CellResult]) -> list[dict[str, Shown]]:
-    """Of each capture: the first cell by method that has one of the results."""
+    """The first cell by method that has one of the results, for each truth: a capture may have been rendered twice."""
     done = {result.config.key: result for result in results}
-    cells: dict[tuple[str, int], dict[str, Shown]] = {}
+    cells: dict[tuple[str, int, str], dict[str, Shown]] = {}
     for cell in run.cells:
         if (result := done.get(cell.config.key)) is not None:
-            by_method = cells.setdefault((cell.config.capture, cell.config.subject), {})
-            by_method.setdefault(cell.config.method, Shown(cell=cell, result=result))
+            config = cell.config
+            by_method = cells.setdefault((config.place, config.subject, config.truth), {})
+            by_method.setdefault(config.method, Shown(cell=cell, result=result))
     return [*cells.values()]
 
 

@@ -14,7 +14,7 @@ from benchmarks.analysis.results import RunTables
 from benchmarks.cell.schema import Cell, CellResult, Summary, failed_result
 from benchmarks.report import people
 from benchmarks.report.content import Bullets, Table
-from benchmarks.report.pictures import Album
+from benchmarks.report.pictures import Album, first_cells
 from benchmarks.report.scene import SceneData, scene_report
 from benchmarks.suites.runs import Run, results_of
 
@@ -53,6 +53,17 @@ def test_every_subject_has_the_lead_of_ash() -> None:
     assert place.items[0] == (
         "On novel views ASH minus DDC is -0.75 to +1.75 dB: ahead by more than 0.1 dB on 1 of 2 subjects, behind on 1."
     )
+
+
+def test_rows_stand_side_by_side_where_the_same_capture_was_rendered_twice() -> None:
+    known = [result(method, subject, 0, 25.0) for method in ("ash", "ddc") for subject in (0, 1)]
+    results = [
+        replace(each, config=replace(each.config, truth=f"of {each.config.subject}", capture=each.config.method))
+        for each in known
+    ]
+    cells = tuple(Cell(config=each.config, folder=Path(), capture_folder=Path()) for each in results)
+    run = Run(folder=Path(), suite="s", about="", command="", cells=cells)
+    assert [list(shown) for shown in first_cells(run, results)] == [["ash", "ddc"], ["ash", "ddc"]]
 
 
 def test_an_ablation_that_changes_nothing_is_no_win() -> None:
@@ -112,10 +123,10 @@ def test_a_report_over_people_shows_everybody(run: Run, tmp_path: Path) -> None:
     sheet = Image.open(io.BytesIO(sheets[strips.file]))
     alone = next(b for s in sections for b in s.blocks if b.kind == "flipbook")
     assert strips.file in sheets and alone.file in sheets and sheet.width < sheet.height
-    apart = {cell.config.key: replace(cell.config, capture=cell.config.method) for cell in cast.cells}
-    rendered_twice = replace(cast, cells=tuple(replace(cell, config=apart[cell.config.key]) for cell in cast.cells))
+    apart = {cell.config.key: replace(cell.config, truth=cell.config.method) for cell in cast.cells}
+    shown_apart = replace(cast, cells=tuple(replace(cell, config=apart[cell.config.key]) for cell in cast.cells))
     of_both = [replace(each, config=apart[each.config.key]) for each in results]
-    assert people.pictured(rendered_twice, of_both, tables, "boxes", Album()) == (None, {})
+    assert people.pictured(shown_apart, of_both, tables, "boxes", Album()) == (None, {})
     shutil.rmtree(tmp_path / "other")
     with pytest.raises(InputError):
         people.pictured(cast, results, tables, "boxes", Album())
