@@ -116,8 +116,8 @@ def _matrix(tables: RunTables, effects: Sequence[ablation_matrix.AblationEffect]
     if framed:
         counts = Counter(effect.verdict for effect in framed)
         sentences = ablation_matrix.surprises(list(effects))
-        text = f"On {words}, {len(framed)} components were removed from scenes that should need them."
-        text += f" Verdicts on ASH with them: {', '.join(f'{count} {verdict}' for verdict, count in counts.items())}."
+        verdicts = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
+        text = f"Framed on {words}: {len(framed)}. Verdicts on ASH with the component: {verdicts}."
         blocks.append(Text(text=f"{text} {'Contradictions:' if sentences else 'No contradictions.'}"))
         blocks += [Bullets(items=tuple(sentences))] if sentences else []
         if open_cells := ablation_matrix.undecided(list(effects)):

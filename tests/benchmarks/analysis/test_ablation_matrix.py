@@ -93,6 +93,13 @@ def test_surprises_are_what_contradicts_the_expectation(factors: RunTables) -> N
     assert said[2].endswith("worse, although the scene should need it.")
 
 
+def test_a_scene_of_all_phenomena_may_need_components_that_are_not_expected_of_it() -> None:
+    loose = run("loose", {"ash": 27.0, "unlearned": 27.0, "wo_disp": 25.0})
+    tables = RunTables(loose + run("skinned", {"ash": 27.0, "wo_disp": 27.0}))
+    (said,) = surprises(matrix(tables, differences(tables), "novel_view"))
+    assert said.startswith("loose, skinned template") and said.endswith("although the scene should need it.")
+
+
 def test_a_surprise_names_the_control_scene_where_it_was_run() -> None:
     base = {"ash": 27.0, "wo_mot": 26.0, "wo_disp": 27.0}
     shown = run("skinned", base) + run("wrinkles", base)
