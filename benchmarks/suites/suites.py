@@ -110,15 +110,14 @@ class Suite:
 
     def __post_init__(self) -> None:
         """Refuse what makes no table."""
-        scenes, methods = [row.name for row in self.scenes], [row.name for row in self.methods]
+        scenes, known = tuple(row.name for row in self.scenes), tuple(row.name for row in self.methods)
         several = [name for name in scenes if not people_of_one([row for row in self.scenes if row.name == name])]
-        twice = [name for name in methods if methods.count(name) > 1]
-        for what, names, alike in (("scene", scenes, several), ("method", methods, twice)):
+        twice = [name for name in known if known.count(name) > 1]
+        for what, names, alike in (("scene", scenes, several), ("method", known, twice)):
             if not names:
                 raise InputError(f"expected at least one {what}")
             if alike:
                 raise InputError(f"two {what}s are called {alike[0]!r}, expected a name of its own for each")
-        known = tuple(method.name for method in self.methods)
         for scene in self.scenes:
             for name in scene.methods:
                 if name not in known:
