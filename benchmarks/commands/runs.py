@@ -3,7 +3,6 @@
 import os
 import sys
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -172,12 +171,11 @@ class ReportCommand:
 
     Shards of one run are merged: their cells are copied to --out, which is then the whole run.
 
-    What --publish leaves holds cells.zip, every number of every cell. Unpacked, that is a run for `report` and
-    `compare`: `unzip reports/table/cells.zip -d runs/earlier`.
+    What --publish leaves holds cells.zip, every number of every cell. That is a run too, without pictures.
     """
 
-    runs: Positional[tuple[Path, ...]]  # folders of runs or of single cells
-    out: Folder | None = None  # where the report goes; default: the run's own folder, for several runs/report
+    runs: Positional[tuple[Path, ...]]  # folders of runs or of single cells, packs, or cells.zip of a published report
+    out: Folder | None = None  # where the report goes; default: the run's own folder, otherwise runs/report
     publish: Folder | None = None  # copy it there, to be committed: all but the page, and every cell's numbers
     chosen_on: Folder | None = None  # a run of the same rows with --validation: how what suffices there does here
     # write its tables alone: a suite of ours or FILE.toml with [[table]]; default: the table of the run's suite
@@ -188,20 +186,26 @@ class ReportCommand:
 
     def __call__(self) -> int:
         """Write it, and copy it where that is asked for."""
+        from benchmarks.suites.archive import opened
         from benchmarks.suites.merge import are_shards, merge_runs
-        from benchmarks.suites.runs import TRAINED_BY_HAND, gathered, read_run, require_for_choosing
+        from benchmarks.suites.runs import TRAINED_BY_HAND, gathered, read_run
 
         if not self.runs:
             raise InputError("expected the folder of a run or of a cell")
-        if len(self.runs) == 1 and self.out is None:
-            run = read_run(self.runs[0])
-            if run.suite == TRAINED_BY_HAND:  # Nothing keeps such a folder from holding two versions of a row.
-                run = gathered(self.runs, self.runs[0], command=run.command)
-        elif are_shards(self.runs):
-            merge_runs(self.runs, out := self.out or Path("runs/report"))
-            run = read_run(out)
-        else:
-            run = gathered(self.runs, self.out or Path("runs/report"), command=typed())
+        out = self.out or Path("runs/report")
+        if are_shards(self.runs):
+            merge_runs(self.runs, out)
+            return self._write(read_run(out))
+        with opened(self.runs) as runs:
+            if len(runs) > 1 or self.out is not None or self.runs[0].is_file():
+                return self._write(gathered(runs, out, command=typed()))
+            if runs[0].suite == TRAINED_BY_HAND:  # Nothing keeps such a folder from holding two versions of a row.
+                runs = [gathered(runs, self.runs[0], command=runs[0].command)]
+            return self._write(runs[0])
+
+    def _write(self, run: "RunOnDisk") -> int:
+        from benchmarks.suites.runs import read_run, require_for_choosing
+
         if self.table or self.latex or self.markdown or self.csv:
             return self._tables(run)
         if self.chosen_on is None:
@@ -234,17 +238,18 @@ class ReportCommand:
 class CompareCommand:
     """Put two runs side by side: before and after, row by row, with the worst frames of each."""
 
-    before: Positional[Path]  # a run's folder or a cell's
+    before: Positional[Path]  # a run's folder or a cell's, a pack, or cells.zip of a published report
     after: Positional[Path]  # another
-    out: Folder | None = None  # write compare.html and compare.csv there; default: AFTER/compare
+    out: Folder | None = None  # write compare.html and compare.csv there; default: AFTER/compare, of a file beside it
 
     def __call__(self) -> int:
         """Print the table, and write the page."""
         from benchmarks.report.compare import write_comparison
-        from benchmarks.suites.runs import read_run
+        from benchmarks.suites.archive import opened
 
-        out = self.out or self.after / "compare"
-        print(write_comparison(read_run(self.before), read_run(self.after), out))
+        out = self.out or (self.after.parent if self.after.is_file() else self.after) / "compare"
+        with opened((self.before, self.after)) as (before, after):
+            print(write_comparison(before, after, out))
         print(out / "compare.html")
         return DONE
 
@@ -267,16 +272,15 @@ class ClaimsCommand:
         """Print the verdicts, and write the page."""
         from benchmarks.analysis.claims import FILE, read_claims
         from benchmarks.report.claims import write_claims
-        from benchmarks.suites.archive import unpacked
+        from benchmarks.suites.archive import opened
         from benchmarks.suites.runs import gathered
 
         if not self.runs:
             raise InputError("expected the folder of a run")
         places = [run.parent if run.is_file() else run for run in self.runs]
         pages = ([path for name in ("report.html", "report.md") if (path := place / name).exists()] for place in places)
-        with ExitStack() as open_packs:
-            folders = [open_packs.enter_context(unpacked(run)) if run.is_file() else run for run in self.runs]
-            run = gathered(folders, self.out, command="", leave_out=partial(print, file=sys.stderr))
+        with opened(self.runs) as runs:
+            run = gathered(runs, self.out, command="", leave_out=partial(print, file=sys.stderr))
             lines, lost = write_claims(
                 run,
                 read_claims(self.claims or FILE),

@@ -1,8 +1,8 @@
 """Runs as one file, written here and read as hostile input.
 
 `cells.zip` holds every number of every cell, without avatars and pictures, for a repository. A pack also holds the
-pictures that were scored and `pack.json`: SHA-256 of every file and of the checkpoints, which are not in it. Unpacked,
-either is a run again, of which `report` and `compare` read all that is there.
+pictures that were scored and `pack.json`: SHA-256 of every file and of the checkpoints, which are not in it. Either is
+a run again, of which `report`, `compare`, `claims` and `leaderboard` read all that is there.
 """
 
 import contextlib
@@ -13,8 +13,8 @@ import shutil
 import struct
 import tempfile
 import zipfile
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from ash.files import PACKED, PLAIN, InputError, disk_problem, open_regular, rea
 from benchmarks.cell.metrics import IMAGE_SPLITS, PROTOCOL
 from benchmarks.cell.schema import CHECKPOINT, prediction_path, result_of
 from benchmarks.provenance import commit, machine, versions
-from benchmarks.suites.runs import RUN_FILE, Run, description_of
+from benchmarks.suites.runs import RUN_FILE, Run, description_of, read_run
 
 PACK_FILE = "pack.json"
 PACK_SCHEMA = 1
@@ -149,6 +149,20 @@ def unpacked(path: Path) -> Iterator[Path]:
             yield Path(name)
         except InputError as error:
             raise InputError(str(error).replace(name, str(path))) from error
+
+
+@contextlib.contextmanager
+def opened(paths: Sequence[Path]) -> Iterator[list[Run]]:
+    """The runs of folders, of single cells' folders, of packs and of `cells.zip`, for as long as the block lasts.
+
+    Each is called as it was given (`Run.folder`), also where its cells lie in a temporary folder.
+
+    Raises:
+        InputError: see `read_run` and `unpacked`.
+    """
+    with contextlib.ExitStack() as stack:
+        folders = [stack.enter_context(unpacked(path)) if path.is_file() else path for path in paths]
+        yield [replace(read_run(folder), folder=path) for folder, path in zip(folders, paths, strict=True)]
 
 
 def _require_small_index(file: Any) -> None:

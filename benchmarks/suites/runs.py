@@ -306,9 +306,7 @@ def read_run(folder: Path) -> Run:
     return Run(folder=folder, cells=cells, absent=absent, titles=titles, table=file.table, **names)
 
 
-def gathered(
-    folders: Sequence[Path], out: Path, *, command: str, leave_out: Callable[[str], None] | None = None
-) -> Run:
+def gathered(runs: Sequence[Run], out: Path, *, command: str, leave_out: Callable[[str], None] | None = None) -> Run:
     """The finished cells of several runs as one, to be reported in `out`; a cell that several have is taken once.
 
     Where one scene's name stands for different captures of a subject, each is called as its capture's folder is. The
@@ -316,10 +314,9 @@ def gathered(
     where an earlier run has their row trained differently or their scene from other captures; none: see Raises.
 
     Raises:
-        InputError: a folder is no run, people for validation are among others, or two cells of one name were trained
-            differently: a report would take them for two seeds.
+        InputError: people for validation are among others, or two cells of one name were trained differently: a
+            report would take them for two seeds.
     """
-    runs = [read_run(folder) for folder in folders]
     cells = list({cell.config.key: cell for run in runs for cell in run.cells}.values())
     if leave_out is not None:
         cells = _first_of_each(cells, leave_out)
@@ -335,7 +332,7 @@ def gathered(
         for cell in cells
     ]
     require_one_of_each(named)
-    about = f"cells of {', '.join(map(str, folders))}"
+    about = f"cells of {', '.join(str(run.folder) for run in runs)}"
     titles = {name: title for run in reversed(runs) for name, title in run.titles.items()}  # The first run's first.
     table = next((run.table for run in runs if run.table), ())
     there = {cell.config.key for cell in cells}

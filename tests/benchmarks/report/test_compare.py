@@ -18,10 +18,11 @@ from ash.capture.manifest import read_manifest
 from ash.files import InputError
 from benchmarks import cli
 from benchmarks.cell.schema import Cell, CellResult, result_of, write_config, write_result
+from benchmarks.commands import arguments
 from benchmarks.report.compare import changes, failures_in_words, printed, verdict_of, write_comparison
-from benchmarks.suites import runs as runs_module
+from benchmarks.suites.archive import opened, write_archive
 from benchmarks.suites.captures import SHOWS_THE_SAME, truth_of
-from benchmarks.suites.runs import Run, gathered, read_run, write_run
+from benchmarks.suites.runs import Run, gathered, read_run, results_of, write_run
 
 Rows = dict[tuple[str, str], list[tuple[Cell, CellResult]]]
 
@@ -124,14 +125,33 @@ def test_a_report_over_runs_and_cells(runs: tuple[Path, Path], tmp_path: Path, n
     cells = [*(runs[0] / "cells").iterdir()]
     assert cli.main(["report", *map(str, cells), "--out", str(tmp_path / "both")]) == 0
     assert "boxes" in (tmp_path / "both" / "report.md").read_text()
-    run = gathered([runs[0], cells[0]], tmp_path, command="report")
+    run = gathered([*map(read_run, (runs[0], cells[0]))], tmp_path, command="report")
     assert len(run.cells) == 2 and len({each.config.key for each in run.cells}) == 2
     assert run.command == "run before; report"
 
 
+def test_report_and_compare_take_archives(runs: tuple[Path, Path], tmp_path: Path, no_chart_files: None) -> None:
+    published = [tmp_path / name / "cells.zip" for name in ("before", "after")]
+    for folder, archive in zip(runs, published, strict=True):
+        write_archive(read_run(folder), archive)
+    with opened(published) as both:
+        assert [run.folder for run in both] == published
+        assert [run.cells[0].config.key for run in both] == [read_run(each).cells[0].config.key for each in runs]
+    out = tmp_path / "report"
+    assert cli.main(["report", str(published[0]), "--out", str(out), "--publish", str(tmp_path / "again")]) == 0
+    assert f"Cells of {published[0]}." in (out / "report.html").read_text()
+    with opened([published[0], tmp_path / "again" / "cells.zip"]) as (before, again):
+        assert results_of(again) == results_of(before)
+    assert cli.main(["compare", *map(str, published)]) == 0
+    page = (published[1].parent / "compare" / "compare.html").read_text()
+    assert f"Before: {published[0]} (" in page and "ash-bench-pack-" not in page
+    published[0].write_bytes(b"no archive")
+    assert cli.main(["compare", *map(str, published)]) == arguments.WRONG_INPUT
+
+
 def test_two_avatars_of_one_name_are_no_two_seeds(runs: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"expected one cell boxes · mine · seed 0, another with other settings"):
-        gathered(runs, tmp_path, command="")
+        gathered([*map(read_run, runs)], tmp_path, command="")
 
 
 def test_captures_of_one_name_are_told_apart(runs: tuple[Path, Path], tmp_path: Path) -> None:
@@ -142,17 +162,17 @@ def test_captures_of_one_name_are_told_apart(runs: tuple[Path, Path], tmp_path: 
     shown = load_capture(other)
     same = replace(mine, capture_folder=other)
     third = copied(same, tmp_path, capture=shown.identity, truth=truth_of(shown.manifest))
-    run = gathered([runs[0], third.folder], tmp_path, command="")
+    run = gathered([*map(read_run, (runs[0], third.folder))], tmp_path, command="")
     assert {each.config.scene for each in run.cells} == {"capture", "other"}
 
 
-def test_subjects_of_a_scene_stay_one_scene(runs: tuple[Path, Path], tmp_path: Path, monkeypatch) -> None:
+def test_subjects_of_a_scene_stay_one_scene(runs: tuple[Path, Path], tmp_path: Path) -> None:
     run = read_run(runs[0])
     for subjects, names in (((0, 1), {"boxes"}), ((1, 1), {"capture"})):
         output = zip(run.cells, subjects, strict=False)
         cells = tuple(replace(c, config=replace(c.config, subject=k, truth=str(n))) for n, (c, k) in enumerate(output))
-        monkeypatch.setattr(runs_module, "read_run", lambda _, cells=cells: replace(run, cells=cells))
-        assert {each.config.scene for each in gathered([runs[0]], tmp_path, command="").cells} == names
+        whole = gathered([replace(run, cells=cells)], tmp_path, command="")
+        assert {each.config.scene for each in whole.cells} == names
 
 
 def test_runs_without_a_common_row_are_refused(runs: tuple[Path, Path], tmp_path: Path) -> None:
