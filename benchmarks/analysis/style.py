@@ -70,8 +70,12 @@ STYLES = {
     "sh_2": MethodStyle("SH 2", "#7a869a"),
     "mlp": MethodStyle("w/ MLP", "#c2415c"),
     "mlp_base": MethodStyle("w/ MLP on static texels", "#a0522d"),
-    # Suite `mlp`.
+    # Suites `mlp` and `offline_stability`.
     "ash_6_min": MethodStyle("ASH, 6 min", "#2f6fde"),
+    "ddc_6_min": MethodStyle("DDC, 6 min", "#dd6b20", reference="ash_6_min"),
+    "tava_6_min": MethodStyle("TAVA, 6 min", "#c2415c", reference="ash_6_min"),
+    "neural_actor_6_min": MethodStyle("Neural Actor, 6 min", "#5b8c2a", reference="ash_6_min"),
+    "hdhumans_6_min": MethodStyle("HDHumans, 6 min", "#9b59b6", reference="ash_6_min"),
     "mlp_6_min": MethodStyle("w/ MLP, 6 min", "#c2415c", reference="ash_6_min"),
     "plus_base_6_min": MethodStyle("+ static texels, 6 min", "#5b8c2a", reference="ash_6_min"),
     "mlp_base_6_min": MethodStyle("w/ MLP on static texels, 6 min", "#a0522d", reference="plus_base_6_min"),

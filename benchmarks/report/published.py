@@ -45,7 +45,7 @@ def read_me(folder: Path = FOLDER) -> str:
 class Numbers:
     """What a template may ask for; a quantity is named by split and metric (`benchmarks.cell.metrics`).
 
-    Rows of several reports are those of "one+other".
+    Rows of several reports are those of "one+other". A scene may be a perturbed one, "loose tracking=3".
     """
 
     def __init__(self, folder: Path) -> None:
