@@ -245,9 +245,9 @@ class CompareCommand:
     def __call__(self) -> int:
         """Print the table, and write the page."""
         from benchmarks.report.compare import write_comparison
-        from benchmarks.suites.archive import opened
+        from benchmarks.suites.archive import folder_of, opened
 
-        out = self.out or (self.after.parent if self.after.is_file() else self.after) / "compare"
+        out = self.out or folder_of(self.after) / "compare"
         with opened((self.before, self.after)) as (before, after):
             print(write_comparison(before, after, out))
         print(out / "compare.html")
@@ -272,12 +272,12 @@ class ClaimsCommand:
         """Print the verdicts, and write the page."""
         from benchmarks.analysis.claims import FILE, read_claims
         from benchmarks.report.claims import write_claims
-        from benchmarks.suites.archive import opened
+        from benchmarks.suites.archive import folder_of, opened
         from benchmarks.suites.runs import gathered
 
         if not self.runs:
             raise InputError("expected the folder of a run")
-        places = [run.parent if run.is_file() else run for run in self.runs]
+        places = [folder_of(run) for run in self.runs]
         pages = ([path for name in ("report.html", "report.md") if (path := place / name).exists()] for place in places)
         with opened(self.runs) as runs:
             run = gathered(runs, self.out, command="", leave_out=partial(print, file=sys.stderr))

@@ -165,6 +165,11 @@ def opened(paths: Sequence[Path]) -> Iterator[list[Run]]:
         yield [replace(read_run(folder), folder=path) for folder, path in zip(folders, paths, strict=True)]
 
 
+def folder_of(path: Path) -> Path:
+    """The folder of a run, or the one that its archive lies in: where its pages are."""
+    return path.parent if path.is_file() else path
+
+
 def _require_small_index(file: Any) -> None:
     """Refuse what zipfile would read into memory unasked: an index of any size."""
     size = file.seek(0, 2)
