@@ -226,8 +226,8 @@ def test_reports_need_a_finished_cell(finished: Path, tmp_path: Path, capsys) ->
     assert (out / "report.html").read_bytes() == page
 
 
-# An interrupt may fall between psutil's open() and its `with`: the file is closed when it is collected.
-@pytest.mark.filterwarnings("ignore:.*FileIO name='/proc/:pytest.PytestUnraisableExceptionWarning")
+# An interrupt may fall between an open(), ours or psutil's, and its `with`: the file is closed when it is collected.
+@pytest.mark.filterwarnings("ignore:.*FileIO name=:pytest.PytestUnraisableExceptionWarning")
 def test_ctrl_c_exits_with_130_and_the_same_command_goes_on(capture: Path, tmp_path: Path, capsys) -> None:
     def interrupt_the_training(number: int) -> None:
         wait_for(lambda: list(tmp_path.glob("cells/*/*/log.jsonl")))

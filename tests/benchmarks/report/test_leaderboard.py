@@ -13,6 +13,7 @@ from helpers.browser import PHONE, Visitor
 from helpers.commands import refused
 from helpers.hostile import Text
 from helpers.packs import change, change_json
+from helpers.waiting import wait_for
 from PIL import Image
 
 from ash.capture.formats import load_capture
@@ -88,16 +89,15 @@ def test_it_sorts_filters_and_shows_any_picture(board: Path, visit: Visitor) -> 
     assert sent.inner_text().split().count("n/a") < unknown
     page.select_option("#region", "full")
     assert page.locator("#board thead", has_text="(whole frame)").count() == 0
-    sent.locator("a").click()  # The page follows its address a moment later.
-    page.wait_for_function("document.querySelectorAll('#strip figure').length === 2")
+    sent.locator("a").click()
+    wait_for(lambda: page.locator("#strip figure").count() == 2)  # The page follows its address a moment later.
     page.select_option("#method", "")
     page.select_option("#images", "novel_pose")
     page.click("[data-step='1']")
     assert page.inner_text("#number") == "5" and page.url.endswith("/novel_pose/cam3/5/all")
     assert page.locator("#values tbody tr").count() == 3
-    page.wait_for_function(
-        "[...document.querySelectorAll('#strip img')].every((i) => i.complete && i.naturalWidth === 64)"
-    )
+    loaded = "images => images.every(i => i.complete && i.naturalWidth === 64)"
+    wait_for(lambda: page.locator("#strip img").evaluate_all(loaded))
     assert page.locator("#strip img").count() == 1 + 3 * 3 and page.locator("#strip a").count() == 4
     other = visit(page.url, size=PHONE, scheme="dark")
     assert other.page.inner_text("#number") == "5" and other.page.input_value("#images") == "novel_pose"
