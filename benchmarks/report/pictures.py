@@ -85,15 +85,23 @@ class Frames:
 
 
 def first_cells(run: Run, results: Sequence[CellResult]) -> list[dict[str, Shown]]:
-    """The first cell by method that has one of the results, for each truth: a capture may have been rendered twice."""
+    """The first cell by method that has one of the results, for each truth: a capture may have been rendered twice.
+
+    Where some cells have pictures and others, from a published report, have none: those that have.
+    """
     done = {result.config.key: result for result in results}
+    finished = [cell for cell in run.cells if cell.config.key in done]
     cells: dict[tuple[str, int, str], dict[str, Shown]] = {}
-    for cell in run.cells:
-        if (result := done.get(cell.config.key)) is not None:
-            config = cell.config
-            by_method = cells.setdefault((config.place, config.subject, config.truth), {})
-            by_method.setdefault(config.method, Shown(cell=cell, result=result))
+    for cell in [cell for cell in finished if has_pictures(cell)] or finished:
+        config = cell.config
+        by_method = cells.setdefault((config.place, config.subject, config.truth), {})
+        by_method.setdefault(config.method, Shown(cell=cell, result=done[config.key]))
     return [*cells.values()]
+
+
+def has_pictures(cell: Cell) -> bool:
+    """Whether what was drawn lies beside the numbers."""
+    return (cell.folder / "images").is_dir()
 
 
 def tracks(capture: Capture, shown: Sequence[Shown], album: Album, *, max_bytes: int) -> list[dict[str, Any]]:

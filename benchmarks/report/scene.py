@@ -267,6 +267,8 @@ def _picture_sections(
         "Cropped to the subject, on grey; compressed for this page, while scores come from the stored pictures. First "
         "seed. Difference: that to the truth, four times enlarged."
     )
+    if few := _people_pictured(data):
+        note += f" Pictures are of {few}: the other cells are those of a published report, which holds no pictures."
     sections = [Section(title=title, blocks=(flipbook, Text(text=note, note=True)))]
     if subjects is not None:
         typical = "Of novel views and of novel poses the view whose score by ASH is the subject's median."
@@ -278,6 +280,15 @@ def _picture_sections(
         blocks = (strips, Text(text=text, note=True))
         sections.append(Section(title=f"The worst frames on {data.scene}, by image region", blocks=blocks))
     return sections, sheets | subject_sheet | worst_sheet
+
+
+def _people_pictured(data: SceneData) -> str:
+    """Of which people there are pictures, in words; empty where of all."""
+    keys = {result.config.key for result in data.results}
+    cells = [cell for cell in data.run.cells if cell.config.key in keys]
+    people = {cell.config.subject for cell in cells}
+    pictured = sorted({cell.config.subject for cell in cells if pictures.has_pictures(cell)})
+    return f"subject {', '.join(map(str, pictured))} of {len(people)} people" if len(pictured) < len(people) else ""
 
 
 def on_sheet(shown: list[Shown]) -> list[Shown]:

@@ -123,6 +123,12 @@ def test_a_report_over_people_shows_everybody(run: Run, tmp_path: Path) -> None:
     sheet = Image.open(io.BytesIO(sheets[strips.file]))
     alone = next(b for s in sections for b in s.blocks if b.kind == "flipbook")
     assert strips.file in sheets and alone.file in sheets and sheet.width < sheet.height
+    first = tuple(replace(cell, folder=tmp_path) if cell.config.subject == 0 else cell for cell in cast.cells)
+    sections, _ = scene_report(replace(data, run=replace(cast, cells=first)))
+    (strips,) = (b for s in sections if s.title == "All subjects on boxes" for b in s.blocks if b.kind == "strips")
+    assert [name for name, _ in strips.groups] == ["subject 1"], "of the first only numbers were published"
+    side_by_side = next(s for s in sections if s.title.startswith("Side by side"))
+    assert "Pictures are of subject 1 of 2 people" in side_by_side.blocks[-1].text
     apart = {cell.config.key: replace(cell.config, truth=cell.config.method) for cell in cast.cells}
     shown_apart = replace(cast, cells=tuple(replace(cell, config=apart[cell.config.key]) for cell in cast.cells))
     of_both = [replace(each, config=apart[each.config.key]) for each in results]
