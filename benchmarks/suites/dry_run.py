@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 
-from benchmarks.suites.captures import described
+from benchmarks.suites.captures import described, folder_of
 from benchmarks.suites.engine import shard_of
 from benchmarks.suites.runs import RunOptions, require_runnable
 from benchmarks.suites.scenes import SPLATS
@@ -12,6 +12,7 @@ from benchmarks.suites.suites import CellSpec, Suite
 
 def estimate(suite: Suite, options: RunOptions) -> str:
     """Cells, hours and gigabytes of a suite, as lines."""
+    from synth.capture import is_finished
     from synth.cost import estimate as estimate_capture
 
     notes = require_runnable(suite, options)
@@ -29,7 +30,9 @@ def estimate(suite: Suite, options: RunOptions) -> str:
         if (spec.of or spec.scene) == SPLATS:
             lines.append(f"capture {spec.name}: splatted, under a minute")
             continue
-        lines.append(f"capture {spec.name}: {estimate_capture(described(spec)).text}")
+        scene, folder = described(spec), folder_of(spec, options.data)
+        state = "is there" if is_finished(scene, folder) else estimate_capture(scene).text
+        lines.append(f"capture {folder.name}: {state}")
     lines += ["", *_described(cells)]
     hours = len(cells) * suite.cell_minutes / 60
     beside = options.side_by_side

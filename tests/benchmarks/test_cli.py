@@ -213,6 +213,12 @@ def test_dry_run_starts_nothing(tmp_path: Path, capsys) -> None:
     assert not out.exists()
 
 
+def test_dry_run_does_not_count_a_finished_capture(ci_data: Path, capsys) -> None:
+    assert cli.main(["run", "ci", "--data", str(ci_data), "--dry-run"]) == arguments.DONE
+    told = capsys.readouterr().out
+    assert "capture mannequin-ci-0: is there" in told and "GB" not in told
+
+
 def test_reports_need_a_finished_cell(finished: Path, tmp_path: Path, capsys) -> None:
     assert "run.json: cannot be read" in refused(capsys, "report", str(tmp_path))
     out = finished
