@@ -319,7 +319,7 @@ def _head(column: TableColumn, scenes: Sequence[str]) -> tuple[str, str]:
 
 
 def _caption(tables: RunTables, spec: TableSpec, marks: set[Mark], notes: Sequence[str]) -> str:
-    """People, seeds, what stands in a cell, those marks that the table has, protocol."""
+    """People, seeds, regions, what stands in a cell, those marks that the table has, protocol."""
     sentences = [spec.caption.rstrip(".") + "."] if spec.caption else []
     units = set()
     for scene in _scenes(spec.columns):
@@ -328,6 +328,11 @@ def _caption(tables: RunTables, spec: TableSpec, marks: set[Mark], notes: Sequen
             counts = f"{people} {'person' if people == 1 else 'people'}, {seeds} seed{'' if seeds == 1 else 's'}"
             sentences.append(f"Scene {scene}: {counts}{' each' if people > 1 else ''}.")
             units.add("people" if people > 1 else "the seeds of one person" if seeds > 1 else "")
+    sentences += dict.fromkeys(
+        f"{METRICS[column.metric].title}: {measured.REGION_TITLES[column.region]}."
+        for column in spec.columns
+        if column.title and column.region in measured.REGION_TITLES  # Which a title of the author's may not tell.
+    )
     over = " and ".join(sorted(filter(None, units)))
     if not over:
         sentences.append("One value per row: no interval, and no row is marked as best.")

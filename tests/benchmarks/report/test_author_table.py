@@ -83,6 +83,13 @@ def test_one_value_has_no_mark_and_no_interval() -> None:
     assert "One value per row" in table.caption and "Bold" not in table.caption
 
 
+def test_the_caption_tells_the_region_of_a_column_that_has_a_title_of_its_own() -> None:
+    plain = {"metric": "psnr", "split": "novel_view"}
+    column = plain | {"region": "release_crop", "title": "PSNR"}
+    assert made(LEVELS, columns=[column, column]).caption.count("PSNR: release crop.") == 1
+    assert "crop" not in made(LEVELS, columns=[plain, plain | {"title": "PSNR"}]).caption
+
+
 def test_without_the_reference_there_are_means_alone() -> None:
     asked = {key: value for key, value in ASKED.items() if key != "rows"}
     results = people({"wo_mot": LEVELS["wo_mot"]})
