@@ -83,9 +83,9 @@ STYLES = {
     "tava": MethodStyle("TAVA", "#c2415c"),
     "neural_actor": MethodStyle("Neural Actor", "#5b8c2a"),
     "hdhumans": MethodStyle("HDHumans", "#9b59b6"),
-    "tava_120_min": MethodStyle("TAVA, 120 min", "#8c2f45", reference="ash"),
-    "neural_actor_120_min": MethodStyle("Neural Actor, 120 min", "#3f6b12", reference="ash"),
-    "hdhumans_120_min": MethodStyle("HDHumans, 120 min", "#6d3f85", reference="ash"),
+    "tava_120_min": MethodStyle("TAVA, 120 min", "#8c2f45"),
+    "neural_actor_120_min": MethodStyle("Neural Actor, 120 min", "#3f6b12"),
+    "hdhumans_120_min": MethodStyle("HDHumans, 120 min", "#6d3f85"),
     "per_frame": MethodStyle("Gaussians per training frame", "#7a869a", reference="ash_plus"),
     # Suite `switches`.
     "warm_up_released": MethodStyle("warm-up as released", "#7a869a"),

@@ -92,14 +92,14 @@ def first_cells(run: Run, results: Sequence[CellResult]) -> list[dict[str, Shown
     done = {result.config.key: result for result in results}
     finished = [cell for cell in run.cells if cell.config.key in done]
     cells: dict[tuple[str, int, str], dict[str, Shown]] = {}
-    for cell in [cell for cell in finished if has_pictures(cell)] or finished:
+    for cell in [cell for cell in finished if _has_pictures(cell)] or finished:
         config = cell.config
         by_method = cells.setdefault((config.place, config.subject, config.truth), {})
         by_method.setdefault(config.method, Shown(cell=cell, result=done[config.key]))
     return [*cells.values()]
 
 
-def has_pictures(cell: Cell) -> bool:
+def _has_pictures(cell: Cell) -> bool:
     """Whether what was drawn lies beside the numbers."""
     return (cell.folder / "images").is_dir()
 

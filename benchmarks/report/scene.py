@@ -283,11 +283,11 @@ def _picture_sections(
 
 
 def _people_pictured(data: SceneData) -> str:
-    """Of which people there are pictures, in words; empty where of all."""
-    keys = {result.config.key for result in data.results}
-    cells = [cell for cell in data.run.cells if cell.config.key in keys]
-    people = {cell.config.subject for cell in cells}
-    pictured = sorted({cell.config.subject for cell in cells if pictures.has_pictures(cell)})
+    """Of which people there are pictures, in words; empty where of all whose cells are done."""
+    done = [result for result in data.results if result.status == "done"]
+    people = {result.config.subject for result in done}
+    shown = (each for cells in pictures.first_cells(data.run, done) for each in cells.values())
+    pictured = sorted({each.cell.config.subject for each in shown})
     return f"subject {', '.join(map(str, pictured))} of {len(people)} people" if len(pictured) < len(people) else ""
 
 

@@ -32,13 +32,13 @@ def make_capture(spec: CaptureSpec, data: Path, *, workers: int) -> Path:
         return _perturbed_capture(
             spec, spec.stress, make_capture(replace(spec, stress=None), data, workers=workers), data
         )
-    folder = folder_of(spec, data)
+    folder = capture_folder(spec, data)
     if spec.folder is None:
         make_capture_in(spec, folder, workers=workers)
     return folder
 
 
-def folder_of(spec: CaptureSpec, data: Path) -> Path:
+def capture_folder(spec: CaptureSpec, data: Path) -> Path:
     """Where an unperturbed capture lies, or will."""
     if spec.folder is not None:
         return spec.folder
@@ -52,13 +52,13 @@ def folder_of(spec: CaptureSpec, data: Path) -> Path:
 def missing_captures(suite: Suite, data: Path) -> list[CaptureSpec]:
     """The captures that a run has to render first."""
     clean = (spec for spec in suite.captures if spec.folder is None and spec.stress is None)
-    return [spec for spec in clean if not is_capture(folder_of(spec, data))]
+    return [spec for spec in clean if not is_capture(capture_folder(spec, data))]
 
 
 def require_space_for(missing: Sequence[CaptureSpec], data: Path) -> None:
     """Refuse captures that the disk cannot hold together."""
     require_space(
-        [(described(spec), folder_of(spec, data)) for spec in missing if (spec.of or spec.scene) != SPLATS], data
+        [(described(spec), capture_folder(spec, data)) for spec in missing if (spec.of or spec.scene) != SPLATS], data
     )
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 
-from benchmarks.suites.captures import described, folder_of
+from benchmarks.suites.captures import capture_folder, described
 from benchmarks.suites.engine import shard_of
 from benchmarks.suites.runs import RunOptions, require_runnable
 from benchmarks.suites.scenes import SPLATS
@@ -30,7 +30,7 @@ def estimate(suite: Suite, options: RunOptions) -> str:
         if (spec.of or spec.scene) == SPLATS:
             lines.append(f"capture {spec.name}: splatted, under a minute")
             continue
-        scene, folder = described(spec), folder_of(spec, options.data)
+        scene, folder = described(spec), capture_folder(spec, options.data)
         state = "is there" if is_finished(scene, folder) else estimate_capture(scene).text
         lines.append(f"capture {folder.name}: {state}")
     lines += ["", *_described(cells)]

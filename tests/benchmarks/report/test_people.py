@@ -129,6 +129,10 @@ def test_a_report_over_people_shows_everybody(run: Run, tmp_path: Path) -> None:
     assert [name for name, _ in strips.groups] == ["subject 1"], "of the first only numbers were published"
     side_by_side = next(s for s in sections if s.title.startswith("Side by side"))
     assert "Pictures are of subject 1 of 2 people" in side_by_side.blocks[-1].text
+    fallen = [failed_result(each.config, "crashed", "boom") if each.config.subject == 0 else each for each in results]
+    sections, _ = scene_report(replace(data, run=replace(cast, cells=first), results=tuple(fallen)))
+    side_by_side = next(s for s in sections if s.title.startswith("Side by side"))
+    assert "Pictures are of" not in side_by_side.blocks[-1].text, "no report was published of what crashed"
     apart = {cell.config.key: replace(cell.config, truth=cell.config.method) for cell in cast.cells}
     shown_apart = replace(cast, cells=tuple(replace(cell, config=apart[cell.config.key]) for cell in cast.cells))
     of_both = [replace(each, config=apart[each.config.key]) for each in results]
