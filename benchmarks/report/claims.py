@@ -15,9 +15,10 @@ from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.schema import ViewScore
 from benchmarks.report import tables
 from benchmarks.report.compare import Rows, Views, cells_by_row, same_person, shared_views
-from benchmarks.report.content import Block, Bullets, Facts, Links, Mark, Section, Strip, Strips, Table, Text
+from benchmarks.report.content import Block, Bullets, Links, Mark, Section, Strip, Strips, Table, Text
 from benchmarks.report.page import render
 from benchmarks.report.pictures import Album
+from benchmarks.report.sections import again
 from benchmarks.suites.runs import Run
 
 ABOUT = (
@@ -69,8 +70,6 @@ def write_claims(
     blocks.append(Bullets(items=tuple(_told(claim, table[table["name"] == claim.name]) for claim in claims)))
     if lost:
         blocks.insert(0, Bullets(items=tuple(lost)))
-    if command:
-        blocks.append(Facts(items=(("Again", command),)))
     if reports:
         links = tuple((f"Report of {path.parent.name}", Path(os.path.relpath(path, out))) for path in reports)
         blocks.append(Links(items=links))
@@ -78,7 +77,7 @@ def write_claims(
     page = [*blocks, *([Strips(file="", title="", groups=groups)] if groups else [])]
     for form, content in (("html", page), ("md", blocks)):
         section = Section(title="Claims", headline=f"{headline}.", blocks=tuple(content))
-        text = render("ash-bench: claims", [section], form, album)  # type: ignore[arg-type]
+        text = render("ash-bench: claims", [section, *again(command)], form, album)  # type: ignore[arg-type]
         write_atomic(out / f"claims.{form}", text.encode())
     return [*([shown.to_string(), ""] if len(shown) else []), headline], lost
 

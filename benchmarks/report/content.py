@@ -48,6 +48,14 @@ class Facts:
     items: tuple[tuple[str, str], ...]
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Commands:
+    """Lines for a shell, in order."""
+
+    kind: ClassVar[str] = "commands"
+    items: tuple[str, ...]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Table:
     """A table of texts: the index names the rows; columns are titles, or pairs of a group and a title.
@@ -114,7 +122,7 @@ class Flipbook:
     chart: Figure
 
 
-Block = Text | Bullets | Links | Facts | Table | Figure | Strips | Flipbook
+Block = Text | Bullets | Links | Facts | Commands | Table | Figure | Strips | Flipbook
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -62,7 +62,7 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
         )
         for scene in run_tables.scenes
     ]
-    first, others = _first_sections([parts for parts, _ in made], run.command)
+    first, others = _first_sections([parts for parts, _ in made])
     curves = [*sections.training_cost(run_tables), *sections.template_errors(run_tables)]
     novelty = sections.novelty(run_tables)
     turned, turned_sheets = new_headings(run, results, run_tables, album)
@@ -79,7 +79,8 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
         *turned,
         *sections.beside_the_paper(run_tables, run.suite),
         *sections.failed_cells(results, len(run.cells) + len(run.absent) - len(results)),
-        sections.provenance(results, run.command),
+        *sections.again(run.command),
+        sections.provenance(results),
         sections.glossary(),
     ]
     files = {each.file: each.svg().encode() for part in parts for each in part.blocks if isinstance(each, Figure)}
@@ -97,14 +98,13 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
     return [*lines, *shown, f"report: {run.folder / 'report.html'}"]
 
 
-def _first_sections(scenes: Sequence[Sequence[Section]], command: str) -> tuple[Sequence[Section], Sequence[Section]]:
+def _first_sections(scenes: Sequence[Sequence[Section]]) -> tuple[Sequence[Section], Sequence[Section]]:
     """What stands first, the opening of a single scene or the findings of all; and the other sections of scenes."""
     every = [section for scene in scenes for section in scene]
     if len(scenes) == 1:
         return every[:1], every[1:]
-    findings = [(opening.title, opening.headline) for opening, *_ in scenes]
-    again = [("Again", command)] if command else []
-    return [Section(title="Results by scene", blocks=(content.Facts(items=(*findings, *again)),))], every
+    findings = tuple((opening.title, opening.headline) for opening, *_ in scenes)
+    return [Section(title="Results by scene", blocks=(content.Facts(items=findings),))], every
 
 
 def write_tables(

@@ -123,7 +123,7 @@ def scene_report(data: SceneData) -> tuple[list[Section], dict[str, bytes]]:
 
 
 def _facts(data: SceneData, capture: Capture | None, *, smoke: bool) -> list[tuple[str, str]]:
-    """What a reader asks first: what was compared on which data, what came out, how sure it is, how to run it again."""
+    """What a reader asks first: what was compared on which data, what came out, how sure it is."""
     run_tables, scene = data.tables, data.scene
     rows, methods = run_tables.of(scene), run_tables.methods(scene)
     presets = ", ".join(dict.fromkeys(result.config.preset for result in data.results if result.brought is None))
@@ -162,7 +162,6 @@ def _facts(data: SceneData, capture: Capture | None, *, smoke: bool) -> list[tup
         "Held out": f"{'; '.join(tests)}." if tests else "",
         **known,
         "Missing": " ".join(filter(None, missing)) or "Nothing: every method was trained and scored.",
-        "Again": f"{command} (code and versions: Provenance, below)" if (command := data.run.command) else "",
     }
     return [(label, text) for label, text in facts.items() if text]
 

@@ -12,12 +12,13 @@ from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell.metrics import METRICS, PROTOCOL
 from benchmarks.cell.schema import CellResult
 from benchmarks.report import author_table, charts, vega
-from benchmarks.report.content import Block, Bullets, Section, Table, Text
+from benchmarks.report.content import Block, Bullets, Commands, Section, Table, Text
 from benchmarks.report.figures import line_figure
 from benchmarks.report.glossary import GLOSSARY
 from benchmarks.report.tables import text_of
 from benchmarks.report.vega import Figure, Series
 from benchmarks.suites.reuse import TRAINED_BY
+from benchmarks.suites.runs import commands_of
 from benchmarks.suites.stress import AXES
 
 WHISKERS = "Whiskers: 95 % interval over seeds, or over captures where there are several."
@@ -357,7 +358,12 @@ def failed_cells(results: Sequence[CellResult], missing: int) -> list[Section]:
     return [Section(title="Failed cells" if items else "Unfinished", blocks=tuple(blocks))] if blocks else []
 
 
-def provenance(results: Sequence[CellResult], command: str) -> Section:
+def again(command: str) -> list[Section]:
+    """The commands that make the report again."""
+    return [Section(title="Again", blocks=(Commands(items=tuple(commands_of(command))),))] if command else []
+
+
+def provenance(results: Sequence[CellResult]) -> Section:
     """Where the numbers come from; cells made at several places are listed with all of them."""
     provenances = [result.provenance for result in results if result.provenance is not None]
     facts = [("protocol", PROTOCOL), ("commit", _distinct(p.commit for p in provenances))]
@@ -371,7 +377,6 @@ def provenance(results: Sequence[CellResult], command: str) -> Section:
     facts.append(("captures", _distinct(f"{r.config.scene} {r.config.size} {r.config.capture[:12]}" for r in results)))
     facts.append(("seeds", ", ".join(str(seed) for seed in sorted({r.config.seed for r in results}))))
     facts.append(("sum of all cells [min]", f"{sum(p.wall_s for p in provenances) / 60:.1f}"))
-    facts += [("command", command)] if command else []
     reused = [REUSED_NOTE.format(reused=len(trainers), cells=len(results))] if trainers else []
     note = " ".join((PROVENANCE_NOTE, *reused))
     return Section(title="Provenance", blocks=(_facts("fact", facts), Text(text=note, note=True)))

@@ -22,7 +22,7 @@ from benchmarks.commands import arguments
 from benchmarks.report.compare import changes, failures_in_words, printed, verdict_of, write_comparison
 from benchmarks.suites.archive import opened, write_archive
 from benchmarks.suites.captures import SHOWS_THE_SAME, truth_of
-from benchmarks.suites.runs import Run, gathered, read_run, results_of, write_run
+from benchmarks.suites.runs import Run, commands_of, gathered, read_run, results_of, write_run
 
 Rows = dict[tuple[str, str], list[tuple[Cell, CellResult]]]
 
@@ -128,6 +128,8 @@ def test_a_report_over_runs_and_cells(runs: tuple[Path, Path], tmp_path: Path, n
     run = gathered([*map(read_run, (runs[0], cells[0]))], tmp_path, command="report")
     assert len(run.cells) == 2 and len({each.config.key for each in run.cells}) == 2
     assert run.command == "run before; report"
+    more = gathered([run, read_run(runs[0])], tmp_path, command="report more")
+    assert commands_of(more.command) == ["run before", "report", "report more"], "each once"
 
 
 def test_report_and_compare_take_archives(runs: tuple[Path, Path], tmp_path: Path, no_chart_files: None) -> None:
