@@ -5,6 +5,7 @@ Everything comes from the results of the run's cells; the page needs no network 
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -100,10 +101,10 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
 
 def _first_sections(scenes: Sequence[Sequence[Section]]) -> tuple[Sequence[Section], Sequence[Section]]:
     """What stands first, the opening of a single scene or the findings of all; and the other sections of scenes."""
-    every = [section for scene in scenes for section in scene]
     if len(scenes) == 1:
-        return every[:1], every[1:]
+        return scenes[0][:1], scenes[0][1:]
     findings = tuple((opening.title, opening.headline) for opening, *_ in scenes)
+    every = [section for opening, *others in scenes for section in (replace(opening, headline=""), *others)]
     return [Section(title="Results by scene", blocks=(content.Facts(items=findings),))], every
 
 

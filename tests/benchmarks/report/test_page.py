@@ -186,6 +186,7 @@ def test_the_findings_of_several_scenes_stand_first(
     assert (
         text.index("## Results by scene") < text.index("**other.**") < text.index("## boxes") < text.index("## Again")
     )
+    assert text.count("On other, ") == 1, "what was found stands once"
 
 
 def test_markdown_and_latex_say_the_same_as_the_page(run: Run) -> None:
