@@ -160,23 +160,30 @@ def independent(samples: Samples) -> list[float]:
 def intervals(samples: Mapping[str, Samples]) -> dict[str, Interval]:
     """Every method's mean with its interval, for a chart in which methods stand beside each other.
 
-    Over several captures that all methods share, the common effect of a capture is removed first (Cousineau 2005, with
-    the correction of Morey 2008), because subjects differ by more than methods do. Otherwise Student's interval.
+    The effect of a capture, by the methods that have all captures, is removed first (Cousineau 2005, with the
+    correction of Morey 2008), because subjects differ by more than methods do. A method of fewer captures has its
+    adjusted mean: what it would have over all, by its difference to those methods. Student's interval and the plain
+    mean where there is one capture, or where fewer than two methods have all.
     """
-    by_method = {method: mean_interval(independent(seeds)) for method, seeds in samples.items()}
-    if len(samples) < 2:
-        return by_method
-    first, *others = samples.values()
-    shared = [capture for capture in first if all(capture in other for other in others)]
-    if len(shared) < 2:
-        return by_method
-    values = np.array([[np.mean(seeds[capture]) for capture in shared] for seeds in samples.values()])
-    variances = (values - values.mean(0)).var(1, ddof=1) * len(samples) / len(others)
-    halves = _quantile(LEVEL, len(shared) - 1) * np.sqrt(variances / len(shared))
-    return {
-        method: Interval(each.mean, each.mean - float(half), each.mean + float(half))
-        for (method, each), half in zip(by_method.items(), halves, strict=True)
-    }
+    if not (whole := on_all_captures(samples)):
+        return {method: mean_interval(independent(seeds)) for method, seeds in samples.items()}
+    captures = list(samples[whole[0]])
+    values = np.array([[np.mean(samples[method][capture]) for capture in captures] for method in whole])
+    effects = dict(zip(captures, values.mean(0) - values.mean(), strict=True))
+    of_methods = {}
+    for method, seeds in samples.items():
+        each = mean_interval([float(np.mean(seeds[capture])) - effects[capture] for capture in seeds])
+        correction = math.sqrt(len(whole) / (len(whole) - 1)) if method in whole else 1.0
+        half = (each.high - each.mean) * correction
+        of_methods[method] = Interval(each.mean, each.mean - half, each.mean + half)
+    return of_methods
+
+
+def on_all_captures(samples: Mapping[str, Samples]) -> list[str]:
+    """The methods that have every capture that any has; none where that is one method, or one capture."""
+    captures = {capture for seeds in samples.values() for capture in seeds}
+    whole = [method for method, seeds in samples.items() if seeds.keys() == captures]
+    return whole if len(whole) > 1 and len(captures) > 1 else []
 
 
 def spreads(samples: Samples) -> tuple[float | None, float | None]:

@@ -15,7 +15,7 @@ from benchmarks.analysis.results import (
     foreground,
     samples_of,
 )
-from benchmarks.analysis.statistics import intervals
+from benchmarks.analysis.statistics import intervals, on_all_captures
 from benchmarks.analysis.style import EXACT, SPLIT_NAMES
 from benchmarks.cell.registry import WRONG_BY_MM
 from benchmarks.report import charts, vega
@@ -71,8 +71,12 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
         caption += " Hollow: given the exact surface, a bound and no competitor; the dashed line joins it with the same"
         caption += " method on its own template."
     if over := tables.unit(scene):
-        apart = ", the common effect of a capture removed" if over == "captures" else ""
+        compared = on_all_captures(drawn)
+        apart = ", the common effect of a capture removed" if compared else ""
         caption += f" Whiskers: 95 % interval over {over}{apart}; one that reaches the edge is cut."
+        if compared and len(compared) < len(drawn):
+            caption += " A method of fewer captures stands at its adjusted mean: where it would stand with all of them,"
+            caption += " by its difference to the methods that have all."
         caption += " Ringed: the smallest sufficient method."
     panels = charts.speed(
         pd.DataFrame(points).astype({"low": float, "high": float}),

@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from benchmarks.analysis.statistics import (
     independent,
     intervals,
     mean_interval,
+    on_all_captures,
     spreads,
     wilson,
 )
@@ -187,4 +189,14 @@ def test_intervals_over_shared_captures_leave_out_the_common_effect_of_a_capture
     for each in found.values():  # Of two methods, the paired interval by the square root of two.
         assert each.high - each.mean == pytest.approx((tested.high - tested.mean) / 2**0.5)
     apart = {"ash": {"a": [25.0], "b": [27.0]}, "ddc": {"b": [24.0], "c": [25.0]}}
-    assert intervals(apart)["ddc"] == mean_interval([24.0, 25.0]), "Student's where they share no two captures"
+    assert intervals(apart)["ddc"] == mean_interval([24.0, 25.0]), "Student's where no method has all captures"
+
+
+def test_a_method_of_fewer_captures_stands_at_its_adjusted_mean_and_widens_no_other_interval() -> None:
+    both = {"ash": captures(30.0, 25.0, 20.0), "ddc": captures(29.1, 24.0, 18.9)}  # Effects: 5.05, 0, -5.05.
+    easy, hard = {"0": (30.0,)}, {"2": (20.0,)}
+    more = intervals(both | {"easy": easy, "hard": hard})
+    assert {method: more[method] for method in both} == intervals(both)
+    assert (more["easy"].mean, more["hard"].mean) == (pytest.approx(24.95), pytest.approx(25.05))
+    assert math.isnan(more["easy"].high), "of one value"
+    assert on_all_captures(both | {"easy": easy}) == ["ash", "ddc"] and on_all_captures({"ash": both["ash"]}) == []
