@@ -204,15 +204,14 @@ class ReportCommand:
             return self._write(runs[0])
 
     def _write(self, run: "RunOnDisk") -> int:
-        from benchmarks.suites.runs import read_run, require_for_choosing
+        from benchmarks.suites.runs import joined, read_run, require_for_choosing
 
         if self.table or self.latex or self.markdown or self.csv:
             return self._tables(run)
         if self.chosen_on is None:
             code = _report(run)
         else:  # The report says so; the run that --publish leaves is as it was.
-            commands = dict.fromkeys(filter(None, (run.command, typed())))
-            both = replace(run, command="; ".join(commands))
+            both = replace(run, command=joined(run.command, typed()))
             code = _report(both, require_for_choosing(read_run(self.chosen_on)))
         if self.publish is not None:
             from benchmarks.report.page import publish

@@ -337,14 +337,18 @@ def gathered(runs: Sequence[Run], out: Path, *, command: str, leave_out: Callabl
     table = next((run.table for run in runs if run.table), ())
     there = {cell.config.key for cell in cells}
     absent = tuple(dict.fromkeys(key for run in runs for key in run.absent if key not in there))
-    commands = (each for run in (*(run.command for run in runs), command) for each in commands_of(run))
-    typed = "; ".join(dict.fromkeys(commands))
-    given: dict[str, Any] = {"suite": out.name, "about": about, "command": typed, "titles": titles, "table": table}
+    whole = joined(*(run.command for run in runs), command)
+    given: dict[str, Any] = {"suite": out.name, "about": about, "command": whole, "titles": titles, "table": table}
     return Run(folder=out, cells=tuple(named), absent=absent, **given)
 
 
+def joined(*commands: str) -> str:
+    """Commands of runs as that of one run: one line, separated by semicolons, each once."""
+    return "; ".join(dict.fromkeys(each for command in commands for each in commands_of(command)))
+
+
 def commands_of(command: str) -> list[str]:
-    """The commands that made a run, in order; those of gathered runs stand in one line, separated by semicolons."""
+    """The commands that made a run, in order: those that `joined` put into one line."""
     return command.split("; ") if command else []
 
 
