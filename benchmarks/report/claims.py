@@ -67,7 +67,7 @@ def write_claims(
             marks[row, list(shown.columns).index("verdict")] = "best" if verdict in HOLDS else "second"
     blocks: list[Block] = [Text(text=ABOUT)]
     blocks += [Table(frame=shown, corner="claim", marks=marks)] if len(shown) else []
-    blocks.append(Bullets(items=tuple(_told(claim, table[table["name"] == claim.name]) for claim in claims)))
+    blocks.append(Bullets(items=tuple(_summary(claim, table[table["name"] == claim.name]) for claim in claims)))
     if lost:
         blocks.insert(0, Bullets(items=tuple(lost)))
     if reports:
@@ -104,13 +104,13 @@ def printed(judged: pd.DataFrame) -> pd.DataFrame:
     return texts
 
 
-def _told(claim: Claim, rows: pd.DataFrame) -> str:
-    """What is claimed, where, and what was found on each of its scenes."""
-    verdicts = (
-        f"{f'{row.scene}: ' if row.scene else ''}{row.verdict}{f' ({row.because})' if row.because else ''}"
-        for row in rows.itertuples()
-    )
-    return f"{claim.name} ({claim.where}): {claim.says}. {'; '.join(verdicts)}."
+def _summary(claim: Claim, rows: pd.DataFrame) -> str:
+    """What is claimed, where, and what was found on its scenes; scenes of the same outcome stand together."""
+    outcomes = []
+    for (verdict, because), scenes in rows.groupby(["verdict", "because"], sort=False)["scene"]:
+        on = " and ".join(filter(None, scenes))
+        outcomes.append(f"{f'{on}: ' if on else ''}{verdict}{f' ({because})' if because else ''}")
+    return f"{claim.name} ({claim.where}): {claim.says}. {'; '.join(outcomes)}."
 
 
 def _table(rows: Rows) -> pd.DataFrame:

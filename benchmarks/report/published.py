@@ -122,9 +122,10 @@ class Numbers:
         """How many of them had reached their plateau."""
         return int(self._plateaus(report).sum())
 
-    def people(self, report: str, scene: str = "") -> int:
-        """How many people a report has, or one of its scenes."""
-        return (self._of_scene(report, scene) if scene else self._rows(report))["subject"].nunique()
+    def people(self, report: str, scene: str = "", method: str = "") -> int:
+        """How many people a report has, one of its scenes, or a method on it."""
+        rows = self._of_scene(report, scene) if scene else self._rows(report)
+        return (rows[rows["method"] == method] if method else rows)["subject"].nunique()
 
     def _of_scene(self, report: str, scene: str) -> pd.DataFrame:
         rows = self._rows(report)

@@ -354,7 +354,7 @@ def failed_cells(results: Sequence[CellResult], missing: int) -> list[Section]:
     if items:
         blocks.append(Text(text="A failed cell has the worst score in every quality; it is never left out.", note=True))
     if missing:
-        blocks.append(Text(text=f"{missing} cells are not finished; the tables show those that are.", note=True))
+        blocks.append(Text(text=f"Cells that are not finished: {missing}. The tables show the others.", note=True))
     return [Section(title="Failed cells" if items else "Unfinished", blocks=tuple(blocks))] if blocks else []
 
 

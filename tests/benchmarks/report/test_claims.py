@@ -124,7 +124,7 @@ def test_by_more_than_so_much_asks_for_the_whole_interval() -> None:
     assert verdict(claim, wide) == "not shown" and verdict(replace(claim, least=None), wide) == "confirmed"
 
 
-def test_trainings_that_ended_before_their_plateau_are_told() -> None:
+def test_trainings_that_ended_before_their_plateau_are_named() -> None:
     table = rows(BETTER, OTHER)
     ended = table.drop_duplicates(["method", "capture"]).assign(split="speed", region="", metric="plateau", value=1.0)
     assert judge([CLAIM], pd.concat([table, ended])).because.item() == ""
@@ -213,14 +213,17 @@ scenes = ["boxes"]
 
 def test_a_page_shows_what_was_judged(two_people: Run, tmp_path: Path) -> None:
     file = tmp_path / "claims.toml"
-    file.write_text(BOXES)
+    file.write_text(BOXES.replace('["boxes"]', '["boxes", "loose", "tight"]'))
     lines, lost = write_claims(
         two_people, read_claims(file), tmp_path / "judged", reports=[tmp_path / "run" / "report.html"]
     )
     assert "confirmed 1" in lines[-1] and lost == []
     page = (tmp_path / "judged" / "claims.html").read_text()
     assert "the view of the median difference" in page and 'href="../run/report.html"' in page
-    assert "80 % power" in page and "more detail is more accurate" in (tmp_path / "judged" / "claims.md").read_text()
+    assert "80 % power" in page
+    text = (tmp_path / "judged" / "claims.md").read_text()
+    assert "more detail is more accurate. boxes: confirmed; " in text
+    assert "; loose and tight: cannot be judged here (no run of this scene)." in text
 
 
 def part_of(run: Run, method: str, folder: Path, /, **other: str) -> Path:

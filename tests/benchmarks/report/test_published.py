@@ -64,6 +64,7 @@ def test_a_row_of_fewer_people_than_others_says_so(numbers: Numbers) -> None:
     (numbers.folder / "fewer" / "results.csv").write_text(csv_of(made))
     text = numbers.scores("fewer", "loose")
     assert "| ASH | 27.00 |" in text and "(2 of 3 people) | 24.50 |" in text
+    assert numbers.people("fewer", "loose") == 3 and numbers.people("fewer", "loose", "smpl") == 2
 
 
 def test_rows_of_two_reports_are_compared(numbers: Numbers) -> None:
