@@ -100,7 +100,7 @@ class RunCommand:
             shard=self.shard,
             retry_failed=self.retry_failed,
             reuse=self.reuse,
-            command=typed(),
+            command=typed(without="--shard"),  # All shards together are the run.
         )
         if self.dry_run:
             from benchmarks.suites.dry_run import estimate

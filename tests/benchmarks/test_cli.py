@@ -306,10 +306,12 @@ def test_shards_are_merged_into_the_undisturbed_run(finished: Path, boxes: str, 
     """Each shard has done its cell before, and finds it."""
     shards = [Path(shutil.copytree(finished, tmp_path / name)) for name in ("a", "b")]
     cells = json.loads((finished / "run.json").read_text())["cells"]
-    for index, shard in enumerate(shards, 1):
+    for index, (shard, flag) in enumerate(zip(shards, (["--shard", "1/2"], ["--shard=2/2"]), strict=True), 1):
         shutil.rmtree(shard / "cells" / cells[2 - index])
-        assert cli.main(["run", boxes, "--out", str(shard), "--shard", f"{index}/2"]) == arguments.DONE
+        assert cli.main(["run", boxes, *flag, "--out", str(shard)]) == arguments.DONE
         assert "1 of 1 cells are there already" in capsys.readouterr().err
+        command = json.loads((shard / "run.json").read_text())["command"]
+        assert command.endswith(f"run {boxes} --out {shard}"), "of all shards together"
     twice = ["report", str(shards[0]), str(shards[0]), "--out", str(tmp_path / "half")]
     assert re.search(r"cells are in no shard, the first: \w+ .* seed 0", refused_last(capsys, *twice))
     assert cli.main(["report", *map(str, shards), "--out", str(tmp_path / "merged")]) == arguments.DONE
