@@ -101,15 +101,9 @@ def own_name() -> str:
     return "./ash-bench" if Path(sys.prefix).name == ".venv" and launcher.is_file() else "ash-bench"
 
 
-def typed(*, without: str = "") -> str:
-    """The command as it was given, for reports; `without`: a flag that is left out, with its value."""
-    given, kept = iter(_typed), []
-    for each in given:
-        if each == without:
-            next(given, None)
-        elif not each.startswith(f"{without}="):
-            kept.append(each)
-    return shlex.join([own_name(), *kept])
+def typed() -> str:
+    """The command as it was given, for reports."""
+    return shlex.join([own_name(), *_typed])
 
 
 @dataclass(frozen=True, slots=True)

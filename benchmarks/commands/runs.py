@@ -1,6 +1,7 @@
 """Commands that make, score and report cells and runs: run, train, eval, report, compare, claims."""
 
 import os
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -100,7 +101,7 @@ class RunCommand:
             shard=self.shard,
             retry_failed=self.retry_failed,
             reuse=self.reuse,
-            command=typed(without="--shard"),  # All shards together are the run.
+            command=re.sub(r" --shard[ =]\d+/\d+", "", typed()),  # All shards together are the run.
         )
         if self.dry_run:
             from benchmarks.suites.dry_run import estimate
