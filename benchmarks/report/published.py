@@ -25,6 +25,9 @@ from benchmarks.report.tables import ON_WHOLE_FRAMES, cost_columns, head_of, qua
 
 FOLDER = Path(__file__).parents[2] / "reports"
 NAME = "README.md"
+OWN = "README: "  # begins the names of claims that are this project's own
+OUTFITS = ("tight", "loose")
+OTHER_SCENES = "other scenes"
 FACT = re.compile(r"^\| (code|commit|processor|gpu) \| (.*?) \|$", re.MULTILINE)  # of its provenance
 
 
@@ -94,17 +97,31 @@ class Numbers:
         return order.tau_text
 
     def claims(self) -> str:
-        """The claims that were judged, a row each with a column for each scene, as a table in Markdown."""
-        table = pd.read_csv(self.folder / "claims" / "claims.csv", keep_default_na=False, na_values=[""])
+        """The paper's claims that were judged, in Markdown: a column for each outfit, one for other scenes."""
+        table = self._claims(own=False)
         shown = printed(table[table["effect"].notna()])
         shown["text"] = [
-            f"{row.verdict}: {row.difference}{row.paper and f', paper {row.paper}'}, {row.people} people"
-            f"{row.needed and f', {row.needed} needed'}"
+            f"{'' if row.scene in OUTFITS else f'{row.scene}: '}{row.verdict}: {row.difference}"
+            f"{row.paper and f', paper {row.paper}'}, {row.people} people{row.needed and f', {row.needed} needed'}"
             for row in shown.itertuples()
         ]
-        wide = shown.set_index(["contrast", "scene"], append=True)["text"].unstack(sort=False).fillna("")
+        shown["column"] = shown["scene"].where(shown["scene"].isin(OUTFITS), OTHER_SCENES)
+        wide = shown.set_index(["contrast", "column"], append=True)["text"].unstack(sort=False).fillna("")
         heads = ["claim", "contrast", *wide.columns]
         return _markdown(heads, [[*name, *row] for name, *row in wide.itertuples()], numbers=False)
+
+    def own_claims(self) -> str:
+        """This project's own claims by verdict: how many are confirmed, and the names of the others."""
+        parts = []
+        for verdict, rows in self._claims(own=True).groupby("verdict", sort=False):
+            scenes = rows.groupby("name", sort=False)["scene"].agg(" and ".join)
+            names = [f"{name.removeprefix(OWN)} ({scene})" for name, scene in scenes.items()]
+            parts.append(f"{len(rows)} {verdict}" + (f" ({'; '.join(names)})" if verdict != "confirmed" else ""))
+        return ", ".join(parts)
+
+    def _claims(self, *, own: bool) -> pd.DataFrame:
+        table = pd.read_csv(self.folder / "claims" / "claims.csv", keep_default_na=False, na_values=[""])
+        return table[table["name"].str.startswith(OWN) == own]
 
     def training(self, report: str) -> str:
         """Core-hours of training of a published report, and its processors and GPUs."""

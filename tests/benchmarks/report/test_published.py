@@ -73,20 +73,35 @@ def test_rows_of_two_reports_are_compared(numbers: Numbers) -> None:
     assert numbers.difference("mine+other", "loose", "smpl", "ash") == "-2.00 dB [-2.00, -2.00]"
 
 
-def test_a_claim_is_a_row_with_a_column_for_each_scene(numbers: Numbers) -> None:
+@pytest.fixture
+def claims(numbers: Numbers) -> Numbers:
     (numbers.folder / "claims").mkdir()
     (numbers.folder / "claims" / "claims.csv").write_text(
         "name,scene,contrast,paper,effect,low,high,people,unit,verdict,needed\n"
         "1 views,tight,ash - ddc,4.63,-0.7,-1.1,-0.3,5,dB,not shown,8\n"
         "1 views,loose,ash - ddc,,1.2,0.6,1.8,5,dB,confirmed,\n"
         "2 speed,,ash - ddc,,,,,0,ms,cannot be judged here,\n"
+        "3 light,lit,wo_phi - ash,,-0.4,-0.5,-0.3,3,dB,confirmed,\n"
+        "README: motion,tight,ash_plus - ash,,1.2,0.6,1.8,5,dB,confirmed,\n"
+        "README: motion,loose,ash_plus - ash,,0.1,-0.6,0.8,5,dB,not shown,40\n"
+        "README: mesh,tight,ddc_plus - ddc,,0.1,-0.6,0.8,5,dB,not shown,40\n"
+        "README: mesh,loose,ddc_plus - ddc,,0.1,-0.6,0.8,5,dB,not shown,40\n"
     )
-    assert numbers.claims().splitlines() == [
-        "| claim | contrast | tight | loose |",
-        "| --- | --- | --- | --- |",
+    return numbers
+
+
+def test_a_claim_of_the_paper_is_a_row_with_a_column_for_each_outfit_and_one_for_other_scenes(claims: Numbers) -> None:
+    assert claims.claims().splitlines() == [
+        "| claim | contrast | tight | loose | other scenes |",
+        "| --- | --- | --- | --- | --- |",
         "| 1 views | ash - ddc | not shown: -0.7 dB [-1.1, -0.3], paper +4.63 dB, 5 people, 8 needed "
-        "| confirmed: +1.2 dB [+0.6, +1.8], 5 people |",
+        "| confirmed: +1.2 dB [+0.6, +1.8], 5 people |  |",
+        "| 3 light | wo_phi - ash |  |  | lit: confirmed: -0.4 dB [-0.5, -0.3], 3 people |",
     ]
+
+
+def test_own_claims_are_counted_and_those_that_do_not_hold_named(claims: Numbers) -> None:
+    assert claims.own_claims() == "1 confirmed, 3 not shown (motion (loose); mesh (tight and loose))"
 
 
 def test_the_order_of_rows_is_compared_with_the_paper_s(numbers: Numbers) -> None:
