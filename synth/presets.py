@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,6 @@ SIZES = ("ci", "factor", "quick", "long", "table", "paper")
 ROTATING = Rig(cameras=24, held_out=4, cameras_per_frame=4)
 ALONE: dict[str, Any] = {"near": (), "far": ()}  # no motion beside what is asked for
 NEW = ("dance", "twist", "wave", "bow", "clap")  # kinds of motion that no scene trains on
-# Where people stand in `lit`, metres towards the lamp; training has four kinds of clips, so each is seen in several.
-TRAINING_PLACES, HELD_OUT_PLACES = (-0.5, 0.5, 0.0, -0.25, 0.25), (-0.35, 0.35, -0.1, 0.1)
 EVENING = Light(falloff=0.4, gloss=0.2)  # a lamp that lights one side of the floor, on cloth that shines a little
 
 
@@ -164,26 +161,12 @@ def factor_scene(name: str, *, size: str, seed: int = 0, strength: float = 1.0) 
     if name == "swing":
         return replace(base, outfit=replace(base.outfit, swing=strength))
     if name == "lit":
-        # People who stay where they are would be lit alike in all images.
-        reach = min(strength, 1.0)
-        return replace(
-            base,
-            light=replace(base.light, falloff=strength),
-            train=_across(base.train, TRAINING_PLACES, reach),
-            test=_across(base.test, HELD_OUT_PLACES, reach),
-            near=_across(base.near, HELD_OUT_PLACES, reach),
-            far=_across(base.far, HELD_OUT_PLACES, reach),
-        )
+        return replace(base, light=replace(base.light, falloff=strength))
     if name == "glossy":
         return replace(base, light=replace(base.light, gloss=strength))
     if name == "turning":
         return replace(base, test=tuple(replace(clip, yaw=2.4 * strength) for clip in base.test))
     raise InputError(f"unknown factor scene {name!r}, expected one of {', '.join(FACTORS)}")
-
-
-def _across(clips: tuple[Clip, ...], places: tuple[float, ...], reach: float) -> tuple[Clip, ...]:
-    """The clips at these places in turn, each times `reach`."""
-    return tuple(replace(clip, shift=(reach * place, 0.0)) for clip, place in zip(clips, cycle(places), strict=False))
 
 
 def still(*, size: str, seed: int) -> Scene:
