@@ -88,12 +88,14 @@ def judge(claims: Sequence[Claim], rows: pd.DataFrame) -> pd.DataFrame:
     """Every claim on every scene of it: `COLUMNS`, `effect` is `a` minus `b`, `needed` people would decide.
 
     `rows`: as `analysis.results.load` has them; people for validation decide nothing. p is corrected over all claims
-    (Holm). A claim about a single person is not judged, for one person says nothing about others.
+    (Holm), those without a row too: what is run later changes no verdict but its own. A claim about a single person is
+    not judged, for one person says nothing about others.
     """
     rows = rows[rows["subject"] < VALIDATION]
     of_scene = {scene: rows[rows["scene"] == scene] for claim in claims for scene in claim.scenes}
     contrasts = [(claim, scene, *_compared(claim, of_scene[scene])) for claim in claims for scene in claim.scenes]
-    tests = iter(corrected([test for _, _, test, _ in contrasts if test is not None]))
+    planned = sum(not claim.cannot for claim, *_ in contrasts)
+    tests = iter(corrected([test for _, _, test, _ in contrasts if test is not None], planned))
     records = []
     for claim, scene, test, missing in contrasts:
         record: dict[str, Any] = {

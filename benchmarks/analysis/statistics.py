@@ -115,10 +115,14 @@ def compare_samples(
     )
 
 
-def corrected(comparisons: Sequence[Comparison]) -> list[Comparison]:
-    """With p adjusted so that the chance of any false alarm among all of them is at most 5 % (Holm 1979)."""
+def corrected(comparisons: Sequence[Comparison], planned: int = 0) -> list[Comparison]:
+    """With p adjusted so that the chance of any false alarm among all of them is at most 5 % (Holm 1979).
+
+    `planned`: how many tests there are with those still to be made, so that making them does not change these.
+    """
     p_values = [each.p for each in comparisons if not math.isnan(each.p)]
-    adjusted, tests = iter(holm(p_values)), len(p_values)
+    tests = max(planned, len(p_values))
+    adjusted = iter(holm([*p_values, *[1.0] * (tests - len(p_values))]))
     return [each if math.isnan(each.p) else replace(each, p=next(adjusted), tests=tests) for each in comparisons]
 
 

@@ -23,11 +23,12 @@ from benchmarks.suites.runs import Run
 
 ABOUT = (
     "A claim is judged by its contrast, the mean of the first row minus that of the second, in pairs over people; in "
-    "brackets the 95 % interval. Confirmed: p below 5 % after Holm's correction over all claims, and a difference "
-    "above the smallest that counts (the whole interval, where the claim names how much); or an interval without a "
-    "loss that counts, where the claim is that nothing is lost. Smaller: the whole interval lies below the published "
-    "difference. Contradicted: the opposite was found, or no difference that counts. Not shown: neither; beside it "
-    "how many people would decide, if difference and spread are those of all people (80 % power, after correction). "
+    "brackets the 95 % interval. Confirmed: p below 5 % after Holm's correction over all claims, judged or not yet, "
+    "and a difference above the smallest that counts (the whole interval, where the claim names how much); or an "
+    "interval without a loss that counts, where the claim is that nothing is lost. Smaller: the whole interval lies "
+    "below the published difference. Contradicted: the opposite was found, or no difference that counts. Not shown: "
+    "neither; beside it how many people would decide, if difference and spread are those of all people (80 % power, "
+    "after correction). "
     "The avatars are small and the people synthetic: differences are compared with the paper's, levels never."
 )
 ORDER = ("confirmed", "confirmed but smaller", "contradicted", "not shown", "cannot be judged here")

@@ -111,6 +111,7 @@ def test_holms_correction_by_hand_leaves_out_what_has_no_p() -> None:
     assert [each.p for each in (*found[:2], found[3])] == pytest.approx([0.08, 0.03, 0.9]) and np.isnan(found[2].p)
     assert [each.verdict for each in found] == ["unclear", "better", "unclear", "unclear"]
     assert [each.tests for each in found] == [3, 3, 1, 3]
+    assert [each.p for each in corrected(tests[:2], 5)] == pytest.approx([0.16, 0.05])
 
 
 def test_false_alarms_and_power_on_our_design() -> None:

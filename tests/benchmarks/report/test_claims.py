@@ -160,6 +160,15 @@ def test_p_is_corrected_over_all_claims() -> None:
     assert set(judge(many, table).verdict) == {"not shown"}
 
 
+def test_a_verdict_does_not_depend_on_which_other_claims_were_run() -> None:
+    others = [replace(CLAIM, name=str(k), a="mine") for k in range(20)]
+    table = rows((28.9, 30.3, 30.9), OTHER)
+    planned = judge([CLAIM, *others], table)
+    assert planned["verdict"][0] == "not shown" and set(planned["verdict"][1:]) == {"cannot be judged here"}
+    never = [replace(each, cannot="needs a GPU") for each in others]  # No test of these will be made.
+    assert judge([CLAIM, *never], table)["verdict"][0] == "confirmed"
+
+
 def test_a_claim_that_held_and_does_not_any_more_is_named() -> None:
     held, lost = (judge([CLAIM], rows(a, OTHER)) for a in (BETTER, SAME))
     assert broken(held, held) == [] and broken(lost, held) == []

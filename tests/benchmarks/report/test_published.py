@@ -9,6 +9,7 @@ from helpers.cells import people
 from ash.files import InputError
 from benchmarks import cli
 from benchmarks.analysis.results import csv_of, load
+from benchmarks.analysis.style import style_of
 from benchmarks.cell.registry import code_version
 from benchmarks.report.published import FOLDER, NAME, Numbers, read_me
 
@@ -25,6 +26,18 @@ def test_the_readme_has_the_numbers_of_the_reports() -> None:
         assert numbers.difference("table", scene, "ash_plus", "ash") in text
     for ablation in ("wo_disp", "smpl"):
         assert numbers.difference("table", "loose", ablation, "ash") in text
+
+
+def test_the_readme_has_the_scores_of_the_main_job() -> None:
+    text, numbers = (FOLDER.parent / "README.md").read_text(), Numbers(FOLDER)
+    splits = ("novel_view", "near_pose", "novel_pose", "far_pose")
+    quantities = [(split, metric) for split in splits for metric in ("psnr", "lpips")]
+    quantities += [("speed", "frame_ms"), ("speed", "train_s")]
+    for method in ("ash", "ddc", "wo_mot", "ash_plus", "ddc_plus"):
+        cells = [numbers.score("quick", "loose", method, *quantity) for quantity in quantities]
+        assert "n/a" not in cells
+        row = " +".join(map(re.escape, (style_of(method).title, *cells)))
+        assert re.search(f"^{row}$", text, re.MULTILINE), method
 
 
 def test_the_claims_are_judged_by_the_numbers_of_the_reports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
