@@ -72,7 +72,7 @@ def _finding(tables: RunTables, scene: str) -> str:
         first, *others = (_pair(tables, scene, ranked, *pair) for pair in pairs)
         return " ".join([f"On {scene}, {first}", *(text[0].upper() + text[1:] for text in others)])
     if len(ranked) and ranked["p"].notna().all():
-        return f"On {scene}, {'; '.join(_ablation(ranked))}."
+        return sentence(f"On {scene}, {'; '.join(_ablation(ranked))}")
     means = tables.values(scene, foreground(), tables.methods(scene, oracles=False))
     first, *others = sorted(means, key=lambda name: -means[name]) or [""]
     if not first:

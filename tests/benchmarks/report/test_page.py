@@ -264,6 +264,8 @@ def test_the_headline_of_an_ablation_has_the_verdicts_on_its_rows() -> None:
     assert sentences.headline(scores, "loose") == (
         f"On loose, on novel views {verdicts} ASH+, double width; on novel poses {verdicts} ASH+, double width."
     )
+    two = RunTables(people({name: levels[name] for name in ("ash_plus", "wo_mot_plus")}))
+    assert sentences.headline(two, "loose").endswith("on novel poses ASH+ is better than ASH+ w/o mot.")
 
 
 def test_best_and_second_are_marked_as_printed_and_oracles_are_not_ranked() -> None:
