@@ -88,8 +88,8 @@ def judge(claims: Sequence[Claim], rows: pd.DataFrame) -> pd.DataFrame:
     """Every claim on every scene of it: `COLUMNS`, `effect` is `a` minus `b`, `needed` people would decide.
 
     `rows`: as `analysis.results.load` has them; people for validation decide nothing. p is corrected over all claims
-    (Holm), those without a row too: what is run later changes no verdict but its own. A claim about a single person is
-    not judged, for one person says nothing about others.
+    (Holm), those without a row too: what is run later takes no verdict away. A claim about a single person is not
+    judged, for one person says nothing about others.
     """
     rows = rows[rows["subject"] < VALIDATION]
     of_scene = {scene: rows[rows["scene"] == scene] for claim in claims for scene in claim.scenes}

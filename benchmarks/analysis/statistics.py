@@ -118,7 +118,7 @@ def compare_samples(
 def corrected(comparisons: Sequence[Comparison], planned: int = 0) -> list[Comparison]:
     """With p adjusted so that the chance of any false alarm among all of them is at most 5 % (Holm 1979).
 
-    `planned`: how many tests there are with those still to be made, so that making them does not change these.
+    `planned`: how many tests there are with those still to be made, so that making them raises no p of these.
     """
     p_values = [each.p for each in comparisons if not math.isnan(each.p)]
     tests = max(planned, len(p_values))

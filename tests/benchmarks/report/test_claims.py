@@ -160,7 +160,7 @@ def test_p_is_corrected_over_all_claims() -> None:
     assert set(judge(many, table).verdict) == {"not shown"}
 
 
-def test_a_verdict_does_not_depend_on_which_other_claims_were_run() -> None:
+def test_claims_that_are_run_later_take_no_verdict_away() -> None:
     others = [replace(CLAIM, name=str(k), a="mine") for k in range(20)]
     table = rows((28.9, 30.3, 30.9), OTHER)
     planned = judge([CLAIM, *others], table)
