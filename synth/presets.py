@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ SIZES = ("ci", "factor", "quick", "long", "table", "paper")
 ROTATING = Rig(cameras=24, held_out=4, cameras_per_frame=4)
 ALONE: dict[str, Any] = {"near": (), "far": ()}  # no motion beside what is asked for
 NEW = ("dance", "twist", "wave", "bow", "clap")  # kinds of motion that no scene trains on
+# Where people stand in `lit`, metres towards the lamp; training has four kinds of clips, so each is seen in several.
+TRAINING_PLACES, HELD_OUT_PLACES = (-0.5, 0.5, 0.0, -0.25, 0.25), (-0.35, 0.35, -0.1, 0.1)
 EVENING = Light(falloff=0.4, gloss=0.2)  # a lamp that lights one side of the floor, on cloth that shines a little
 
 
@@ -43,7 +46,7 @@ def _size(name: str) -> Size:
         clips: dict[str, Any] = {"frames": 4, "new": {"frames": 3}, "near": some, "far": some}
         return Size(rig=rig, repeats=1, **clips, stride=3, samples=16, texture=512)
     if name == "factor":  # Novel views lie between cameras, and pixels show what a factor adds.
-        rig = Rig(cameras=20, held_out=4, cameras_per_frame=8, width=192, height=192)
+        rig = replace(ROTATING, cameras_per_frame=8, width=192, height=192)
         return Size(rig=rig, repeats=2, **_few(10), stride=10, samples=50, texture=1024)
     if name == "quick":  # 104 training frames, and fewer than 550 images.
         return Size(rig=ROTATING, repeats=2, **_few(13), stride=13, samples=32, texture=2048)
@@ -161,12 +164,27 @@ def factor_scene(name: str, *, size: str, seed: int = 0, strength: float = 1.0) 
     if name == "swing":
         return replace(base, outfit=replace(base.outfit, swing=strength))
     if name == "lit":
-        return replace(base, light=replace(base.light, falloff=strength))
+        # The other lights dim, so that the lamp is much of what people get, and people cross the floor.
+        reach = min(strength, 1.0)
+        rest = 1 - 0.7 * reach
+        return replace(
+            base,
+            light=replace(base.light, sky=rest * base.light.sky, area=rest * base.light.area, falloff=2 * strength),
+            train=_across(base.train, TRAINING_PLACES, reach),
+            test=_across(base.test, HELD_OUT_PLACES, reach),
+            near=_across(base.near, HELD_OUT_PLACES, reach),
+            far=_across(base.far, HELD_OUT_PLACES, reach),
+        )
     if name == "glossy":
         return replace(base, light=replace(base.light, gloss=strength))
     if name == "turning":
         return replace(base, test=tuple(replace(clip, yaw=2.4 * strength) for clip in base.test))
     raise InputError(f"unknown factor scene {name!r}, expected one of {', '.join(FACTORS)}")
+
+
+def _across(clips: tuple[Clip, ...], places: tuple[float, ...], reach: float) -> tuple[Clip, ...]:
+    """The clips at these places in turn, each times `reach`."""
+    return tuple(replace(clip, shift=(reach * place, 0.0)) for clip, place in zip(clips, cycle(places), strict=False))
 
 
 def still(*, size: str, seed: int) -> Scene:

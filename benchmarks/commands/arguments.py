@@ -321,24 +321,38 @@ def _current_tokens(tokens: Sequence[str], flags: Sequence[_Flag]) -> list[str]:
 
 
 def _config_of(command: type[Any], name: str, own: Sequence[_Flag], tokens: Sequence[str]) -> Any:
-    """The configuration that a command line means, without its flags; None where its own arguments are incomplete."""
+    """The configuration that a command line means, without its flags; None where its own arguments are incomplete.
+
+    Whether a flag of the configuration takes one value or several is known once the configuration is: both are tried.
+    """
+    helped = any(token in HELP for token in tokens)
+    for several in (False, True):
+        own_tokens = _own_tokens(own, tokens, several=several)
+        named = helped and own_tokens[:1] and not own_tokens[0].startswith("-")
+        for missing in ([], ["."]) if named else ([],):  # Help on a method needs no capture.
+            try:
+                made = _made(command, _parse(command, name, own, _current_tokens([*own_tokens, *missing], own)))
+            except InputError:
+                continue
+            return made.settings()
+    return None
+
+
+def _own_tokens(own: Sequence[_Flag], tokens: Sequence[str], *, several: bool) -> list[str]:
+    """Tokens without other flags than a command's own; of those, one value is left out, or all that follow."""
     names = {flag.name for flag in own}
-    own_tokens: list[str] = []
-    waiting = iter(range(len(tokens)))
-    for index in waiting:
-        token = tokens[index]
+    kept: list[str] = []
+    values = 0  # That may still belong to a flag which was left out.
+    for token in tokens:
         if token in HELP:
             continue
-        if token.startswith("--") and token.partition("=")[0].replace("_", "-") not in names:
-            if "=" not in token and index + 1 < len(tokens) and not tokens[index + 1].startswith("--"):
-                next(waiting, None)
-            continue
-        own_tokens.append(token)
-    helped = any(token in HELP for token in tokens) and own_tokens[:1] and not own_tokens[0].startswith("-")
-    for missing in ([], ["."]) if helped else ([],):  # Help on a method needs no capture.
-        try:
-            made = _made(command, _parse(command, name, own, _current_tokens([*own_tokens, *missing], own)))
-        except InputError:
-            continue
-        return made.settings()
-    return None
+        if token.startswith("--"):
+            is_own = token.partition("=")[0].replace("_", "-") in names
+            values = 0 if is_own or "=" in token else len(tokens) if several else 1
+            if is_own:
+                kept.append(token)
+        elif values:
+            values -= 1
+        else:
+            kept.append(token)
+    return kept

@@ -15,6 +15,7 @@ from synth.person.cast import VALIDATION
 MOST_SEEDS = 1000
 AS_GIVEN = "as given"  # size of a capture, or preset of brought pictures, that nobody says
 LONGEST_VALUE = 24  # Characters of a changed value in a name; its hash stands for a longer one.
+LONGEST_NAME = 120  # Characters of a name; the hash of all changes stands for a longer list of them.
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -217,9 +218,10 @@ def varied_name(of: str, changes: Changes) -> str:
     """A name for what differs from `of` in some fields, such as `ash+texels=128`; fit for files and links."""
     parts = [of]
     for key, value in changes:
-        text = re.sub(r"[^\w.,-]", "", ",".join(map(str, value)) if isinstance(value, tuple) else str(value))
+        text = re.sub(r"[^\w.-]", "", "_".join(map(str, value)) if isinstance(value, tuple) else str(value))
         parts.append(f"{key.rpartition('.')[2]}={text if len(text) <= LONGEST_VALUE else hash_of(value)[:8]}")
-    return "+".join(parts)
+    name = "+".join(parts)
+    return name if len(name) <= LONGEST_NAME else f"{of}+{hash_of([(key, str(value)) for key, value in changes])[:8]}"
 
 
 def capture_name(scene: str, size: str, seed: int, subject: int = 0) -> str:

@@ -16,7 +16,7 @@ from helpers.waiting import wait_for
 
 import ash.files
 from ash.capture.manifest import read_manifest
-from ash.files import read_json, write_json
+from ash.files import read_json, require_plain, write_json
 from benchmarks import cli
 from benchmarks.cell import registry
 from benchmarks.cell.sandbox import METHOD_PATH
@@ -137,6 +137,10 @@ def test_a_scenes_fields_are_flags_and_part_of_what_it_is(capsys) -> None:
     assert (name, person.name, person.subject) == ("mannequin-ci-7-subject103", "mannequin", 103)
     splats, _ = arguments.read_command(SynthCommand, "synth", ["splats", "--size", "ci", "--name", "mine"])._described()
     assert (splats.name, splats.body) == ("mine", "mannequin")
+    command = ["mannequin", "--train.0.shift", "-0.5", "0", "--light.sky", "0.3", "--size", "ci"]
+    moved, _ = arguments.read_command(SynthCommand, "synth", command)._described()
+    assert (moved.train[0].shift, moved.light.sky) == ((-0.5, 0.0), 0.3)
+    assert require_plain(moved.name, what="scene") == "mannequin+sky=0.3+shift=-0.5_0.0"
 
 
 def test_a_methods_mistake_comes_with_file_and_line(capture: Path, tmp_path: Path, monkeypatch, capsys) -> None:

@@ -11,6 +11,7 @@ from ash.capture.formats import load_capture
 from ash.files import InputError
 from synth import presets
 from synth.camera.render import probe
+from synth.camera.rig import held_out, place
 from synth.capture import describe, finish
 from synth.cloth.surface import Folds, true_surface
 from synth.motion.clips import make_motion
@@ -32,6 +33,7 @@ def _tiny(scene: Scene) -> Scene:
         rig=Rig(cameras=4, held_out=1, width=64, height=64),
         train=clips,
         test=(Clip(generator="stand", frames=2),),
+        **presets.ALONE,
         novel_view_stride=2,
         samples=32,
         texture=256,
@@ -56,8 +58,9 @@ def test_strength_zero_is_skinned_itself(name: str, size: str):
     skinned = presets.scene("skinned", size=size)
     assert replace(presets.factor_scene(name, size=size, strength=0.0), name="skinned") == skinned
     changed = presets.scene(name, size=size)
-    different = [key for key in ("outfit", "light", "test") if getattr(changed, key) != getattr(skinned, key)]
-    assert len(different) == 1
+    keys = ("outfit", "light", "train", "test", "near", "far")
+    different = [key for key in keys if getattr(changed, key) != getattr(skinned, key)]
+    assert len(different) == (5 if name == "lit" else 1)  # Fall-off is seen by people in several places.
     assert replace(changed, name="skinned", **{key: getattr(skinned, key) for key in different}) == skinned
 
 
@@ -130,6 +133,29 @@ def test_turning_shows_headings_that_training_never_had():
         headings.append(np.rad2deg(np.linalg.norm(motion.dofs[:, 3:6], axis=1)))
     assert headings[0].max() < 60 and headings[1].max() < 60
     assert headings[2].min() > 80
+
+
+@pytest.mark.parametrize("size", ["factor", "quick", "long"])
+def test_the_cameras_of_a_test_stand_around_the_person(size: str):
+    rig = presets.scene("skinned", size=size).rig
+    positions = place(rig)[held_out(rig)]
+    around = np.sort(np.degrees(np.arctan2(positions[:, 0], positions[:, 2])))
+    assert np.diff(around, append=around[0] + 360).max() < 120
+
+
+def test_people_in_lit_stand_in_several_places_and_are_tested_between_them():
+    scene = presets.scene("lit", size="factor")
+    x = {}
+    for part in ("train", "test", "near", "far"):
+        motion = make_motion(BODY.skeleton, getattr(scene, part), fps=12.0, seed=0)
+        sequences = [motion.dofs[motion.sequence == one, 0].mean() for one in np.unique(motion.sequence)]
+        x[part] = np.array(sequences)
+    assert np.ptp(x["train"]) > 0.8
+    for part in ("test", "near", "far"):
+        assert np.ptp(x[part]) > 0.3
+        assert x["train"].min() < x[part].min() and x[part].max() < x["train"].max()
+    kinds = [clip.generator for clip in scene.train]
+    assert all(len({clip.shift for clip in scene.train if clip.generator == kind}) > 1 for kind in kinds)
 
 
 def test_light_varies_over_the_floor_in_lit_only_and_gloss_adds_highlights_alone(tmp_path: Path):

@@ -7,7 +7,7 @@ import pytest
 from helpers import fakes
 
 from ash.capture.manifest import read_manifest
-from ash.files import InputError
+from ash.files import InputError, require_plain
 from benchmarks.analysis.style import is_ours, style_of, titles_of, user_rows
 from benchmarks.cell.registry import WRONG_BY_MM, is_oracle
 from benchmarks.cell.schema import write_config
@@ -260,6 +260,9 @@ def test_a_suite_is_narrowed_to_some_of_its_stresses() -> None:
 
 def test_names_of_variants_are_fit_for_files() -> None:
     assert varied_name("ash", (("model.texels", 128), ("training.warmup", "none"))) == "ash+texels=128+warmup=none"
-    assert varied_name("tight", (("rig.distortion", (0.1, 0, 0, 0)),)) == "tight+distortion=0.1,0,0,0"
+    assert varied_name("tight", (("rig.distortion", (0.1, 0, 0, 0)),)) == "tight+distortion=0.1_0_0_0"
     assert "/" not in varied_name("tight", (("rig.given", "../" * 99),))
     assert len(varied_name("tight", (("rig.given", "x" * 999),))) < 40
+    shifts = {at: tuple((f"train.{clip}.shift", (at, 0.0)) for clip in range(9)) for at in (-0.5, 0.5)}
+    many, others = (varied_name("lit", changes) for changes in shifts.values())
+    assert require_plain(many, what="scene").startswith("lit+") and len(many) < 40 and many != others
