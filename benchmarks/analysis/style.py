@@ -39,6 +39,7 @@ ADDED = (  # by `ash_plus`: name, title, colour
     ("coarse", "one coarse U-Net", "#dd6b20"),
     ("narrow", "half the width, one frame", "#5b6b7a"),
 )
+MAIN = ("ash", "ddc", "ash_plus", "ddc_plus", "ash_truth", "ddc_truth")
 STYLES = {
     "ash": MethodStyle("ASH", "#2f6fde"),
     "ash_plus": MethodStyle("ASH+", "#12b5cb"),
@@ -192,6 +193,11 @@ def reference_of(method: str, methods: Collection[str]) -> str | None:
     first = STYLES[method].reference if is_ours(method) and method in STYLES else REFERENCES[0]
     references = [name for name in (first, *REFERENCES) if name in methods and name != method]
     return references[0] if references else None
+
+
+def prominence(method: str) -> int:
+    """What stands first where there is no room for all rows: 0, a user's row; 1, a main one of ours; 2, another."""
+    return 1 + (method not in MAIN) if is_ours(method) else 0
 
 
 def is_ours(method: str) -> bool:

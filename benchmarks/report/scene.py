@@ -11,7 +11,7 @@ from ash.files import InputError
 from benchmarks.analysis import differences, paper
 from benchmarks.analysis.error_attribution import REGIONS
 from benchmarks.analysis.results import HELD_OUT_SPLITS, MOTION_SPLITS, RANKED_SPLITS, Quantity, RunTables
-from benchmarks.analysis.style import SPLIT_NAMES, is_ours, style_of
+from benchmarks.analysis.style import SPLIT_NAMES, is_ours, prominence, style_of
 from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.schema import CellResult
 from benchmarks.report import charts, figures, people, pictures, sentences, tables, vega
@@ -22,7 +22,6 @@ from benchmarks.report.vega import Figure
 from benchmarks.suites.runs import Run
 
 COSTS = ("frame_ms", "train_s", "peak_rss_mb", "params", "gaussians")  # the others stand folded
-ON_SHEETS = ("ash", "ddc", "ash_plus", "ddc_plus", "ash_truth", "ddc_truth")
 AT_MOST_ON_SHEETS = 5
 WORST, FEW_WORST, MANY = 3, 1, 24  # worst frames of each method; of more than so many methods on all scenes, one
 SHEETS = {"pictures": "Truth, methods and errors", "pictures_people": "All subjects", "worst": "The worst frames"}
@@ -291,9 +290,8 @@ def _people_pictured(data: SceneData) -> str:
 
 
 def on_sheet(shown: list[Shown]) -> list[Shown]:
-    """Whose pictures come first: a user's rows, which may have the names of ours, then the main ones of ours."""
-    main = [each for each in shown if not is_ours(each.cell.config.method) or each.cell.config.method in ON_SHEETS]
-    return sorted(main, key=lambda each: is_ours(each.cell.config.method))
+    """Whose pictures are shown: a user's rows, which may have the names of ours, our main ones, then our others."""
+    return sorted(shown, key=lambda each: prominence(each.cell.config.method))[:AT_MOST_ON_SHEETS]
 
 
 def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Flipbook, dict[str, bytes]]:
@@ -313,7 +311,7 @@ def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Fl
         series=series,
     )
     file = f"pictures_{data.scene}.webp"
-    sheet = pictures.sheet(pictures.comparisons(capture, (on_sheet(shown) or shown)[:AT_MOST_ON_SHEETS]))
+    sheet = pictures.sheet(pictures.comparisons(capture, on_sheet(shown)))
     names = tuple(each.title for each in series)
     return Flipbook(file=file, tracks=tuple(tracks), names=names, chart=chart), {file: sheet}
 

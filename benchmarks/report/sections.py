@@ -8,7 +8,7 @@ import pandas as pd
 from benchmarks.analysis import ablation_matrix, curves, paper, pareto, stability, template_error
 from benchmarks.analysis.differences import differences
 from benchmarks.analysis.results import RANKED_SPLITS, Quantity, RunTables, alike
-from benchmarks.analysis.style import SPLIT_NAMES, style_of
+from benchmarks.analysis.style import SPLIT_NAMES, prominence, style_of
 from benchmarks.cell.metrics import METRICS, PROTOCOL
 from benchmarks.cell.schema import CellResult
 from benchmarks.report import author_table, charts, vega
@@ -24,6 +24,7 @@ from benchmarks.suites.stress import AXES
 WHISKERS = "Whiskers: 95 % interval over seeds, or over captures where there are several."
 APART = "The common effect of a capture is removed."
 LIMIT_DB = 2.0  # differences from which on a matrix has the deepest colour
+MOST_LINES = 8  # in the chart of novelty; of more rows the main ones
 MANY_ROWS = 3  # from which on the smallest sufficient one is asked for
 MATRIX_NOTE = (
     "Foreground PSNR of ASH minus that of the row without the component, with its 95 % interval and the verdict on "
@@ -263,13 +264,16 @@ def novelty(tables: RunTables) -> list[Section]:
     table = curves.novelty(curves.on_equal_captures(tables.images))
     if not len(table):
         return []
+    main = table[table["method"].map(prominence) < 2]
+    shown = main if table["method"].nunique() > MOST_LINES and len(main) else table
+    rows = "" if shown is table else "The main rows; the sentence below has all. "
     figure = line_figure(
-        table.assign(panel=table["scene"], scale=table["scene"], novelty_deg=table["novelty_deg"].round(1)),
+        shown.assign(panel=shown["scene"], scale=shown["scene"], novelty_deg=shown["novelty_deg"].round(1)),
         name="novelty",
         title="Quality against novelty",
         caption="Foreground PSNR by how far a pose lies from the nearest training pose: the mean over the joints of "
         "the angle between their rotations, the heading removed. At zero: novel views of training poses. The frames of "
-        f"near, new and far novel poses stand in bins of equal number, each at its mean. {WHISKERS} {APART}",
+        f"near, new and far novel poses stand in bins of equal number, each at its mean. {rows}{WHISKERS} {APART}",
         x="novelty_deg",
         x_title="novelty of the pose [degrees]",
     )

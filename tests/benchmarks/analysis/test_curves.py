@@ -239,6 +239,16 @@ def test_the_chart_of_novelty_has_a_line_per_method() -> None:
     assert "novelty of the pose [degrees]" in figure.svg()
 
 
+def test_of_many_rows_the_chart_of_novelty_shows_the_main_ones_and_its_sentence_all() -> None:
+    rows = ["wo_disp", "wo_mot", "window_1", "unlearned", "wo_phi", "sh_0", "sh_1", "sh_2", "ash"]
+    (section,) = sections.novelty(RunTables([moving(row, 0, 0.5) for row in rows]))
+    figure, sentences = section.blocks
+    assert isinstance(figure, Figure) and [series.title for series in figure.series] == ["ASH"]
+    assert isinstance(sentences, Bullets) and sentences.items[0].count(" dB") == len(rows)
+    (fewer,) = sections.novelty(RunTables([moving(row, 0, 0.5) for row in rows[1:]]))
+    assert isinstance(fewer.blocks[0], Figure) and len(fewer.blocks[0].series) == len(rows) - 1
+
+
 @pytest.mark.parametrize("splits", [("novel_view", "novel_pose"), ("novel_view", *MOTION)])
 def test_tables_show_near_and_far_where_a_scene_has_them(splits: tuple[str, ...]) -> None:
     whole = moving("ash", 0, 0.5)

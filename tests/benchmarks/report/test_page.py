@@ -517,10 +517,11 @@ def test_nothing_is_wrong_on_a_desktop_and_the_controls_work(run: Run, visit: Vi
     assert seen.errors == []
 
 
-def test_a_sheet_shows_every_row_once_and_those_of_a_user_first() -> None:
+def test_a_sheet_shows_every_row_once_those_of_a_user_first_and_our_main_ones_next() -> None:
     """A user's row may have the name of one of ours."""
     changed = replace(config("ddc"), changes={"training.seconds": 9.0})
-    cells = [Cell(config=each, folder=Path()) for each in (config("ash"), changed)]
+    rows = [config("wo_disp"), config("ash"), changed]
+    cells = [Cell(config=each, folder=Path()) for each in rows]
     shown = [Shown(cell=each, result=CellResult(config=each.config, status="done")) for each in cells]
     with titles_of([each.config for each in cells]):
-        assert [each.cell.config.method for each in scene_module.on_sheet(shown)] == ["ddc", "ash"]
+        assert [each.cell.config.method for each in scene_module.on_sheet(shown)] == ["ddc", "ash", "wo_disp"]
