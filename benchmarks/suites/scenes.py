@@ -5,13 +5,17 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ash.fields import Changes, apply_overrides, suggest
 from ash.files import InputError
 from benchmarks.cell.registry import current_fields
 from benchmarks.suites.progress import Progress
+from synth.camera.rig import held_out, place
 from synth.presets import SCENES, scene, skinned
-from synth.scene import Scene
+from synth.scene import Rig, Scene
 
+ONE_SIDED = 200.0  # degrees
 SPLATS = "splats"  # The first factor scene, drawn by `benchmarks.suites.splats`.
 
 
@@ -45,6 +49,18 @@ def identity_of(of: str, wanted: Scene) -> str:
     return wanted.identity
 
 
+def one_sided(rig: Rig) -> str:
+    """What is said where the test cameras of a dome leave more than `ONE_SIDED` degrees around the person unseen."""
+    if rig.kind != "dome" or rig.held_out < 3:
+        return ""
+    cameras = place(rig)[held_out(rig)]
+    azimuths = np.sort(np.degrees(np.arctan2(cameras[:, 0], cameras[:, 2])))
+    gap = np.diff(azimuths, append=azimuths[0] + 360).max()
+    if gap < ONE_SIDED:
+        return ""
+    return f"no test camera in {gap:.0f} of 360 degrees around the person; rig.cameras 24 has them on all sides"
+
+
 def draw_scene(
     of: str,
     wanted: Scene,
@@ -74,6 +90,8 @@ def draw_scene(
     if not (folder / "cameras.json").exists():  # Written last before the images.
         cost = estimate(wanted).text
         progress.say(f"{title}: {cost}; first body, motion, clothes and texture (up to two minutes)")
+        if note := one_sided(wanted.rig):
+            progress.say(f"{title}: {note}")
     for attempt in (1, 2):  # The kernel kills when memory runs out; what was drawn is kept.
         try:
             render(wanted, folder, workers=workers, progress=progress.advance, executor=executor, shard=shard)

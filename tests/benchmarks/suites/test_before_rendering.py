@@ -1,5 +1,6 @@
 """What can be known to be wrong before anything is rendered is refused then, in one line."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,9 @@ from helpers.commands import refused
 from ash.files import InputError
 from benchmarks import cli
 from benchmarks.suites.files import find_suite
+from benchmarks.suites.scenes import one_sided
 from synth import cost
+from synth.presets import SIZES
 from synth.presets import scene as named
 
 
@@ -50,3 +53,10 @@ def test_a_disk_that_is_too_small_is_told_in_a_unit_that_shows_it(tmp_path: Path
     monkeypatch.setattr(cost.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 2_500_000}))
     with pytest.raises(InputError, match=r"the capture needs \d+\.\d MB more and the disk has 2\.5 MB free"):
         cost.require_space([(scene, tmp_path / "new")], tmp_path)
+
+
+def test_test_cameras_on_one_side_of_the_person_are_told() -> None:
+    """Those of size `factor` stood within 97 degrees behind the person when it had 20 cameras."""
+    assert not any(one_sided(named("skinned", size=size).rig) for size in SIZES)
+    few = replace(named("skinned", size="quick").rig, cameras=20)
+    assert one_sided(few).startswith("no test camera in 263 of 360 degrees")
