@@ -58,7 +58,7 @@ def one_sided(rig: Rig) -> str:
     gap = np.diff(azimuths, append=azimuths[0] + 360).max()
     if gap < ONE_SIDED:
         return ""
-    return f"no test camera in {gap:.0f} of 360 degrees around the person; rig.cameras 24 has them on all sides"
+    return f"no test camera in {gap:.0f} of 360 degrees around the person; 24 cameras with 4 held out see all sides"
 
 
 def draw_scene(

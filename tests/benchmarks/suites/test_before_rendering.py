@@ -60,3 +60,5 @@ def test_test_cameras_on_one_side_of_the_person_are_told() -> None:
     assert not any(one_sided(named("skinned", size=size).rig) for size in SIZES)
     few = replace(named("skinned", size="quick").rig, cameras=20)
     assert one_sided(few).startswith("no test camera in 263 of 360 degrees")
+    three = replace(named("skinned", size="quick").rig, held_out=3)
+    assert "4 held out" in one_sided(three), "24 cameras are not enough of an advice: these are 24"
