@@ -1,0 +1,71 @@
+"""Draw a sheet with a row for each scene: .venv/bin/python docs/scene_sheet.py OUT.webp SCENE...
+
+Each row has five views: training views and, last, one of a new and one of a far pose where the scene has them. Each
+person is cropped to fill the tile. Only these views are rendered; a scene takes about a minute.
+"""
+
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from ash.capture.dataset import image_path
+from synth import presets
+from synth.camera.render import probe
+from synth.capture import describe
+from synth.rendering import render_views
+from synth.scene import Scene
+from synth.views import WantedView, splits
+
+VIEWS, TILE, GREY = 5, (240, 320), (71, 71, 71)  # TILE: width, height in pixels
+
+
+def row(name: str) -> Image.Image:
+    """The scene's views beside one another."""
+    scene = presets.scene(name, size="quick" if name in ("tight", "loose") else "factor")
+    scene = replace(scene, rig=replace(scene.rig, width=2 * TILE[1], height=2 * TILE[1]), samples=32)
+    views = shown(scene)
+    line = Image.new("RGB", (VIEWS * TILE[0], TILE[1]), GREY)
+    with TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        with ProcessPoolExecutor(mp_context=get_context("spawn")) as executor:
+            describe(scene, folder, executor)
+        for column, view in enumerate(views):
+            render_views(scene, folder, probe(), [view])
+            line.paste(tile(Image.open(image_path(folder, view.camera, view.frame))), (column * TILE[0], 0))
+    ImageDraw.Draw(line).text((6, 6), name)
+    return line
+
+
+def shown(scene: Scene) -> list[WantedView]:
+    """The views of a row: evenly spaced ones of the training images, then the middle one of new and of far poses."""
+    parts = splits(scene)
+    poses = [list(parts[name].views) for name in ("novel_pose", "far_pose") if name in parts]
+    training = list(parts["train"].views)
+    spaced = np.linspace(0, len(training) - 1, VIEWS - len(poses)).round().astype(int)
+    pairs = [training[index] for index in spaced] + [views[len(views) // 2] for views in poses]
+    return [WantedView(camera=camera, frame=frame) for camera, frame in pairs]
+
+
+def tile(image: Image.Image) -> Image.Image:
+    """The person of an RGBA image on grey, with a margin of 6 % above and below."""
+    left, top, right, bottom = image.getchannel("A").getbbox()
+    height = max(1.12 * (bottom - top), 1.12 * (right - left) * TILE[1] / TILE[0])
+    width, x, y = height * TILE[0] / TILE[1], (left + right) / 2, (top + bottom) / 2
+    box = [round(edge) for edge in (x - width / 2, y - height / 2, x + width / 2, y + height / 2)]
+    person = image.crop(box).resize(TILE, Image.Resampling.LANCZOS)
+    return Image.alpha_composite(Image.new("RGBA", TILE, (*GREY, 255)), person).convert("RGB")
+
+
+if __name__ == "__main__":
+    out, *names = sys.argv[1:]
+    sheet = Image.new("RGB", (VIEWS * TILE[0], len(names) * TILE[1]), GREY)
+    for index, name in enumerate(names):
+        print(f"{name} ({index + 1} of {len(names)})", flush=True)
+        sheet.paste(row(name), (0, index * TILE[1]))
+    sheet.save(out, quality=80)
