@@ -11,10 +11,10 @@ from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
 from PIL import Image, ImageDraw
 
 from ash.capture.dataset import image_path
+from benchmarks.cell.evaluation import spread
 from synth import presets
 from synth.camera.render import probe
 from synth.capture import describe
@@ -47,8 +47,8 @@ def shown(scene: Scene) -> list[WantedView]:
     parts = splits(scene)
     poses = [list(parts[name].views) for name in ("novel_pose", "far_pose") if name in parts]
     training = list(parts["train"].views)
-    spaced = np.linspace(0, len(training) - 1, VIEWS - len(poses)).round().astype(int)
-    pairs = [training[index] for index in spaced] + [views[len(views) // 2] for views in poses]
+    spaced = [training[index] for index in spread(len(training), VIEWS - len(poses))]
+    pairs = spaced + [views[len(views) // 2] for views in poses]
     return [WantedView(camera=camera, frame=frame) for camera, frame in pairs]
 
 
