@@ -214,6 +214,12 @@ def compare(rows: pd.DataFrame, a: str, b: str, quantity: Quantity) -> Compariso
     )
 
 
+def methods_of(rows: pd.DataFrame, *, oracles: bool = True) -> tuple[str, ...]:
+    """Methods that have rows: the user's first, then ours in the order of the suite."""
+    names = sorted(map(str, rows["method"].unique()), key=is_ours)
+    return tuple(name for name in names if oracles or not is_oracle(name))
+
+
 def fewer_captures(rows: pd.DataFrame) -> dict[str, str]:
     """Methods that have fewer captures than others, with what their means are of, such as "3 of 5 people".
 
@@ -278,8 +284,7 @@ class RunTables:
 
     def methods(self, scene: str, *, oracles: bool = True) -> tuple[str, ...]:
         """Methods on a scene: the user's first, then ours in the order of the suite."""
-        names = sorted(map(str, self.of(scene)["method"].unique()), key=is_ours)
-        return tuple(name for name in names if oracles or not is_oracle(name))
+        return methods_of(self.of(scene), oracles=oracles)
 
     def get(self, scene: str, method: str, quantity: Quantity) -> Any:
         """The row of `summary`, or None where no cell has the quantity."""

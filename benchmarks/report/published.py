@@ -14,20 +14,32 @@ import pandas as pd
 from jinja2 import Environment, StrictUndefined
 
 from ash.files import InputError, write_atomic
+from benchmarks.analysis import ablation_matrix
+from benchmarks.analysis.differences import differences
 from benchmarks.analysis.paper import order_agreement, paper_tables
-from benchmarks.analysis.results import Quantity, compare, fewer_captures, foreground, read_csv, samples_of, summarise
+from benchmarks.analysis.results import (
+    RANKED_SPLITS,
+    Quantity,
+    compare,
+    fewer_captures,
+    foreground,
+    read_csv,
+    samples_of,
+    summarise,
+)
 from benchmarks.analysis.statistics import Comparison
-from benchmarks.analysis.style import style_of
+from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell.metrics import METRICS, PROTOCOL
 from benchmarks.cell.registry import code_version, methods
 from benchmarks.report.claims import printed
-from benchmarks.report.tables import ON_WHOLE_FRAMES, cost_columns, head_of, quality_columns
+from benchmarks.report.tables import ON_WHOLE_FRAMES, cost_columns, head_of, people_needed, quality_columns
 
 FOLDER = Path(__file__).parents[2] / "reports"
 NAME = "README.md"
 OWN = "README: "  # begins the names of claims that are this project's own
 OUTFITS = ("tight", "loose")
 OTHER_SCENES = "other scenes"
+NEEDS = {"better": "needed", "equivalent": "not needed", "worse": "does harm"}  # by the verdict on ASH with a component
 FACT = re.compile(r"^\| (code|commit|processor|gpu) \| (.*?) \|$", re.MULTILINE)  # of its provenance
 
 
@@ -71,19 +83,36 @@ class Numbers:
             raise InputError(f"{self.folder / report}: expected rows {a} and {b} on {scene}")
         return _with_interval(test, metric)
 
-    def scores(self, report: str, scene: str) -> str:
-        """A table in Markdown: PSNR and LPIPS on all held-out splits, milliseconds and training seconds."""
+    def scores(self, report: str, *scenes: str) -> str:
+        """A table in Markdown of the rows that ran on everybody: PSNR and LPIPS on all held-out splits, milliseconds
+        and training seconds.
+        """
         quantities = [*quality_columns(("psnr", "lpips")), *cost_columns(("frame_ms", "train_cpu_s"))]
-        of_scene = self._of_scene(report, scene)
-        fewer = fewer_captures(of_scene)
+        of_scenes = {scene: self._of_scene(report, scene) for scene in scenes}
         cells = [
-            [
-                style_of(method).title + (f" ({fewer[method]})" if method in fewer else ""),
-                *(self._score(report, scene, method, quantity) for quantity in quantities),
-            ]
-            for method in of_scene["method"].unique()
+            [f"{scene}: {style_of(method).title}", *(self._score(report, scene, method, each) for each in quantities)]
+            for scene, rows in of_scenes.items()
+            for method in rows["method"].unique()
+            if method not in fewer_captures(rows)
         ]
         return _markdown(["", *(": ".join(head_of(quantity)) for quantity in quantities)], cells)
+
+    def needs(self, report: str) -> str:
+        """A table in Markdown: what ASH loses without a component, with the verdict on ASH or how many people would
+        decide, on the scene that should need it, on this scene at other strengths, and on the one of strength 0.
+        """
+        table = differences(self._rows(report))
+        views, poses = ({(e.row, e.scene): e for e in ablation_matrix.effects(table, s)} for s in RANKED_SPLITS)
+        asked = {row for (row, _), effect in views.items() if effect.expected}
+        beside = {ablation_matrix.ZERO_STRENGTH, *ablation_matrix.OTHER_STRENGTHS}
+        cells = [
+            [effect.component, scene, str(self.people(report, scene, row)), _need(effect), _need(poses[row, scene])]
+            for (row, scene), effect in views.items()
+            if effect.expected or (row in asked and scene in beside)
+        ]
+        return _markdown(
+            ["ASH", "scene", "people", *(SPLIT_NAMES[s].words for s in RANKED_SPLITS)], cells, numbers=False
+        )
 
     def order(self, report: str, scene: str, split: str, metric: str) -> str:
         """Kendall's tau of our rows to the order of the paper's comparison, with its interval over people."""
@@ -182,6 +211,13 @@ def _quantity(split: str, metric: str) -> Quantity:
     if split in ("speed", "memory") or METRICS[metric].unit == "mm":
         return Quantity(split, "", metric)
     return Quantity(split, "full", metric) if metric in ON_WHOLE_FRAMES else foreground(split, metric)
+
+
+def _need(effect: ablation_matrix.AblationEffect) -> str:
+    """The loss without the component, and whether it is needed or how many people would decide."""
+    if effect.verdict == "unclear":
+        return f"{effect.text}: {people_needed(effect.needed) or 'more'} people would decide"
+    return f"{effect.text}: {NEEDS[effect.verdict]}"
 
 
 def _with_interval(test: Comparison, metric: str) -> str:

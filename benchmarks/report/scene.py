@@ -88,7 +88,7 @@ def scene_report(data: SceneData) -> tuple[list[Section], dict[str, bytes]]:
     costs = tables.cost_columns(COSTS)
     cost = tables.build(run_tables, scene, costs, title=f"Cost on {scene}", exposed=exposed)
     more = _other_numbers(run_tables, scene, [*asked, *costs])
-    ranked = differences.differences(run_tables, scenes=(scene,))
+    ranked = differences.differences(run_tables.of(scene))
     note = " ".join((QUALITY_NOTE, *((APART_NOTE,) if quality.below else ()), VALUES_NOTE))
     picture_sections, sheets = _picture_sections(data, capture, shown, trouble)
     smoke = sentences.smoke(data.results)
@@ -194,7 +194,7 @@ def statistics_blocks(run_tables: RunTables, scene: str) -> list[Block]:
     learned = sentences.templates(run_tables, scene)
     blocks: list[Block] = [Text(text=learned)] if learned else []
     others = tuple(split for split in MOTION_SPLITS if split not in RANKED_SPLITS)
-    beside = differences.differences(run_tables, splits=others, scenes=(scene,))
+    beside = differences.differences(run_tables.of(scene), splits=others)
     blocks += difference_tables(run_tables, scene, beside, title="Near and far novel poses")
     return blocks
 

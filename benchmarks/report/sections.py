@@ -65,7 +65,7 @@ def ablations(tables: RunTables, chosen_on: RunTables | None = None) -> list[Sec
 
     `chosen_on`: the same rows on subjects for validation, whose choice is judged on the subjects here.
     """
-    ranked = differences(tables)
+    ranked = differences(tables.rows)
     blocks: list[Block] = []
     for split in RANKED_SPLITS:
         effects = ablation_matrix.matrix(tables, ranked, split)

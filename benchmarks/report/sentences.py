@@ -67,7 +67,7 @@ def headline(tables: RunTables, scene: str, *, smoke: bool = False) -> str:
 
 def _finding(tables: RunTables, scene: str) -> str:
     """The verdict on each pair; where there is none, those on the rows of an ablation, or on the two best methods."""
-    ranked = differences(tables, scenes=(scene,))
+    ranked = differences(tables.of(scene))
     if pairs := [pair for pair in PAIRS if set(pair) <= set(tables.methods(scene))]:
         first, *others = (_pair(tables, scene, ranked, *pair) for pair in pairs)
         return " ".join([f"On {scene}, {first}", *(text[0].upper() + text[1:] for text in others)])

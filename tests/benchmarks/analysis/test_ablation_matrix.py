@@ -52,7 +52,7 @@ def factors() -> RunTables:
 
 
 def verdicts(tables: RunTables) -> dict[tuple[str, str], str]:
-    found = matrix(tables, differences(tables), "novel_view")
+    found = matrix(tables, differences(tables.rows), "novel_view")
     return {(effect.scene, effect.row): effect.verdict for effect in found}
 
 
@@ -62,7 +62,7 @@ def test_the_matrix_has_the_verdicts_of_the_differences(factors: RunTables) -> N
     assert found["turning", "plus_heading"] == "worse"
     assert (found["glossy", "sh_0"], found["glossy", "sh_1"]) == ("better", "better")
     assert len(found) == 4 * 5 and {scene for scene, _ in found}.isdisjoint({"wrinkles_half", "wrinkles_twice"})
-    effects = matrix(factors, differences(factors), "novel_view")
+    effects = matrix(factors, differences(factors.rows), "novel_view")
     assert list(dict.fromkeys(effect.component for effect in effects)) == [
         "w/o mot.",
         "SH 0",
@@ -82,7 +82,7 @@ def test_one_scene_or_no_component_makes_no_matrix() -> None:
 
 
 def test_surprises_are_what_contradicts_the_expectation(factors: RunTables) -> None:
-    said = surprises(matrix(factors, differences(factors), "novel_view"))
+    said = surprises(matrix(factors, differences(factors.rows), "novel_view"))
     assert [text.partition(":")[0] for text in said] == [
         "skinned, w/o mot.",
         "swing, w/o mot.",
@@ -96,7 +96,7 @@ def test_surprises_are_what_contradicts_the_expectation(factors: RunTables) -> N
 def test_a_scene_of_all_phenomena_may_need_components_that_are_not_expected_of_it() -> None:
     loose = run("loose", {"ash": 27.0, "unlearned": 27.0, "wo_disp": 25.0})
     tables = RunTables(loose + run("skinned", {"ash": 27.0, "wo_disp": 27.0}))
-    (said,) = surprises(matrix(tables, differences(tables), "novel_view"))
+    (said,) = surprises(matrix(tables, differences(tables.rows), "novel_view"))
     assert said.startswith("loose, skinned template") and said.endswith("although the scene should need it.")
 
 
@@ -104,26 +104,26 @@ def test_a_surprise_names_the_control_scene_where_it_was_run() -> None:
     base = {"ash": 27.0, "wo_mot": 26.0, "wo_disp": 27.0}
     shown = run("skinned", base) + run("wrinkles", base)
     tables = RunTables([*shown, *run("overcast", base | {"wo_mot": 26.9})])
-    said = surprises(matrix(tables, differences(tables), "novel_view"))
+    said = surprises(matrix(tables, differences(tables.rows), "novel_view"))
     assert "Control scene overcast, under an even sky, where no lamp casts shadows: +0.10 dB" in said[0]
 
 
 def test_what_a_scene_should_need_and_is_unclear_says_how_many_people_would_decide() -> None:
     unclear = people({"ash": (27.0, 29.0, 31.0), "wo_mot": (26.8, 28.1, 31.2)}, scene="wrinkles")
     tables = RunTables(unclear + run("swing", {"ash": 27.0, "wo_mot": 26.0}))
-    (sentence,) = undecided(matrix(tables, differences(tables), "novel_view"))
+    (sentence,) = undecided(matrix(tables, differences(tables.rows), "novel_view"))
     assert sentence.startswith("wrinkles, w/o mot.: +0.30 dB [") and sentence.endswith(" people would decide.")
     said = [item for bullets in blocks_of(sections.ablations(tables), Bullets) for item in bullets.items]
     assert sentence in said
     seeds = people({"ash": (27.0,), "wo_mot": (26.9,)}, (0.0, 0.5, -0.5), scene="wrinkles")
     single = RunTables(seeds + run("swing", {"ash": 27.0, "wo_mot": 26.0}))
-    assert undecided(matrix(single, differences(single), "novel_view")) == [], (
+    assert undecided(matrix(single, differences(single.rows), "novel_view")) == [], (
         "seeds of one person say nothing of others"
     )
 
 
 def test_loss_by_strength(factors: RunTables) -> None:
-    table = strength_curves(differences(factors), "novel_view")
+    table = strength_curves(differences(factors.rows), "novel_view")
     wrinkles = table[table["scene"] == "wrinkles"]
     assert wrinkles["strength"].tolist() == [0.0, 0.5, 1.0, 2.0]
     assert wrinkles["mean"].tolist() == pytest.approx([1.0, 0.6, 1.5, 3.0], abs=0.01)

@@ -10,7 +10,7 @@ from scipy import stats
 
 from benchmarks.analysis.differences import differences
 from benchmarks.analysis.pareto import candidates
-from benchmarks.analysis.results import COLUMNS, RunTables, compare, foreground
+from benchmarks.analysis.results import COLUMNS, RunTables, compare, foreground, load
 from benchmarks.cell.schema import failed_result
 from benchmarks.report.content import Table
 from benchmarks.report.scene import difference_tables
@@ -48,7 +48,7 @@ def test_a_table_of_differences_keeps_the_level_over_all_its_rows() -> None:
         levels = {m: captures + rng.normal(0, 0.2, 8) for m in ("ash", "ddc", "mlp", "static", "wo_mot")}
         results = people({m: own.tolist() for m, own in levels.items()})
         tables = RunTables([replace(result, summary=result.summary[:2]) for result in results])  # of PSNR alone
-        alarms += bool((differences(tables)["p"] < 0.05).any())
+        alarms += bool((differences(tables.rows)["p"] < 0.05).any())
     assert stats.binomtest(alarms, TABLES, 0.05, alternative="greater").pvalue > 0.01, alarms / TABLES
 
 
@@ -62,7 +62,7 @@ def test_a_method_is_compared_on_the_captures_that_both_have() -> None:
 def test_a_failed_method_is_compared_with_nobody() -> None:
     results = people({"ash": (20.0, 25.0), "ddc": (19.5, 24.7)})
     results[-1] = failed_result(results[-1].config, "crashed", "boom")
-    assert not len(differences(RunTables(results)))
+    assert not len(differences(load(results)))
 
 
 def test_methods_compete_on_the_captures_that_all_have() -> None:
@@ -72,18 +72,18 @@ def test_methods_compete_on_the_captures_that_all_have() -> None:
 
 def test_a_report_says_what_was_compared_and_what_could_be_found() -> None:
     many = RunTables(people({"ash": (20.0, 25.0, 30.0), "ddc": (19.0, 24.2, 29.2)}))
-    ranked = differences(many)
+    ranked = differences(many.rows)
     (main,) = (b for b in difference_tables(many, "loose", ranked, title="") if isinstance(b, Table))
     assert list(main.frame.columns)[1:4] == ["verdict", "difference [dB]", "95 % interval [people, paired t]"]
     assert main.frame.index[0] == "DDC" and main.frame["verdict"].tolist() == ["better", "better"]
     assert "people needed" not in main.frame
     apart = RunTables(people({"ash": (20.0, 25.0, 30.0), "ddc": (19.0, 24.2, 29.2), "mlp": (18.0, 25.5, 29.0)}))
-    (main,) = (b for b in difference_tables(apart, "loose", differences(apart), title="") if isinstance(b, Table))
+    (main,) = (b for b in difference_tables(apart, "loose", differences(apart.rows), title="") if isinstance(b, Table))
     unclear = main.frame["verdict"] == "unclear"
     assert unclear.any() and (main.frame["people needed"].ne("") == unclear).all()
     assert main.frame.loc[unclear, "people needed"].astype(int).ge(4).all()
     one = RunTables(people({"ash": (20.0,), "ddc": (19.0,)}, seeds=(0.0, 0.1, 0.3)))
-    (main,) = (b for b in difference_tables(one, "loose", differences(one), title="") if isinstance(b, Table))
+    (main,) = (b for b in difference_tables(one, "loose", differences(one.rows), title="") if isinstance(b, Table))
     assert list(main.frame.columns)[3] == "95 % interval [seeds, Welch]"
     single = RunTables([cell("ash", 20.0), cell("ddc", 19.0)])
-    assert difference_tables(single, "loose", differences(single), title="") == []
+    assert difference_tables(single, "loose", differences(single.rows), title="") == []

@@ -252,7 +252,7 @@ def test_the_headline_has_the_verdict_of_the_table_below_it() -> None:
     scores = RunTables(
         [scored(m, view=view, pose=view, seed=seed) for m, views in levels.items() for seed, view in enumerate(views)]
     )
-    table = differences(scores).query("method == 'ddc' and split == 'novel_view'").iloc[0]
+    table = differences(scores.rows).query("method == 'ddc' and split == 'novel_view'").iloc[0]
     assert table["verdict"] == "unclear" and table["p"] > 0.05
     assert sentences.headline(scores, "loose").startswith("On loose, no difference between ASH and DDC is shown on ")
 

@@ -68,16 +68,36 @@ def test_numbers_are_those_of_the_csv(numbers: Numbers) -> None:
     assert numbers.score("mine", "loose", "ash") == "27.00"
     assert numbers.score("mine", "loose", "wo_mot") == "n/a"
     assert numbers.difference("mine", "loose", "ash", "ddc") == "+1.00 dB [-1.48, +3.48]"  # t(2) is 4.30
-    assert "| ASH | 27.00 | n/a |" in numbers.scores("mine", "loose")
+    assert "| loose: ASH | 27.00 | n/a |" in numbers.scores("mine", "loose")
 
 
-def test_a_row_of_fewer_people_than_others_says_so(numbers: Numbers) -> None:
+def test_scores_are_of_rows_that_ran_on_everybody(numbers: Numbers) -> None:
     (numbers.folder / "fewer").mkdir()
     made = load(people({"ash": (25.0, 27.0, 29.0), "smpl": (24.0, 25.0)}))
     (numbers.folder / "fewer" / "results.csv").write_text(csv_of(made))
     text = numbers.scores("fewer", "loose")
-    assert "| ASH | 27.00 |" in text and "(2 of 3 people) | 24.50 |" in text
+    assert "| loose: ASH | 27.00 |" in text and "24.50" not in text
     assert numbers.people("fewer", "loose") == 3 and numbers.people("fewer", "loose", "smpl") == 2
+
+
+def test_what_scenes_need_is_beside_the_scene_without_their_phenomenon(numbers: Numbers) -> None:
+    (numbers.folder / "factors").mkdir()
+    ash = (27.0, 29.0, 31.0)
+    found = {"wrinkles": (25.0, 27.1, 28.9), "wrinkles_twice": (24.0, 26.1, 27.9), "skinned": (26.8, 28.1, 31.2)}
+    results = [
+        each
+        for scene, without in found.items()
+        for each in people({"ash": ash, "wo_disp": without, "window_1": without}, scene=scene)
+    ]
+    (numbers.folder / "factors" / "results.csv").write_text(csv_of(load(results)))
+    lines = [[cell.strip() for cell in line.split("|")] for line in numbers.needs("factors").splitlines()[2:]]
+    assert [line[1:4] for line in lines] == [
+        ["w/o disp.", "wrinkles", "3"],
+        ["w/o disp.", "wrinkles_twice", "3"],
+        ["w/o disp.", "skinned", "3"],
+    ]  # One frame of motion is not what wrinkles should need.
+    assert lines[0][4].endswith("+2.00 dB [+1.75, +2.25]: needed")
+    assert lines[2][4].startswith("+0.30 dB [") and lines[2][4].endswith(" people would decide")
 
 
 def test_rows_of_two_reports_are_compared(numbers: Numbers) -> None:
