@@ -8,11 +8,11 @@ from helpers import fakes
 
 from ash.capture.manifest import read_manifest
 from ash.files import InputError, require_plain
-from benchmarks.analysis.style import is_ours, style_of, titles_of, user_rows
+from benchmarks.analysis.style import STYLES, is_ours, style_of, titles_of, user_rows
 from benchmarks.cell.registry import WRONG_BY_MM, is_oracle
 from benchmarks.cell.schema import write_config
 from benchmarks.suites.captures import described
-from benchmarks.suites.files import find_suite, given_captures, line_of, read_suite, suite_files
+from benchmarks.suites.files import find_suite, given_captures, line_of, methods_known, read_suite, suite_files
 from benchmarks.suites.runs import Run, cell_for, read_run, write_run
 from benchmarks.suites.suites import SceneSpec, varied_name
 
@@ -195,6 +195,11 @@ def test_our_suites_are_such_files_and_their_rows_ours(tmp_path: Path) -> None:
     assert not is_ours("mine")
     template = {row.name for row in find_suite("template").methods}
     assert {method for row in WRONG_BY_MM.values() for method in row} <= template
+
+
+def test_every_row_of_ours_has_a_style() -> None:
+    assert sorted(methods_known() - STYLES.keys()) == []
+    assert style_of("ash_16mm").title == "ASH, surface 16 mm off"
 
 
 def test_a_users_row_does_not_take_our_title(tmp_path: Path) -> None:
