@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import pandas as pd
 
 from benchmarks.analysis import style
-from benchmarks.analysis.results import RunTables
+from benchmarks.analysis.results import RunTables, foreground, of_quantity
+from benchmarks.analysis.statistics import mean_interval
 from benchmarks.analysis.style import style_of
 from synth.presets import FACTORS
 
@@ -130,6 +131,24 @@ def undecided(cells: list[AblationEffect]) -> list[str]:
             people = "more than a thousand people" if math.isinf(effect.needed) else f"about {effect.needed:.0f} people"
             sentences.append(f"{effect.scene}, {effect.component}: {effect.text}; {people} would decide.")
     return sentences
+
+
+def more_than_without(rows: pd.DataFrame, scene: str, row: str, split: str) -> str:
+    """How much more is lost without a component on a scene than on that of strength 0, with its 95 % interval over the
+    people of both, dB; empty where they have fewer than two in common.
+
+    `rows`: of both scenes (`benchmarks.analysis.results.load`).
+    """
+    chosen = of_quantity(rows, foreground(split))
+    by_person = chosen.pivot_table(index="subject", columns=["scene", "method"], values="value")
+    places = [(place, method) for place in (scene, ZERO_STRENGTH) for method in (REFERENCE, row)]
+    if scene == ZERO_STRENGTH or not set(places) <= set(by_person.columns):
+        return ""
+    more = by_person[places].dropna().to_numpy() @ ((-1, 1, 1, -1) if row in ADDED else (1, -1, -1, 1))
+    if len(more) < 2:
+        return ""
+    mean, low, high = mean_interval(more)
+    return f"{mean:+z.2f} dB [{low:+z.2f}, {high:+z.2f}]"
 
 
 def strength_curves(table: pd.DataFrame, split: str) -> pd.DataFrame:

@@ -189,11 +189,16 @@ def _cell(result: CellResult, captures: CaptureNames) -> dict[str, Any]:
     return {"scene": config.scene, "method": config.method, "capture": capture, "seed": config.seed}
 
 
-def samples_of(rows: pd.DataFrame, quantity: Quantity) -> dict[str, Samples]:
-    """A quantity by method and capture, a value for each seed; `rows`: of one scene."""
-    chosen = rows[
+def of_quantity(rows: pd.DataFrame, quantity: Quantity) -> pd.DataFrame:
+    """The rows of one quantity."""
+    return rows[
         (rows["metric"] == quantity.metric) & (rows["split"] == quantity.split) & (rows["region"] == quantity.region)
     ]
+
+
+def samples_of(rows: pd.DataFrame, quantity: Quantity) -> dict[str, Samples]:
+    """A quantity by method and capture, a value for each seed; `rows`: of one scene."""
+    chosen = of_quantity(rows, quantity)
     samples: dict[str, dict[str, list[float]]] = {}
     for method, capture, value in zip(chosen["method"], chosen["capture"], chosen["value"], strict=True):
         samples.setdefault(method, {}).setdefault(capture, []).append(value)

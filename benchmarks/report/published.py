@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Sequence
 from functools import cache
+from itertools import chain
 from pathlib import Path
 
 import pandas as pd
@@ -99,20 +100,22 @@ class Numbers:
 
     def needs(self, report: str) -> str:
         """A table in Markdown: what ASH loses without a component, with the verdict on ASH or how many people would
-        decide, on the scene that should need it, on this scene at other strengths, and on the one of strength 0.
+        decide, on the scene that should need it, on this scene at other strengths, and on the one of strength 0; and
+        how much more than on the latter.
         """
-        table = differences(self._rows(report))
+        rows = self._rows(report)
+        table = differences(rows)
         views, poses = ({(e.row, e.scene): e for e in ablation_matrix.effects(table, s)} for s in RANKED_SPLITS)
         asked = {row for (row, _), effect in views.items() if effect.expected}
         beside = {ablation_matrix.ZERO_STRENGTH, *ablation_matrix.OTHER_STRENGTHS}
-        cells = [
-            [effect.component, scene, str(self.people(report, scene, row)), _need(effect), _need(poses[row, scene])]
-            for (row, scene), effect in views.items()
-            if effect.expected or (row in asked and scene in beside)
-        ]
-        return _markdown(
-            ["ASH", "scene", "people", *(SPLIT_NAMES[s].words for s in RANKED_SPLITS)], cells, numbers=False
-        )
+        cells = []
+        for (row, scene), effect in views.items():
+            if effect.expected or (row in asked and scene in beside):
+                cells.append([effect.component, scene, str(self.people(report, scene, row))])
+                for split, each in zip(RANKED_SPLITS, (effect, poses[row, scene]), strict=True):
+                    cells[-1] += [_need(each), ablation_matrix.more_than_without(rows, scene, row, split)]
+        heads = [(SPLIT_NAMES[s].words, f"more than on {ablation_matrix.ZERO_STRENGTH}") for s in RANKED_SPLITS]
+        return _markdown(["ASH", "scene", "people", *chain.from_iterable(heads)], cells, numbers=False)
 
     def order(self, report: str, scene: str, split: str, metric: str) -> str:
         """Kendall's tau of our rows to the order of the paper's comparison, with its interval over people."""

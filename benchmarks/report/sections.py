@@ -78,7 +78,7 @@ def ablations(tables: RunTables, chosen_on: RunTables | None = None) -> list[Sec
     strengths: list[Block] = []
     for split in RANKED_SPLITS:
         table = ablation_matrix.strength_curves(ranked, split)
-        strengths += _strengths(table, split) if len(table) else []
+        strengths += _strengths(tables.rows, table, split) if len(table) else []
     sections.append(Section(title="Strength of a phenomenon", blocks=tuple(strengths)))
     sections.append(Section(title="Smallest sufficient row by scene", blocks=tuple(_sufficient(tables, chosen_on))))
     return [section for section in sections if section.blocks]
@@ -127,7 +127,7 @@ def _matrix(tables: RunTables, effects: Sequence[ablation_matrix.AblationEffect]
     return blocks
 
 
-def _strengths(table: pd.DataFrame, split: str) -> list[Block]:
+def _strengths(rows: pd.DataFrame, table: pd.DataFrame, split: str) -> list[Block]:
     words = SPLIT_NAMES[split].words
     figure = line_figure(
         table.assign(panel=table["scene"], method=table["row"], psnr=table["mean"]),
@@ -143,10 +143,12 @@ def _strengths(table: pd.DataFrame, split: str) -> list[Block]:
         columns=3,
     )
     sentences = []
-    for (scene, component), curve in table.groupby(["scene", "component"], sort=False):
+    for (scene, component, row), curve in table.groupby(["scene", "component", "row"], sort=False):
         course = ", ".join(f"{r.mean:+z.2f} dB at {r.strength:g}" for r in curve.itertuples())
         rises = "rises" if curve["mean"].is_monotonic_increasing and curve["mean"].is_unique else "does not rise"
-        sentences.append(f"{scene}, {component}: {course}; the loss {rises} with every step of strength.")
+        more = ablation_matrix.more_than_without(rows, scene, row, split)
+        paired = f" On the people of both it is {more} more at 1 than at 0." if more else ""
+        sentences.append(f"{scene}, {component}: {course}; the loss {rises} with every step of strength.{paired}")
     return [figure, Bullets(items=tuple(sentences))]
 
 

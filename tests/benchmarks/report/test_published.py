@@ -98,6 +98,7 @@ def test_what_scenes_need_is_beside_the_scene_without_their_phenomenon(numbers: 
     ]  # One frame of motion is not what wrinkles should need.
     assert lines[0][4].endswith("+2.00 dB [+1.75, +2.25]: needed")
     assert lines[2][4].startswith("+0.30 dB [") and lines[2][4].endswith(" people would decide")
+    assert lines[0][5].startswith("+1.70 dB [") and lines[2][5] == ""
 
 
 def test_rows_of_two_reports_are_compared(numbers: Numbers) -> None:
