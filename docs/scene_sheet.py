@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from PIL import Image, ImageDraw
 
 from ash.capture.dataset import image_path
+from ash.files import InputError
 from benchmarks.cell.evaluation import spread
 from synth import presets
 from synth.camera.render import probe
@@ -27,7 +28,7 @@ VIEWS, TILE, GREY = 5, (240, 320), (71, 71, 71)  # TILE: width, height in pixels
 
 def row(name: str) -> Image.Image:
     """The scene's views beside one another."""
-    scene = presets.scene(name, size="quick" if name in ("tight", "loose") else "factor")
+    scene = scene_of(name)
     scene = replace(scene, rig=replace(scene.rig, width=2 * TILE[1], height=2 * TILE[1]), samples=32)
     views = shown(scene)
     line = Image.new("RGB", (VIEWS * TILE[0], TILE[1]), GREY)
@@ -40,6 +41,11 @@ def row(name: str) -> Image.Image:
             line.paste(tile(Image.open(image_path(folder, view.camera, view.frame))), (column * TILE[0], 0))
     ImageDraw.Draw(line).text((6, 6), name)
     return line
+
+
+def scene_of(name: str) -> Scene:
+    """The scene of reports; an InputError names the known ones."""
+    return presets.scene(name, size="quick" if name in ("tight", "loose") else "factor")
 
 
 def shown(scene: Scene) -> list[WantedView]:
@@ -64,6 +70,11 @@ def tile(image: Image.Image) -> Image.Image:
 
 if __name__ == "__main__":
     out, *names = sys.argv[1:]
+    try:
+        for name in names:
+            scene_of(name)
+    except InputError as error:  # before minutes of rendering
+        sys.exit(str(error))
     sheet = Image.new("RGB", (VIEWS * TILE[0], len(names) * TILE[1]), GREY)
     for index, name in enumerate(names):
         print(f"{name} ({index + 1} of {len(names)})", flush=True)

@@ -1,6 +1,8 @@
 """docs/scene_sheet.py: which views it shows, and that it draws them."""
 
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -51,3 +53,11 @@ def test_a_row_is_drawn(sheet: dict[str, Any]) -> None:
     assert line.shape == (32, 72, 3)
     for column in range(3):
         assert (line[:, 24 * column : 24 * column + 24] != names["GREY"]).any(-1).mean() > 0.05
+
+
+def test_an_unknown_scene_is_refused_in_one_line(tmp_path: Path) -> None:
+    command = [sys.executable, SCRIPT, tmp_path / "sheet.webp", "loose", "wrinkels"]
+    outcome = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert outcome.returncode == 1 and not outcome.stdout
+    assert outcome.stderr.startswith("unknown scene 'wrinkels', expected one of ")
+    assert outcome.stderr.count("\n") == 1
