@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.analysis.results import Quantity, RunTables, compare, foreground, samples_of
-from benchmarks.analysis.statistics import independent, mean_interval
+from benchmarks.analysis.statistics import intervals
 from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell.registry import ON_EXACT, WRONG_BY_MM
 
@@ -42,15 +42,18 @@ def margins(tables: RunTables) -> pd.DataFrame:
 
 
 def levels(tables: RunTables) -> pd.DataFrame:
-    """Foreground PSNR in dB on templates of known error: scene, split, method, error_mm, psnr, low, high."""
+    """Foreground PSNR in dB on templates of known error: scene, split, method, error_mm, psnr, low, high.
+
+    Without what a capture does to all rows (`benchmarks.analysis.statistics.intervals`).
+    """
     rows = []
     for scene, split in product(tables.scenes, PAPER_DB):
         samples = samples_of(tables.of(scene), foreground(split))
+        found = intervals({name: each for name, each in samples.items() if tables.whole(scene, name)})
         for column, method in enumerate(ON_EXACT):
             for mm, names in WRONG_BY_MM.items():
-                if samples.get(names[column]) and tables.whole(scene, names[column]):
-                    interval = mean_interval(independent(samples[names[column]]))
-                    rows.append((scene, split, method, float(mm), *interval))
+                if names[column] in found:
+                    rows.append((scene, split, method, float(mm), *found[names[column]]))
     return pd.DataFrame(rows, columns=["scene", "split", "method", "error_mm", "psnr", "low", "high"])
 
 

@@ -200,7 +200,7 @@ def template_errors(tables: RunTables) -> list[Section]:
         name="levels",
         title="Quality against the template's error",
         caption="Foreground PSNR when a method is given a template of known error (the exact surface, displaced "
-        f"smoothly). {WHISKERS}",
+        f"smoothly). {WHISKERS} {APART}",
         x="error_mm",
         x_title="template error [mm rms]",
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from helpers.cells import cell
+from helpers.cells import cell, people
 from helpers.fakes import write_capture
 
 from ash.capture.dataset import Split
@@ -117,6 +117,13 @@ def test_quality_on_templates_of_known_error_has_a_curve_per_method_and_shows_no
     levels = next(block for block in section.blocks if isinstance(block, Figure))
     assert levels.file == "chart_levels.svg"
     assert "best texture, exact mesh" in "".join(ElementTree.fromstring(levels.svg()).itertext())
+
+
+def test_curves_on_known_errors_leave_out_how_people_differ() -> None:
+    """People are 6 dB apart, and the error costs each of them 3 dB: nothing but that is left."""
+    tables = RunTables(people({"ash_truth": (24.0, 30.0, 36.0), "ash_4mm": (21.0, 27.0, 33.0)}))
+    views = template_error.levels(tables).query("split == 'novel_view'")
+    assert views[["psnr", "low", "high"]].to_numpy().tolist() == [pytest.approx([30.0] * 3), pytest.approx([27.0] * 3)]
 
 
 def test_ticks_that_would_lie_on_each_other_give_way_to_the_rounder_one() -> None:
