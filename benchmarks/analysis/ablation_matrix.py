@@ -135,14 +135,15 @@ def undecided(cells: list[AblationEffect]) -> list[str]:
 
 def more_than_without(rows: pd.DataFrame, scene: str, row: str, split: str) -> str:
     """How much more is lost without a component on a scene than on that of strength 0, with its 95 % interval over the
-    people of both, dB; empty where they have fewer than two in common.
+    people of both, dB; empty where they have fewer than two in common, or a cell failed.
 
     `rows`: of both scenes (`benchmarks.analysis.results.load`).
     """
     chosen = of_quantity(rows, foreground(split))
     by_person = chosen.pivot_table(index="subject", columns=["scene", "method"], values="value")
     places = [(place, method) for place in (scene, ZERO_STRENGTH) for method in (REFERENCE, row)]
-    if scene == ZERO_STRENGTH or not set(places) <= set(by_person.columns):
+    failed = chosen.loc[chosen["status"] != "done", ["scene", "method"]].itertuples(index=False, name=None)
+    if scene == ZERO_STRENGTH or not set(places) <= set(by_person.columns) or not set(places).isdisjoint(failed):
         return ""
     more = by_person[places].dropna().to_numpy() @ ((-1, 1, 1, -1) if row in ADDED else (1, -1, -1, 1))
     if len(more) < 2:

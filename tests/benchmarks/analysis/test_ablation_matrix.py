@@ -131,6 +131,8 @@ def test_what_a_scene_needs_more_than_the_one_without_its_phenomenon_is_paired_b
     found = more_than_without(load(results), "wrinkles", "wo_disp", "novel_view")
     half = 4.303 * 0.1 / 3**0.5  # t(2) is 4.303
     assert found == f"+0.60 dB [+{0.6 - half:.2f}, +{0.6 + half:.2f}]"
+    broken = [*results[:-1], failed_result(results[-1].config, "crashed", "boom")]
+    assert more_than_without(load(broken), "wrinkles", "wo_disp", "novel_view") == ""
     assert more_than_without(load(results), "skinned", "wo_disp", "novel_view") == ""
     assert more_than_without(load(results), "wrinkles", "wo_mot", "novel_view") == ""
     page = sections.ablations(RunTables(results))
