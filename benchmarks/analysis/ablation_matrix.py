@@ -77,8 +77,12 @@ class AblationEffect:
     @property
     def text(self) -> str:
         """The loss with its interval."""
-        interval = "" if pd.isna(self.low) else f" [{self.low:+z.2f}, {self.high:+z.2f}]"
-        return f"{self.mean:+z.2f} dB{interval}"
+        return _in_db(self.mean, self.low, self.high)
+
+
+def _in_db(mean: float, low: float, high: float) -> str:
+    interval = "" if pd.isna(low) else f" [{low:+z.2f}, {high:+z.2f}]"
+    return f"{mean:+z.2f} dB{interval}"
 
 
 def effects(table: pd.DataFrame, split: str) -> list[AblationEffect]:
@@ -146,10 +150,7 @@ def more_than_without(rows: pd.DataFrame, scene: str, row: str, split: str) -> s
     if scene == ZERO_STRENGTH or not set(places) <= set(by_person.columns) or not set(places).isdisjoint(failed):
         return ""
     more = by_person[places].dropna().to_numpy() @ ((-1, 1, 1, -1) if row in ADDED else (1, -1, -1, 1))
-    if len(more) < 2:
-        return ""
-    mean, low, high = mean_interval(more)
-    return f"{mean:+z.2f} dB [{low:+z.2f}, {high:+z.2f}]"
+    return _in_db(*mean_interval(more)) if len(more) > 1 else ""
 
 
 def strength_curves(table: pd.DataFrame, split: str) -> pd.DataFrame:

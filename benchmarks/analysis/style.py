@@ -7,7 +7,7 @@ from functools import cache
 from typing import NamedTuple
 
 from ash.files import hash_of
-from benchmarks.cell.registry import DECIDING_PACKAGES, WRONG_BY_MM, methods
+from benchmarks.cell.registry import DECIDING_PACKAGES, ON_EXACT, WRONG_BY_MM, methods
 from benchmarks.cell.schema import CellConfig
 from benchmarks.suites.files import our_rows
 
@@ -27,7 +27,6 @@ class SplitName(NamedTuple):
     words: str
 
 
-PLANTED = (("ASH", "#2f6fde"), ("DDC", "#dd6b20"), ("best texture", "#b8860b"))  # as in `WRONG_BY_MM`
 ADDED = (  # by `ash_plus`: name, title, colour
     ("base", "static texels", "#5b8c2a"),
     ("light", "light", "#b8860b"),
@@ -114,13 +113,13 @@ STYLES = {
     "static": MethodStyle("static", "#7a869a"),
     "nearest": MethodStyle("nearest image", "#7a869a"),
     "oracle_texture": MethodStyle("best texture, exact mesh", "#b8860b"),
-    # Given the exact surface with an error planted in it.
-    **{
-        name: MethodStyle(f"{title}, surface {mm} mm off", colour)
-        for mm, names in WRONG_BY_MM.items()
-        for name, (title, colour) in zip(names, PLANTED, strict=True)
-        if mm > 0
-    },
+}
+# Rows that are given the exact surface with an error planted in it have the colour of those without.
+STYLES |= {
+    name: MethodStyle(f"{title}, surface {mm} mm off", STYLES[exact].colour)
+    for mm, names in WRONG_BY_MM.items()
+    for name, exact, title in zip(names, ON_EXACT, ("ASH", "DDC", "best texture"), strict=True)
+    if mm > 0
 }
 SPLIT_NAMES = {
     "novel_view": SplitName("Novel view", "novel views"),

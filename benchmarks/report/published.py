@@ -89,13 +89,14 @@ class Numbers:
         and training seconds.
         """
         quantities = [*quality_columns(("psnr", "lpips")), *cost_columns(("frame_ms", "train_cpu_s"))]
-        of_scenes = {scene: self._of_scene(report, scene) for scene in scenes}
-        cells = [
-            [f"{scene}: {style_of(method).title}", *(self._score(report, scene, method, each) for each in quantities)]
-            for scene, rows in of_scenes.items()
-            for method in rows["method"].unique()
-            if method not in fewer_captures(rows)
-        ]
+        cells = []
+        for scene in scenes:
+            rows = self._of_scene(report, scene)
+            fewer = fewer_captures(rows)
+            for method in rows["method"].unique():
+                if method not in fewer:
+                    scores = (self._score(report, scene, method, quantity) for quantity in quantities)
+                    cells.append([f"{scene}: {style_of(method).title}", *scores])
         return _markdown(["", *(": ".join(head_of(quantity)) for quantity in quantities)], cells)
 
     def needs(self, report: str) -> str:
