@@ -22,7 +22,7 @@ from benchmarks.report.headings import new_headings
 from benchmarks.report.pictures import Album
 from benchmarks.report.scene import FEW_WORST, MANY, WORST, SceneData, scene_report
 from benchmarks.report.vega import Figure
-from benchmarks.suites.archive import write_archive
+from benchmarks.suites.archive import without_places, write_archive
 from benchmarks.suites.runs import Run, capture_name_of, results_of
 
 PUBLISHED = ("report.md", "results.csv", "tables.tex", "chart_*.svg", "pictures_*.webp", "worst_*.webp")
@@ -151,7 +151,7 @@ def publish(run: Run, folder: Path) -> None:
         for old in folder.glob(pattern):
             old.unlink()
     for path in paths:
-        write_atomic(folder / path.name, path.read_bytes())
+        write_atomic(folder / path.name, without_places(text).encode() if path == report else path.read_bytes())
     write_archive(run, folder / CELLS)
 
 

@@ -89,7 +89,9 @@ def write_pack(run: Run, path: Path) -> PackFile:
 def numbers_of(run: Run) -> Iterator[tuple[str, bytes]]:
     """Name and content of `run.json` and of each finished cell's `config.json` and `result.json`.
 
-    Of a capture's folder only the name is kept, of brought pictures none: where they lay says nothing to others."""
+    Of a capture's folder only the name is kept, of brought pictures none, and of other absolute paths what
+    `without_places` leaves: where they lay says nothing to others.
+    """
     keys: list[str] = []
     for cell in run.cells:
         if (cell.folder / "result.json").exists():
@@ -99,7 +101,13 @@ def numbers_of(run: Run) -> Iterator[tuple[str, bytes]]:
             name = re.sub(r"[^\w .:+=@-]", "_", cell.capture_folder.name)
             yield f"cells/{keys[-1]}/config.json", _json(config | {"capture_folder": name})
             yield f"cells/{keys[-1]}/result.json", _json(read_json(cell.folder / "result.json"))
-    yield RUN_FILE, _json(description_of(run) | {"cells": keys})
+    told = {"about": without_places(run.about), "command": without_places(run.command)}
+    yield RUN_FILE, _json(description_of(run) | {"cells": keys} | told)
+
+
+def without_places(text: str) -> str:
+    """A command or a page whose absolute paths keep their last two names: `data/loose` of `/home/me/data/loose`."""
+    return re.sub(r"(?<![\w.:/])/(?:[^/\s,;'\"]+/)+(?=[^/\s,;'\"]+/[^/\s,;'\"]+)", "", text)
 
 
 def _json(content: Any) -> bytes:

@@ -306,16 +306,22 @@ def test_what_is_published_replaces_what_was_before_and_is_a_run_again_which_doe
     place.mkdir(parents=True)
     for path in (place / "chart_gone.svg", place / "findings.md", run.folder / "chart_of_an_earlier_report.svg"):
         path.write_text("before")
-    publish(run, place)
+    report = (run.folder / "report.md").read_text()
+    private = f"./ash-bench run --capture {run.folder.parent.resolve()}/loose --out runs/mine"
+    public = f"./ash-bench run --capture {run.folder.parent.name}/loose --out runs/mine"
+    (run.folder / "report.md").write_text(f"{report}\n    {private}\n")
+    publish(replace(run, command=private), place)
+    (run.folder / "report.md").write_text(report)
     there = {path.name for path in place.iterdir()}
     assert {"report.md", "results.csv", "tables.tex", "chart_boxes.svg", "findings.md"} <= there
     assert not there & {"chart_gone.svg", "chart_of_an_earlier_report.svg"} and "report.html" not in there
-    assert (place / "report.md").read_bytes() == (run.folder / "report.md").read_bytes()
+    assert (place / "report.md").read_text() == f"{report}\n    {public}\n"
     with pytest.raises(InputError, match=r"expected report\.md"):
         publish(replace(run, folder=tmp_path), place)
     assert (place / "report.md").exists()
     shutil.unpack_archive(place / "cells.zip", again)
-    assert not any(str(run.folder.parent) in path.read_text() for path in again.rglob("config.json"))
+    assert not any(str(run.folder.parent) in path.read_text() for path in again.rglob("*.json"))
+    assert read_run(again).command == public
     assert results_of(read_run(again)) == results_of(run)
     sheets = ("pictures_boxes.webp", "worst_boxes.webp")
     for name in sheets:  # As an earlier report left them.

@@ -12,6 +12,7 @@ from benchmarks.analysis.results import csv_of, load
 from benchmarks.analysis.style import style_of
 from benchmarks.cell.registry import code_version
 from benchmarks.report.published import FOLDER, NAME, Numbers, read_me
+from benchmarks.suites.archive import without_places
 
 
 def test_the_front_page_has_the_numbers_of_the_reports() -> None:
@@ -54,6 +55,11 @@ def test_every_report_is_on_the_front_page() -> None:
     text = (FOLDER / NAME).read_text()
     for path in FOLDER.iterdir():
         assert f"({path.name}" in text or path.name.startswith(NAME) or path.name == "baseline", path
+
+
+def test_no_page_names_a_folder_of_the_machine_that_made_it() -> None:
+    for path in FOLDER.rglob("*.md"):
+        assert without_places(path.read_text()) == path.read_text(), path
 
 
 @pytest.fixture

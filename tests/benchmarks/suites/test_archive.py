@@ -20,7 +20,7 @@ from ash.files import InputError, sha256_of
 from benchmarks import cli
 from benchmarks.cell.schema import CHECKPOINT
 from benchmarks.suites import verification
-from benchmarks.suites.archive import read_pack, unpacked, write_archive
+from benchmarks.suites.archive import read_pack, unpacked, without_places, write_archive
 from benchmarks.suites.runs import read_run
 
 pytestmark = pytest.mark.usefixtures("scored_once")
@@ -229,6 +229,19 @@ def test_numbers_alone_are_no_pack(made_once: Path, tmp_path: Path) -> None:
         assert len(read_run(folder).cells) == 2
     with pytest.raises(InputError, match=r"cells.zip: expected a pack"), unpacked(tmp_path / "cells.zip") as folder:
         read_pack(folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("run --capture /home/me/data/loose --out runs/x", "run --capture data/loose --out runs/x"),
+        ("run '/home/me/my.toml'; report --runs=/a/b/c,/a/b/d", "run 'me/my.toml'; report --runs=b/c,b/d"),
+        ("run --executor dask://host:8786/a/b 1/2 a/b/c (views / poses)", None),
+        ("cells of /runs, /runs/a", None),
+    ],
+)
+def test_paths_of_a_machine_keep_their_last_two_names(text: str, expected: str | None) -> None:
+    assert without_places(text) == (text if expected is None else expected)
 
 
 def test_only_finished_cells_with_their_pictures_are_packed(finished: Path, capsys) -> None:
