@@ -1,52 +1,69 @@
 """Where methods fail: accuracy against the severity of a perturbation, breakdown points, failure rates."""
 
 import math
+from collections.abc import Iterator
+from statistics import fmean
 
 import pandas as pd
 
 from benchmarks.analysis.curves import FOOTAGE_AXIS
 from benchmarks.analysis.results import RANKED_SPLITS, foreground, samples_of
-from benchmarks.analysis.statistics import independent, mean_interval, spreads, wilson
+from benchmarks.analysis.statistics import (
+    Interval,
+    Samples,
+    compare_samples,
+    independent,
+    intervals,
+    mean_interval,
+    spreads,
+    wilson,
+)
 from benchmarks.suites.stress import AXES
 
 TRIVIAL = "nearest"  # shows the training image of the nearest pose and camera
+COURSE = ["scene", "axis", "split", "method"]
 
 
 def steps(rows: pd.DataFrame) -> pd.DataFrame:
     """Foreground PSNR by severity: scene, axis, split, method, severity, psnr, low, high; `rows`: all of a run.
 
-    Failed cells count with the worst score. Cut training motion is no perturbation: see `curves.data_scaling`.
+    Intervals leave out how people differ; of a single person they are over seeds. Failed cells count with the worst
+    score. Cut training motion is no perturbation: see `curves.data_scaling`.
     """
-    rows = _with_plain_scene(rows)
-    records = []
-    for scene, here in rows.groupby("scene", sort=False):
-        for axis in [name for name in AXES if name != FOOTAGE_AXIS and (here["axis"] == name).any()]:
-            along = here[here["axis"].isin(("", axis))]
-            for split in RANKED_SPLITS:
-                for severity, at in along.groupby("severity"):
-                    for method, samples in samples_of(at, foreground(split)).items():
-                        records.append((scene, axis, split, method, severity, *mean_interval(independent(samples))))
-    columns = ["scene", "axis", "split", "method", "severity", "psnr", "low", "high"]
-    table = pd.DataFrame(records, columns=columns)
-    groups = table.groupby(["scene", "axis", "split", "method"])["severity"]
+    records = [
+        (*place, *step, *interval) for place, samples in _courses(rows) for step, interval in intervals(samples).items()
+    ]
+    table = pd.DataFrame(records, columns=[*COURSE, "severity", "psnr", "low", "high"])
+    groups = table.groupby(COURSE)["severity"]
     return table[(groups.transform("min") == 0) & (groups.transform("size") > 1) | (table["method"] == TRIVIAL)]
 
 
-def breakdowns(table: pd.DataFrame) -> pd.DataFrame:
-    """Of `steps`: scene, axis, split, method, loss (dB at the worst severity), midpoint, breakdown (severity).
-
-    A method is broken where the upper bound of its interval lies below the midpoint between its score on the clean
-    capture and the trivial method's; midpoint NaN: that was not run; breakdown NaN: it never is.
+def losses(rows: pd.DataFrame) -> pd.DataFrame:
+    """Foreground PSNR lost to the clean capture, in pairs over people: scene, axis, split, method, severity, mean, low,
+    high, and `distance`: the upper bound of the score minus the midpoint between the person's clean score and the
+    trivial method's (NaN: that was not run). All in dB.
     """
     records = []
-    for (scene, axis, split), here in table.groupby(["scene", "axis", "split"], sort=False):
-        floor = here[(here["method"] == TRIVIAL) & (here["severity"] == 0)]["psnr"]
-        for method, curve in here[here["method"] != TRIVIAL].groupby("method", sort=False):
-            clean, worse = curve.iloc[0]["psnr"], curve.iloc[1:]
-            midpoint = math.nan if floor.empty else (clean + floor.item()) / 2
-            broken = worse.loc[worse["high"].fillna(worse["psnr"]) < midpoint, "severity"]
-            records.append((scene, axis, split, method, clean - worse["psnr"].min(), midpoint, broken.min()))
-    return pd.DataFrame(records, columns=["scene", "axis", "split", "method", "loss", "midpoint", "breakdown"])
+    for place, samples in _courses(rows):
+        trivial = samples.get((TRIVIAL, 0.0), {})
+        for (method, severity), scores in samples.items():
+            clean = samples.get((method, 0.0), {})
+            test = compare_samples(clean, scores)
+            if severity and method != TRIVIAL and test is not None:
+                midpoints = {c: (fmean(clean[c]) + fmean(trivial[c])) / 2 for c in clean if c in trivial}
+                distances = {c: [score - midpoints[c] for score in scores[c]] for c in scores if c in midpoints}
+                bound = mean_interval(independent(distances)) if distances else Interval(math.nan)
+                upper = bound.mean if math.isnan(bound.high) else bound.high
+                records.append((*place, method, severity, test.mean, test.low, test.high, upper))
+    return pd.DataFrame(records, columns=[*COURSE, "severity", "mean", "low", "high", "distance"])
+
+
+def breakdowns(table: pd.DataFrame) -> pd.DataFrame:
+    """Of `losses`: scene, axis, split, method and `breakdown`, the least severity at which the method is broken, its
+    distance below zero (NaN: none).
+    """
+    broken = table.assign(breakdown=table["severity"].where(table["distance"] < 0))
+    return broken.groupby(COURSE, sort=False)["breakdown"].min().reset_index()
 
 
 def reliability(rows: pd.DataFrame, scene: str) -> pd.DataFrame:
@@ -69,3 +86,19 @@ def reliability(rows: pd.DataFrame, scene: str) -> pd.DataFrame:
 def _with_plain_scene(rows: pd.DataFrame) -> pd.DataFrame:
     """The scene without how its capture was perturbed."""
     return rows.assign(scene=rows["scene"].str.split(" ").str[0])
+
+
+def _courses(rows: pd.DataFrame) -> Iterator[tuple[tuple[str, str, str], dict[tuple[str, float], Samples]]]:
+    """Scores along each axis from the clean capture on: scene, axis and split; then by method and severity."""
+    rows = _with_plain_scene(rows)
+    rows = rows.assign(capture=rows["subject"])  # A perturbed capture has a name of its own.
+    for scene, here in rows.groupby("scene", sort=False):
+        for axis in [name for name in AXES if name != FOOTAGE_AXIS and (here["axis"] == name).any()]:
+            along = here[here["axis"].isin(("", axis))]
+            for split in RANKED_SPLITS:
+                samples = {
+                    (method, float(severity)): own
+                    for severity, at in along.groupby("severity")
+                    for method, own in samples_of(at, foreground(split)).items()
+                }
+                yield (str(scene), axis, split), samples

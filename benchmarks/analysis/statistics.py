@@ -7,15 +7,16 @@ the image: images of one training share its random numbers, so that a test over 
 
 import math
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.special import nctdtrinc, stdtr, stdtrit
 
 Verdict = Literal["better", "worse", "equivalent", "unclear"]
 Samples = Mapping[str, Sequence[float]]  # values by capture, one for each seed
+Row = TypeVar("Row", bound=Hashable)  # a method, or a method at a severity
 
 LEVEL, ALPHA, POWER = 0.95, 0.05, 0.8
 MOST_PAIRS = 1000  # that are worth a search
@@ -161,7 +162,7 @@ def independent(samples: Samples) -> list[float]:
     return [*next(iter(samples.values()), ())]
 
 
-def intervals(samples: Mapping[str, Samples]) -> dict[str, Interval]:
+def intervals(samples: Mapping[Row, Samples]) -> dict[Row, Interval]:
     """Every method's mean with its interval, for a chart in which methods stand beside each other.
 
     The effect of a capture, by the methods that have all captures, is removed first (Cousineau 2005, with the
@@ -183,7 +184,7 @@ def intervals(samples: Mapping[str, Samples]) -> dict[str, Interval]:
     return of_methods
 
 
-def on_all_captures(samples: Mapping[str, Samples]) -> list[str]:
+def on_all_captures(samples: Mapping[Row, Samples]) -> list[Row]:
     """The methods that have every capture that any has; none where that is one method, or one capture."""
     captures = {capture for seeds in samples.values() for capture in seeds}
     whole = [method for method, seeds in samples.items() if seeds.keys() == captures]

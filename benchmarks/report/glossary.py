@@ -53,8 +53,8 @@ GLOSSARY = {
     "Holm": "Holm's correction (1979): keeps the chance of any false alarm among all rows at 5 %.",
     "people needed": "How many people would decide what is unclear, with 80 % power after correction, if mean and "
     "spread of the difference are those found here.",
-    "breakdown point": "The least severity at which the interval of a method lies below the middle between its score "
-    "on the clean capture and that of the nearest training image.",
+    "breakdown point": "The least severity at which a method scores below the midpoint between its score on the clean "
+    "capture and that of the nearest training image, compared person by person, with the upper bound of the interval.",
     "seed": "The start of the random numbers of a training.",
     "preset": "A complete configuration by name: resolution, steps of training, sizes of networks.",
     "capture": "What methods are trained and scored on: a synthetic subject filmed by many cameras, with its exact "

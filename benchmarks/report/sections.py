@@ -45,6 +45,11 @@ CHOSEN_NOTE = (
     f"that was best there, with the 90 % interval. Equivalent: the interval lies within {pareto.SUFFICIENT_DB} dB."
 )
 NOT_CHOSEN = "On subjects for validation nothing was chosen: no scene or row in common with this run, or too few."
+BROKEN_NOTE = (
+    "Loss: foreground PSNR on the clean capture minus that on the perturbed one, in pairs over people, with its 95 % "
+    "interval. Broken, the breakdown point: the score lies below the midpoint between the clean score and that of the "
+    "nearest training image, with the upper bound of its interval where there is one."
+)
 PAPER_NOTE = (
     "The paper: captured data at 1285x940 and weeks on a GPU, PSNR of the release's convention. Ours: foreground PSNR "
     "and LPIPS on the release's window, on {suite}. Levels cannot be compared, orders can."
@@ -284,21 +289,22 @@ def novelty(tables: RunTables) -> list[Section]:
 
 def stabilities(tables: RunTables) -> list[Section]:
     """Where methods fail, per scene with perturbed captures."""
-    steps = stability.steps(tables.all_rows)
-    breakdowns = stability.breakdowns(steps)
-    return [_stability(tables, scene, group, steps) for scene, group in breakdowns.groupby("scene", sort=False)]
+    steps, losses = stability.steps(tables.all_rows), stability.losses(tables.all_rows)
+    return [_stability(tables, str(scene), own, steps) for scene, own in losses.groupby("scene", sort=False)]
 
 
-def _stability(tables: RunTables, scene: str, breakdowns: pd.DataFrame, steps: pd.DataFrame) -> Section:
-    series = vega.series_of(breakdowns["method"].unique())
+def _stability(tables: RunTables, scene: str, losses: pd.DataFrame, steps: pd.DataFrame) -> Section:
+    series = vega.series_of(losses["method"].unique())
     titles = {name: f"{axis.title} [{axis.unit}]" for name, axis in AXES.items()}
+    breakdowns = stability.breakdowns(losses)
     caption = "Accuracy against severity, the clean capture at 0. A failed cell counts with the worst score."
-    caption += " Crossed: the breakdown point." if breakdowns["midpoint"].notna().any() else ""
+    caption += f" Crossed: the breakdown point. {WHISKERS}" if losses["distance"].notna().any() else f" {WHISKERS}"
+    caption += f" {APART}" if tables.captures(scene) > 1 else ""
     blocks: list[Block] = []
     for index, split in enumerate(RANKED_SPLITS):
         here = steps[(steps["scene"] == scene) & (steps["split"] == split)]
         floor = here[(here["method"] == stability.TRIVIAL) & (here["severity"] == 0)]
-        here = here[here["method"].isin(series)].merge(breakdowns, on=["scene", "axis", "split", "method"])
+        here = here[here["method"].isin(series)].merge(breakdowns, on=stability.COURSE)
         text = style_of(stability.TRIVIAL).title
         title = SPLIT_NAMES[split].words.capitalize()
         figure = line_figure(
@@ -310,7 +316,7 @@ def _stability(tables: RunTables, scene: str, breakdowns: pd.DataFrame, steps: p
             series,
             name=f"stability_{scene}_{index}",
             title=title,
-            caption=f"{title}. {caption} {WHISKERS}",
+            caption=f"{title}. {caption}",
             x="severity",
             x_title="severity",
             y_title="PSNR [dB]",
@@ -318,15 +324,8 @@ def _stability(tables: RunTables, scene: str, breakdowns: pd.DataFrame, steps: p
             rules=pd.DataFrame({"panel": floor["axis"].map(titles), "y": floor["psnr"], "text": text}),
             columns=3,
         )
-        blocks.append(figure)
-    point = breakdowns["breakdown"].map("{:g}".format).where(breakdowns["breakdown"].notna(), "none")
-    point = point.where(breakdowns["midpoint"].notna(), "n/a")
-    text = point + breakdowns["loss"].map(" ({:.1f} dB lost at worst)".format)
-    place = breakdowns["axis"].map(titles) + ", " + breakdowns["split"].map(lambda split: SPLIT_NAMES[split].words)
-    wide = breakdowns.assign(text=text, place=place).pivot(index="place", columns="method", values="text")
-    wide = wide.loc[place.unique(), [*series]].fillna("n/a").rename(columns={m: s.title for m, s in series.items()})
-    title = "Breakdown point (and the worst loss along the axis)"
-    blocks.append(Table(title=title, corner="axis", frame=wide))
+        blocks += [figure, _losses(losses[losses["split"] == split], title.lower())]
+    blocks.append(Text(text=BROKEN_NOTE, note=True))
     rates = stability.reliability(tables.all_rows, scene)
     frame = pd.DataFrame(
         {
@@ -340,6 +339,18 @@ def _stability(tables: RunTables, scene: str, breakdowns: pd.DataFrame, steps: p
         index=[style_of(method).title for method in rates["method"]],
     )
     return Section(title=f"Stability on {scene}", blocks=(*blocks, Table(title="Reliability", frame=frame)))
+
+
+def _losses(losses: pd.DataFrame, split_title: str) -> Table:
+    """PSNR lost by axis and severity, a column for each method; `losses`: of one split."""
+    rows: dict[str, dict[str, str]] = {}
+    for row in losses.itertuples():
+        axis = AXES[row.axis]
+        interval = "" if pd.isna(row.low) else f" [{row.low:z.1f}, {row.high:z.1f}]"
+        text = f"{row.mean:z.1f}{interval}{', broken' if row.distance < 0 else ''}"
+        rows.setdefault(f"{axis.title}: {row.severity:g} {axis.unit}", {})[style_of(row.method).title] = text
+    title = f"Loss to the clean capture, {split_title} [dB]"
+    return Table(title=title, corner="defect", frame=pd.DataFrame.from_dict(rows, orient="index").fillna("n/a"))
 
 
 def beside_the_paper(tables: RunTables, suite: str) -> list[Section]:

@@ -51,20 +51,41 @@ def course(levels: tuple[float, ...]) -> list[CellResult]:
     return found
 
 
-def breakdown(results: list[CellResult]) -> pd.Series:
-    """What is known of ASH on novel views."""
-    found = stability.breakdowns(stability.steps(load(results)))
-    return found.query("method == 'ash' and split == 'novel_view'").iloc[0]
+def on_views(table: pd.DataFrame) -> pd.DataFrame:
+    """What a table has of ASH on novel views."""
+    return table.query("method == 'ash' and split == 'novel_view'")
+
+
+def breakdown(results: list[CellResult]) -> float:
+    """That of ASH on novel views."""
+    return on_views(stability.breakdowns(stability.losses(load(results))))["breakdown"].item()
 
 
 def test_a_method_breaks_where_its_interval_is_below_half_way_to_the_trivial_baseline() -> None:
-    ash = breakdown(course((30.0, 26.0, 19.9, 12.0)))
-    assert ash.midpoint == pytest.approx((30.1 + 10.0) / 2)
-    assert ash.breakdown == 75.0  # at 50 % the mean, 20.0, lies below the midpoint, 20.05, but not its interval
-    assert ash.loss == pytest.approx(18.0)
-    assert pd.isna(breakdown(course((30.0, 26.0, 25.0, 24.0))).breakdown)
-    without = breakdown(course((30.0, 26.0, 19.0, 12.0))[1:])
-    assert pd.isna(without.midpoint) and pd.isna(without.breakdown), "no trivial baseline was run"
+    """At 50 % the mean, 20.0, lies below the midpoint of 30.1 and 10, but not its interval."""
+    results = course((30.0, 26.0, 19.9, 12.0))
+    assert on_views(stability.losses(load(results)))["mean"].tolist() == pytest.approx([4.0, 10.1, 18.0])
+    assert breakdown(results) == 75.0
+    assert pd.isna(breakdown(course((30.0, 26.0, 25.0, 24.0))))
+    without = course((30.0, 26.0, 19.0, 12.0))[1:]
+    assert on_views(stability.losses(load(without)))["distance"].isna().all(), "no trivial baseline was run"
+    assert pd.isna(breakdown(without))
+
+
+def test_people_who_differ_more_than_a_defect_costs_are_compared_with_themselves() -> None:
+    """People are 10 dB apart; each loses about 6 of the 10 dB to the baseline, and is broken."""
+    clean = people({"ash": (20.0, 30.0, 40.0), "nearest": (10.0, 20.0, 30.0)})
+    worse = people({"ash": (14.0, 24.1, 33.9)})
+    results = [*clean, *(replace(r, config=replace(r.config, axis="lens", severity=12.0)) for r in worse)]
+    names = {r.config.key: f"{r.config.subject}-{r.config.axis}" for r in results}  # as the folders of captures differ
+    rows = load(results, names)
+    (loss,) = on_views(stability.losses(rows)).itertuples()
+    assert (loss.mean, loss.low, loss.high) == pytest.approx((6.0, 6 - 0.248, 6 + 0.248), abs=1e-3)  # t(2) is 4.30
+    assert loss.distance == pytest.approx(-1 + 0.248, abs=1e-3)
+    on_axis = on_views(stability.steps(rows))
+    assert on_axis["psnr"].tolist() == [30.0, 24.0]
+    assert (on_axis["high"] - on_axis["low"]).max() < 0.5
+    assert breakdown(results) == 12.0
 
 
 def test_a_failed_cell_is_the_worst_score_and_counts_in_the_rate() -> None:
@@ -140,8 +161,9 @@ def test_charts_are_svg_with_a_mark_where_a_method_breaks() -> None:
         drawn = ElementTree.fromstring(figure.svg())
         crosses = [path for path in drawn.iter("{http://www.w3.org/2000/svg}path") if path.get("stroke") == vega.INK]
         assert drawn.tag.endswith("svg") and len(crosses) == 1
-    breakdowns = next(block for block in section.blocks if isinstance(block, Table))
-    assert breakdowns.frame.iloc[0, 0] == "50 (19.0 dB lost at worst)"
+    losses = next(block for block in section.blocks if isinstance(block, Table))
+    title = "training cameras missing: 50 %"
+    assert losses.frame.loc[title].tolist() == ["18.0 [17.8, 18.2], broken"]
 
 
 def test_a_row_of_another_suite_stands_beside_ash() -> None:
@@ -150,9 +172,10 @@ def test_a_row_of_another_suite_stands_beside_ash() -> None:
     for method, worst in {"ash": 12.0, "ash_plus": 29.0}.items():
         results += [cell(method, 30.0), cell(method, worst, axis="mask_grown", severity=8.0)]
     (section,) = sections.stabilities(RunTables(results))
-    breakdowns, reliability = (block for block in section.blocks if isinstance(block, Table))
-    assert list(breakdowns.frame.columns) == ["ASH", "ASH+"]
-    assert breakdowns.frame.iloc[0].tolist() == ["8 (18.0 dB lost at worst)", "none (1.0 dB lost at worst)"]
+    views, poses, reliability = (block for block in section.blocks if isinstance(block, Table))
+    assert list(views.frame.columns) == ["ASH", "ASH+"]
+    assert views.frame.loc["masks too large: 8 px"].tolist() == ["18.0, broken", "1.0"]
+    assert poses.frame.to_dict() == views.frame.to_dict()
     assert "ASH+" in reliability.frame.index
     mine = RunTables([*results, cell("mine", 20.0)])
     assert mine.methods("loose") == ("mine", "nearest", "ash", "ash_plus"), "a user's own first"
