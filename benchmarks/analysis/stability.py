@@ -18,9 +18,8 @@ from benchmarks.analysis.statistics import (
     spreads,
     wilson,
 )
-from benchmarks.suites.stress import AXES
+from benchmarks.suites.stress import AXES, TRIVIAL
 
-TRIVIAL = "nearest"  # shows the training image of the nearest pose and camera
 COURSE = ["scene", "axis", "split", "method"]
 
 

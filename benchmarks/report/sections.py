@@ -19,7 +19,7 @@ from benchmarks.report.tables import text_of
 from benchmarks.report.vega import Figure, Series
 from benchmarks.suites.reuse import TRAINED_BY
 from benchmarks.suites.runs import commands_of
-from benchmarks.suites.stress import AXES
+from benchmarks.suites.stress import AXES, TRIVIAL
 
 WHISKERS = "Whiskers: 95 % interval over seeds, or over captures where there are several."
 APART = "The common effect of a capture is removed."
@@ -303,9 +303,9 @@ def _stability(tables: RunTables, scene: str, losses: pd.DataFrame, steps: pd.Da
     blocks: list[Block] = []
     for index, split in enumerate(RANKED_SPLITS):
         here = steps[(steps["scene"] == scene) & (steps["split"] == split)]
-        floor = here[(here["method"] == stability.TRIVIAL) & (here["severity"] == 0)]
+        floor = here[(here["method"] == TRIVIAL) & (here["severity"] == 0)]
         here = here[here["method"].isin(series)].merge(breakdowns, on=stability.COURSE)
-        text = style_of(stability.TRIVIAL).title
+        text = style_of(TRIVIAL).title
         title = SPLIT_NAMES[split].words.capitalize()
         figure = line_figure(
             here.assign(

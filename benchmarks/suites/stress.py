@@ -9,6 +9,7 @@ from ash.fields import suggest
 from ash.files import InputError
 from synth.perturbation.perturb import Perturbation
 
+TRIVIAL = "nearest"  # Shows the training image of the nearest pose and camera; judges others by its clean score.
 FOOTAGE_FRAMES = 320  # Training frames of size `long`, whose motion the axis `footage` cuts short.
 
 
