@@ -28,6 +28,7 @@ from benchmarks.analysis.results import (
     samples_of,
     summarise,
 )
+from benchmarks.analysis.stability import losses
 from benchmarks.analysis.statistics import Comparison
 from benchmarks.analysis.style import SPLIT_NAMES, style_of
 from benchmarks.cell.metrics import METRICS, PROTOCOL
@@ -83,6 +84,16 @@ class Numbers:
         if test is None or not samples_of(of_scene, quantity).keys() >= {a, b}:
             raise InputError(f"{self.folder / report}: expected rows {a} and {b} on {scene}")
         return _with_interval(test, metric)
+
+    def loss(self, report: str, scene: str, method: str, axis: str, severity: float, split: str = "novel_view") -> str:
+        """Foreground PSNR that a defect of the capture costs, in pairs over people, with its 95 % interval."""
+        found = losses(self._rows(report))
+        place = {"scene": scene, "method": method, "axis": axis, "severity": severity, "split": split}
+        found = found[(found[[*place]] == list(place.values())).all(axis=1)]
+        if len(found) != 1:
+            raise InputError(f"{self.folder / report}: expected {method} on {scene} with {axis}={severity:g}")
+        test = Comparison(**found[["mean", "low", "high"]].iloc[0])
+        return _with_interval(test, "psnr")
 
     def scores(self, report: str, *scenes: str) -> str:
         """A table in Markdown of the rows that ran on everybody: PSNR and LPIPS on all held-out splits, milliseconds

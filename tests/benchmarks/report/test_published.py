@@ -1,6 +1,7 @@
 """What is published under reports/: its front page has the numbers of its csv files and says whose code made them."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -84,6 +85,19 @@ def test_scores_are_of_rows_that_ran_on_everybody(numbers: Numbers) -> None:
     text = numbers.scores("fewer", "loose")
     assert "| loose: ASH | 27.00 |" in text and "24.50" not in text
     assert numbers.people("fewer", "loose") == 3 and numbers.people("fewer", "loose", "smpl") == 2
+
+
+def test_what_a_defect_costs_is_in_pairs_over_people(numbers: Numbers) -> None:
+    (numbers.folder / "defects").mkdir()
+    worse = [
+        replace(each, config=replace(each.config, axis="lens", severity=12.0))
+        for each in people({"ash": (23.0, 25.0, 28.0)})
+    ]
+    made = load([*people({"ash": (25.0, 27.0, 29.0)}), *worse])
+    (numbers.folder / "defects" / "results.csv").write_text(csv_of(made))
+    assert numbers.loss("defects", "loose", "ash", "lens", 12) == "+1.67 dB [+0.23, +3.10]"  # t(2) is 4.30
+    with pytest.raises(InputError, match="expected ash on loose with lens=6"):
+        numbers.loss("defects", "loose", "ash", "lens", 6)
 
 
 def test_what_scenes_need_is_beside_the_scene_without_their_phenomenon(numbers: Numbers) -> None:
