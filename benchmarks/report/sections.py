@@ -47,8 +47,9 @@ CHOSEN_NOTE = (
 NOT_CHOSEN = "On subjects for validation nothing was chosen: no scene or row in common with this run, or too few."
 BROKEN_NOTE = (
     "Loss: foreground PSNR on the clean capture minus that on the perturbed one, in pairs over people, with its 95 % "
-    "interval. Broken, the breakdown point: the score lies below the midpoint between the clean score and that of the "
-    "nearest training image, with the upper bound of its interval where there is one."
+    "interval; a number without one is of one training. Broken, the breakdown point: the score lies below the midpoint "
+    "between the clean score and that of the nearest training image, with the upper bound of its interval where there "
+    "is one."
 )
 PAPER_NOTE = (
     "The paper: captured data at 1285x940 and weeks on a GPU, PSNR of the release's convention. Ours: foreground PSNR "
