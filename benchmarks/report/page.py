@@ -16,7 +16,7 @@ from markupsafe import Markup, escape
 from ash.files import InputError, write_atomic
 from benchmarks.analysis.results import RunTables, csv_of
 from benchmarks.analysis.style import titles_of
-from benchmarks.report import author_table, content, escaping, glossary, sections, sentences, tables, vega
+from benchmarks.report import author_table, content, defects, escaping, glossary, sections, sentences, tables, vega
 from benchmarks.report.content import Section
 from benchmarks.report.headings import new_headings
 from benchmarks.report.pictures import Album
@@ -67,6 +67,7 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
     curves = [*sections.training_cost(run_tables), *sections.template_errors(run_tables)]
     novelty = sections.novelty(run_tables)
     turned, turned_sheets = new_headings(run, results, run_tables, album)
+    defect_parts = [defects.pictured(run, results, scene, album) for scene in run_tables.scenes]
     title = f"Report of suite {run.suite}"
     parts = [
         Section(title="", blocks=(content.Text(text=run.about[:1].upper() + run.about[1:] + "."),)),
@@ -74,6 +75,7 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
         *([Section(title="Tables of the suite", blocks=tuple(author_table.blocks(own)))] if own else []),
         *sections.ablations(run_tables, None if chosen_on is None else RunTables(results_of(chosen_on))),
         *sections.stabilities(run_tables),
+        *(section for own_sections, _ in defect_parts for section in own_sections),
         *curves,
         *others,
         *novelty,
@@ -85,7 +87,7 @@ def _write_report(run: Run, chosen_on: Run | None) -> list[str]:
         sections.glossary(),
     ]
     files = {each.file: each.svg().encode() for part in parts for each in part.blocks if isinstance(each, Figure)}
-    files |= {name: png for _, sheets in made for name, png in sheets.items()} | turned_sheets
+    files |= {name: image for _, sheets in (*made, *defect_parts) for name, image in sheets.items()} | turned_sheets
     files |= {
         "results.csv": csv_of(_without_formulas(run_tables.all_rows)).encode(),
         "tables.tex": author_table.latex(own or author_table.default_tables(run_tables)).encode(),

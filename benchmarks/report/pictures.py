@@ -156,17 +156,16 @@ def sheet(rows: Sequence[Frames], *, scale: int = 2, form: Literal["WEBP", "PNG"
     """All rows in one picture with captions, for Markdown and README; a PNG takes three times the bytes."""
     font = ImageFont.load_default(size=13)
     gap, caption = 10, 34
-    lines = [line for row in rows for line in (row.images, row.errors) if line]
+    lines = [(line, len(row.images) - len(line)) for row in rows for line in (row.images, row.errors) if line]
     columns = max(len(row.images) for row in rows)
-    frames = [frame for line in lines for frame in line]
+    frames = [frame for line, _ in lines for frame in line]
     texts = [text for frame in frames for text in (frame.caption, frame.score)]
     pictures, words = (frame.pixels.shape[1] * scale for frame in frames), map(font.getlength, texts)
     wide = math.ceil(max(*pictures, *words)) + gap
-    heights = [max(frame.pixels.shape[0] for frame in line) * scale + caption + gap for line in lines]
+    heights = [max(frame.pixels.shape[0] for frame in line) * scale + caption + gap for line, _ in lines]
     paper = Image.new("RGB", (columns * wide + gap, sum(heights) + gap), (255, 255, 255))
     pen, top = ImageDraw.Draw(paper), gap
-    for line, height in zip(lines, heights, strict=True):
-        indent = columns - len(line)  # Errors stand below their methods, not below the truth.
+    for (line, indent), height in zip(lines, heights, strict=True):  # Errors stand below their methods.
         for index, frame in enumerate(line):
             left, big = gap + (indent + index) * wide, Image.fromarray(frame.pixels)
             size = (big.width * scale, big.height * scale)

@@ -1,3 +1,4 @@
+import io
 import re
 import shutil
 import xml.etree.ElementTree as ElementTree
@@ -13,6 +14,7 @@ from helpers import fakes
 from helpers.browser import DESKTOP, PHONE, Visit, Visitor
 from helpers.cells import config, people
 from helpers.waiting import wait_for
+from PIL import Image
 
 from ash.files import InputError
 from ash.protocol import TrainingOutcome
@@ -24,7 +26,7 @@ from benchmarks.analysis.style import titles_of
 from benchmarks.cell.metrics import PROTOCOL
 from benchmarks.cell.schema import Cell, CellResult, Summary, failed_result, result_of, write_config, write_result
 from benchmarks.commands import arguments
-from benchmarks.report import charts, sentences, tables, vega
+from benchmarks.report import charts, defects, sentences, tables, vega
 from benchmarks.report import page as page_module
 from benchmarks.report import scene as scene_module
 from benchmarks.report.content import Strips, Table, Text
@@ -333,6 +335,33 @@ def test_what_is_published_replaces_what_was_before_and_is_a_run_again_which_doe
     plain = (again / "report.md").read_text()
     assert all(f"]({name})" in plain and (again / name).exists() for name in sheets)
     assert "No pictures: own/manifest.json" in (again / "report.html").read_text()
+
+
+def test_defects_are_pictured_severity_by_severity_beside_the_clean_capture(run: Run, tmp_path: Path) -> None:
+    clean = next(cell for cell in run.cells if cell.config.method == "fake_good")
+    steps = (("", 0.0), ("lens", 12.0), ("lens", 2.0), ("noise", 6.0))
+    configs = [replace(clean.config, axis=axis, severity=severity) for axis, severity in steps]
+    done = next(result for result in results_of(run) if result.config.key == clean.config.key)
+    results = [replace(done, config=each) for each in configs]
+    perturbed = replace(run, cells=tuple(replace(clean, config=each) for each in configs))
+    (section,), sheets = defects.pictured(perturbed, results, clean.config.scene, album := Album())
+    strips = section.blocks[0]
+    ((_, rows),) = strips.groups
+    assert [[caption for caption, _, _ in row.tiles] for row in rows] == [
+        ["lens distortion that the calibration lacks", "clean", "2 px", "12 px"],
+        ["more noise in the training images", "clean", "6 dB"],
+    ]
+    scores = {score for row in rows for _, score, _ in row.tiles[1:]}
+    assert len(scores) == 1 and re.fullmatch(r"[0-9.]+ dB", scores.pop())
+    assert len(album.pictures) == 4 + 3
+    (sheet,) = sheets.values()
+    assert Image.open(io.BytesIO(sheet)).height > 2 * rows[0].width
+    without = replace(perturbed, cells=tuple(replace(each, folder=run.folder / "none") for each in perturbed.cells))
+    assert defects.pictured(without, results, clean.config.scene, Album()) == ([], {})
+    (tmp_path / next(iter(sheets))).touch()
+    earlier = defects.pictured(replace(without, folder=tmp_path), results, clean.config.scene, Album())
+    assert earlier == ([replace(section, blocks=(replace(strips, groups=()),))], {})
+    assert defects.pictured(run, results_of(run), clean.config.scene, Album()) == ([], {}), "nothing is perturbed"
 
 
 def test_no_count_of_gaussians_is_the_best_and_columns_have_names_of_their_own() -> None:
