@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+from ash.capture.dataset import Capture
 from ash.capture.formats import load_capture
 from ash.files import InputError
 from benchmarks.analysis.curves import FOOTAGE_AXIS
@@ -47,8 +48,10 @@ def pictured(
     scored = tuple(v for v in own[CLEAN].result.views if (v.camera, v.frame) in set.intersection(*views))
     chosen = pictures.choose_views(replace(own[CLEAN].result, views=scored), SPLIT, 1)
     title, file = f"Defects on {scene}", f"pictures_defects_{scene}.webp"
+    axes = [axis for axis in AXES if any(axis == name for name, _ in own)]
     try:
-        rows = [_row(axis, own, view) for axis in AXES for view in chosen if any(axis == name for name, _ in own)]
+        capture = load_capture(own[CLEAN].cell.capture_folder)
+        rows = [_row(axis, own, capture, view) for view in chosen for axis in axes]
     except InputError:  # The cells of a published report have no pictures.
         there = (run.folder / file).exists()
         return [Section(title=title, blocks=(Strips(file=file, title=title, groups=()),))] if there else [], {}
@@ -60,9 +63,8 @@ def pictured(
     return [Section(title=title, blocks=(strips, note))], {file: pictures.sheet(rows)}
 
 
-def _row(axis: str, trained: dict[tuple[str, float], Shown], view: ViewScore) -> Frames:
+def _row(axis: str, trained: dict[tuple[str, float], Shown], capture: Capture, view: ViewScore) -> Frames:
     """The view as it is, as learned from the clean capture, and at each severity, the least first."""
-    capture = load_capture(trained[CLEAN].cell.capture_folder)
     truth = metrics.on_black(capture.image(view.camera, view.frame))
     crop = pictures.crop_of([truth])
     images = [Frame(caption=AXES[axis].title, score="truth", pixels=pictures.on_paper(truth[crop]))]

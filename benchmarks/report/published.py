@@ -69,6 +69,7 @@ class Numbers:
         self.folder = folder
         self._rows = cache(self._read)
         self._means = cache(lambda report: summarise(self._rows(report)))
+        self._losses = cache(lambda report: losses(self._rows(report)))
 
     def score(self, report: str, scene: str, method: str, split: str = "novel_view", metric: str = "psnr") -> str:
         """The mean over people."""
@@ -87,7 +88,7 @@ class Numbers:
 
     def loss(self, report: str, scene: str, method: str, axis: str, severity: float, split: str = "novel_view") -> str:
         """Foreground PSNR that a defect of the capture costs, in pairs over people, with its 95 % interval."""
-        found = losses(self._rows(report))
+        found = self._losses(report)
         place = {"scene": scene, "method": method, "axis": axis, "severity": severity, "split": split}
         found = found[(found[[*place]] == list(place.values())).all(axis=1)]
         if len(found) != 1:
