@@ -7,7 +7,7 @@ from statistics import fmean
 import pandas as pd
 
 from benchmarks.analysis.curves import FOOTAGE_AXIS
-from benchmarks.analysis.results import RANKED_SPLITS, foreground, samples_of
+from benchmarks.analysis.results import RANKED_SPLITS, Quantity, foreground, samples_of
 from benchmarks.analysis.statistics import (
     Interval,
     Samples,
@@ -37,13 +37,13 @@ def steps(rows: pd.DataFrame) -> pd.DataFrame:
     return table[(groups.transform("min") == 0) & (groups.transform("size") > 1) | (table["method"] == TRIVIAL)]
 
 
-def losses(rows: pd.DataFrame) -> pd.DataFrame:
-    """Foreground PSNR lost to the clean capture, in pairs over people: scene, axis, split, method, severity, mean, low,
-    high, and `distance`: the upper bound of the score minus the midpoint between the person's clean score and the
-    trivial method's (NaN: that was not run). All in dB.
+def losses(rows: pd.DataFrame, region: str = "foreground") -> pd.DataFrame:
+    """PSNR lost to the clean capture, in pairs over people: scene, axis, split, method, severity, mean, low, high, and
+    `distance`: the upper bound of the score minus the midpoint between the person's clean score and the trivial
+    method's (NaN: that was not run). All in dB, of images of `region` (`benchmarks.cell.metrics`).
     """
     records = []
-    for place, samples in _courses(rows):
+    for place, samples in _courses(rows, region):
         trivial = samples.get((TRIVIAL, 0.0), {})
         for (method, severity), scores in samples.items():
             clean = samples.get((method, 0.0), {})
@@ -87,8 +87,10 @@ def _with_plain_scene(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(scene=rows["scene"].str.split(" ").str[0])
 
 
-def _courses(rows: pd.DataFrame) -> Iterator[tuple[tuple[str, str, str], dict[tuple[str, float], Samples]]]:
-    """Scores along each axis from the clean capture on: scene, axis and split; then by method and severity."""
+def _courses(
+    rows: pd.DataFrame, region: str = "foreground"
+) -> Iterator[tuple[tuple[str, str, str], dict[tuple[str, float], Samples]]]:
+    """PSNR along each axis from the clean capture on: scene, axis and split; then by method and severity."""
     rows = _with_plain_scene(rows)
     rows = rows.assign(capture=rows["subject"])  # A perturbed capture has a name of its own.
     for scene, here in rows.groupby("scene", sort=False):
@@ -98,6 +100,6 @@ def _courses(rows: pd.DataFrame) -> Iterator[tuple[tuple[str, str, str], dict[tu
                 samples = {
                     (method, float(severity)): own
                     for severity, at in along.groupby("severity")
-                    for method, own in samples_of(at, foreground(split)).items()
+                    for method, own in samples_of(at, Quantity(split, region, "psnr")).items()
                 }
                 yield (str(scene), axis, split), samples

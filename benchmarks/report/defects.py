@@ -8,7 +8,7 @@ from ash.capture.formats import load_capture
 from ash.files import InputError
 from benchmarks.analysis.curves import FOOTAGE_AXIS
 from benchmarks.analysis.error_attribution import psnr_of
-from benchmarks.analysis.style import prominence
+from benchmarks.analysis.style import SPLIT_NAMES, prominence
 from benchmarks.cell import metrics
 from benchmarks.cell.schema import CellResult, ViewScore, stored_prediction
 from benchmarks.report import pictures
@@ -63,17 +63,18 @@ def pictured(
     return [Section(title=title, blocks=(strips, note))], {file: pictures.sheet(rows)}
 
 
-def _row(axis: str, trained: dict[tuple[str, float], Shown], capture: Capture, view: ViewScore) -> Frames:
+def _row(axis: str, own: dict[tuple[str, float], Shown], capture: Capture, view: ViewScore) -> Frames:
     """The view as it is, as learned from the clean capture, and at each severity, the least first."""
     truth = metrics.on_black(capture.image(view.camera, view.frame))
     crop = pictures.crop_of([truth])
     images = [Frame(caption=AXES[axis].title, score="truth", pixels=pictures.on_paper(truth[crop]))]
-    for name, severity in sorted(trained):
+    for name, severity in sorted(own):
         if name in (axis, CLEAN[0]):
-            each = trained[name, severity]
+            each = own[name, severity]
             drawn = stored_prediction(each.cell, capture, view)
             scores = {(v.split, v.camera, v.frame): psnr_of(v) for v in each.result.views}
             caption = f"{severity:g} {AXES[axis].unit}" if name else "clean"
             score = f"{scores[view.split, view.camera, view.frame]:.1f} dB"
             images.append(Frame(caption=caption, score=score, pixels=pictures.on_paper(drawn[crop])))
-    return Frames(title=AXES[axis].title, images=tuple(images))
+    where = f"{SPLIT_NAMES[view.split].words}, camera {view.camera}, frame {view.frame}"
+    return Frames(title=f"{own[CLEAN].title}, {where}", images=tuple(images))

@@ -69,7 +69,7 @@ class Numbers:
         self.folder = folder
         self._rows = cache(self._read)
         self._means = cache(lambda report: summarise(self._rows(report)))
-        self._losses = cache(lambda report: losses(self._rows(report)))
+        self._losses = cache(lambda report, region: losses(self._rows(report), region))
 
     def score(self, report: str, scene: str, method: str, split: str = "novel_view", metric: str = "psnr") -> str:
         """The mean over people."""
@@ -86,9 +86,18 @@ class Numbers:
             raise InputError(f"{self.folder / report}: expected rows {a} and {b} on {scene}")
         return _with_interval(test, metric)
 
-    def loss(self, report: str, scene: str, method: str, axis: str, severity: float, split: str = "novel_view") -> str:
-        """Foreground PSNR that a defect of the capture costs, in pairs over people, with its 95 % interval."""
-        found = self._losses(report)
+    def loss(
+        self,
+        report: str,
+        scene: str,
+        method: str,
+        axis: str,
+        severity: float,
+        split: str = "novel_view",
+        region: str = "foreground",
+    ) -> str:
+        """PSNR of a region that a defect of the capture costs, in pairs over people, with its 95 % interval."""
+        found = self._losses(report, region)
         place = {"scene": scene, "method": method, "axis": axis, "severity": severity, "split": split}
         found = found[(found[[*place]] == list(place.values())).all(axis=1)]
         if len(found) != 1:

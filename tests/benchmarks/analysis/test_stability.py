@@ -181,6 +181,23 @@ def test_a_row_of_another_suite_stands_beside_ash() -> None:
     assert mine.methods("loose") == ("mine", "nearest", "ash", "ash_plus"), "a user's own first"
 
 
+def test_what_is_drawn_beside_the_person_costs_on_a_white_frame_only() -> None:
+    def scored(found: CellResult, on_white: float) -> CellResult:
+        rows = [replace(row, region="white_frame", value=on_white) for row in found.summary if row.metric == "psnr"]
+        return replace(found, summary=(*found.summary, *rows))
+
+    haloed = scored(cell("ash", 29.0, axis="mask_grown", severity=8.0), 15.0)
+    results = [scored(cell("nearest", 10.0), 12.0), scored(cell("ash", 30.0), 28.0), haloed]
+    on_white = on_views(stability.losses(load(results), "white_frame"))
+    assert on_white[["mean", "distance"]].to_numpy().tolist() == [[13.0, -5.0]]
+    (section,) = sections.stabilities(RunTables(results))
+    views, views_on_white, *_ = (block for block in section.blocks if isinstance(block, Table))
+    assert views.title == "Loss to the clean capture, foreground, novel views [dB]"
+    assert views.frame.loc["masks too large: 8 px"].tolist() == ["1.0"]
+    assert views_on_white.title == "Loss to the clean capture, on a white frame, novel views [dB]"
+    assert views_on_white.frame.loc["masks too large: 8 px"].tolist() == ["13.0, broken"]
+
+
 def test_the_studio_is_all_that_the_row_knows_more_and_a_dry_run_counts_it(tmp_path: Path) -> None:
     suite = find_suite(str(MASKS))
     (row,) = [row for row in suite.methods if row.name == "ash_studio"]

@@ -351,6 +351,7 @@ def test_defects_are_pictured_severity_by_severity_beside_the_clean_capture(run:
         ["lens distortion that the calibration lacks", "clean", "2 px", "12 px"],
         ["more noise in the training images", "clean", "6 dB"],
     ]
+    assert all(row.title.startswith(f"{strips.groups[0][0]}, novel views, camera ") for row in rows)
     scores = {score for row in rows for _, score, _ in row.tiles[1:]}
     assert len(scores) == 1 and re.fullmatch(r"[0-9.]+ dB", scores.pop())
     assert len(album.pictures) == 4 + 3
