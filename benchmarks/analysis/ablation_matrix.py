@@ -153,6 +153,11 @@ def more_than_without(rows: pd.DataFrame, scene: str, row: str, split: str) -> s
     return _in_db(*mean_interval(more)) if len(more) > 1 else ""
 
 
+def scenes_by_strength(factor: str) -> dict[float, str]:
+    """A factor scene at all its strengths above 0, the weakest first."""
+    return {strength: f"{factor}{end}" for end, strength in STRENGTHS.items()}
+
+
 def strength_curves(table: pd.DataFrame, split: str) -> pd.DataFrame:
     """Loss by strength of a phenomenon, of the rows that its scene needs: scene, component, row, strength, mean, low,
     high; where two strengths were run, 1 among them.
@@ -160,9 +165,9 @@ def strength_curves(table: pd.DataFrame, split: str) -> pd.DataFrame:
     by_place = {(effect.scene, effect.row): effect for effect in effects(table, split)}
     rows = []
     for factor in FACTORS:
-        scenes = {0.0: ZERO_STRENGTH} | {strength: f"{factor}{end}" for end, strength in STRENGTHS.items()}
+        scenes = {0.0: ZERO_STRENGTH} | scenes_by_strength(factor)
         for row in EXPECTED[factor]:
-            by_strength = {s: by_place[scenes[s], row] for s in sorted(scenes) if (scenes[s], row) in by_place}
+            by_strength = {s: by_place[scenes[s], row] for s in scenes if (scenes[s], row) in by_place}
             if len(by_strength) > 1 and 1.0 in by_strength:
                 rows += [(factor, e.component, row, s, e.mean, e.low, e.high) for s, e in by_strength.items()]
     return pd.DataFrame(rows, columns=["scene", "component", "row", "strength", "mean", "low", "high"])

@@ -122,22 +122,30 @@ class Numbers:
 
     def needs(self, report: str) -> str:
         """A table in Markdown: what ASH loses without a component, with the verdict on ASH or how many people would
-        decide, on the scene that should need it, on this scene at other strengths, and on the one of strength 0; and
-        how much more than on the latter.
+        decide, on the scene that should need it and on the one of strength 0; and how much more than on the latter.
         """
         rows = self._rows(report)
         table = differences(rows)
         views, poses = ({(e.row, e.scene): e for e in ablation_matrix.effects(table, s)} for s in RANKED_SPLITS)
         asked = {row for (row, _), effect in views.items() if effect.expected}
-        beside = {ablation_matrix.ZERO_STRENGTH, *ablation_matrix.OTHER_STRENGTHS}
         cells = []
         for (row, scene), effect in views.items():
-            if effect.expected or (row in asked and scene in beside):
+            if effect.expected or (row in asked and scene == ablation_matrix.ZERO_STRENGTH):
                 cells.append([effect.component, scene, str(self.people(report, scene, row))])
                 for split, each in zip(RANKED_SPLITS, (effect, poses[row, scene]), strict=True):
                     cells[-1] += [_need(each), ablation_matrix.more_than_without(rows, scene, row, split)]
         heads = [(SPLIT_NAMES[s].words, f"more than on {ablation_matrix.ZERO_STRENGTH}") for s in RANKED_SPLITS]
         return _markdown(["ASH", "scene", "people", *chain.from_iterable(heads)], cells, numbers=False)
+
+    def strengths(self, report: str, factor: str, row: str, split: str = "novel_view") -> str:
+        """How much more ASH loses without a component than on the scene of strength 0, at every strength."""
+        rows = self._rows(report)
+        places = ablation_matrix.scenes_by_strength(factor).items()
+        found = {s: ablation_matrix.more_than_without(rows, place, row, split) for s, place in places}
+        shown = [f"{text} at {strength:g}" for strength, text in found.items() if text]
+        if not shown:
+            raise InputError(f"{self.folder / report}: expected rows ash and {row} on {factor} and strength 0")
+        return ", ".join(shown)
 
     def order(self, report: str, scene: str, split: str, metric: str) -> str:
         """Kendall's tau of our rows to the order of the paper's comparison, with its interval over people."""

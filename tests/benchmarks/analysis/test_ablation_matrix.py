@@ -136,8 +136,8 @@ def test_what_a_scene_needs_more_than_the_one_without_its_phenomenon_is_paired_b
     assert more_than_without(load(results), "skinned", "wo_disp", "novel_view") == ""
     assert more_than_without(load(results), "wrinkles", "wo_mot", "novel_view") == ""
     page = sections.ablations(RunTables(results))
-    (sentence,) = [s for bullets in blocks_of(page, Bullets) for s in bullets.items if "more at 1" in s][:1]
-    assert sentence.endswith(f"On the people of both it is {found} more at 1 than at 0.")
+    (sentence,) = [s for bullets in blocks_of(page, Bullets) for s in bullets.items if "More than at 0" in s][:1]
+    assert sentence.endswith(f" More than at 0, on the people of both: {found} at 1.")
 
 
 def test_an_addition_is_missed_more_where_it_gains_more() -> None:

@@ -113,12 +113,15 @@ def test_what_scenes_need_is_beside_the_scene_without_their_phenomenon(numbers: 
     lines = [[cell.strip() for cell in line.split("|")] for line in numbers.needs("factors").splitlines()[2:]]
     assert [line[1:4] for line in lines] == [
         ["w/o disp.", "wrinkles", "3"],
-        ["w/o disp.", "wrinkles_twice", "3"],
         ["w/o disp.", "skinned", "3"],
     ]  # One frame of motion is not what wrinkles should need.
     assert lines[0][4].endswith("+2.00 dB [+1.75, +2.25]: needed")
-    assert lines[2][4].startswith("+0.30 dB [") and lines[2][4].endswith(" people would decide")
-    assert lines[0][5].startswith("+1.70 dB [") and lines[2][5] == ""
+    assert lines[1][4].startswith("+0.30 dB [") and lines[1][4].endswith(" people would decide")
+    assert lines[0][5].startswith("+1.70 dB [") and lines[1][5] == ""
+    own, twice = numbers.strengths("factors", "wrinkles", "wo_disp").split(" at 1, ")
+    assert own.startswith("+1.70 dB [") and twice.startswith("+2.70 dB [") and twice.endswith("] at 2")
+    with pytest.raises(InputError, match="expected rows ash and wo_mot on wrinkles"):
+        numbers.strengths("factors", "wrinkles", "wo_mot")
 
 
 def test_rows_of_two_reports_are_compared(numbers: Numbers) -> None:
