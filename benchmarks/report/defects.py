@@ -39,22 +39,23 @@ def pictured(
         for method, shown in by_method.items():
             config = shown.cell.config
             trained.setdefault((method, config.subject), {})[config.axis, config.severity] = shown
+    title, file = f"Defects on {scene}", f"pictures_defects_{scene}.webp"
+    earlier = [Section(title=title, blocks=(Strips(file=file, title=title, groups=()),))]
+    earlier = earlier if (run.folder / file).exists() else []
     whole = [key for key, own in trained.items() if key[0] != TRIVIAL and CLEAN in own and len(own) > 1]
     if not whole:
-        return [], {}
+        return earlier, {}
     method, subject = min(whole, key=lambda key: (prominence(key[0]), -len(trained[key])))
     own = trained[method, subject]
     views = [{(v.camera, v.frame) for v in each.result.views if v.split == SPLIT} for each in own.values()]
     scored = tuple(v for v in own[CLEAN].result.views if (v.camera, v.frame) in set.intersection(*views))
     chosen = pictures.choose_views(replace(own[CLEAN].result, views=scored), SPLIT, 1)
-    title, file = f"Defects on {scene}", f"pictures_defects_{scene}.webp"
     axes = [axis for axis in AXES if any(axis == name for name, _ in own)]
     try:
         capture = load_capture(own[CLEAN].cell.capture_folder)
         rows = [_row(axis, own, capture, view) for view in chosen for axis in axes]
     except InputError:  # The cells of a published report have no pictures.
-        there = (run.folder / file).exists()
-        return [Section(title=title, blocks=(Strips(file=file, title=title, groups=()),))] if there else [], {}
+        return earlier, {}
     if not rows:
         return [], {}
     name = own[CLEAN].title

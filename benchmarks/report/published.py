@@ -258,7 +258,7 @@ def _with_interval(test: Comparison, metric: str) -> str:
     measure = METRICS[metric]
 
     def number(value: float) -> str:
-        return f"{value:+.{measure.decimals}f}"
+        return f"{value:+z.{measure.decimals}f}"
 
     interval = "" if math.isnan(test.low) else f" [{number(test.low)}, {number(test.high)}]"
     return f"{number(test.mean)} {measure.unit}{interval}"

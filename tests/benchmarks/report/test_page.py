@@ -362,6 +362,8 @@ def test_defects_are_pictured_severity_by_severity_beside_the_clean_capture(run:
     (tmp_path / next(iter(sheets))).touch()
     earlier = defects.pictured(replace(without, folder=tmp_path), results, clean.config.scene, Album())
     assert earlier == ([replace(section, blocks=(replace(strips, groups=()),))], {})
+    unclean = replace(perturbed, folder=tmp_path, cells=perturbed.cells[1:])
+    assert defects.pictured(unclean, results, clean.config.scene, Album()) == earlier, "the clean capture is another's"
     assert defects.pictured(run, results_of(run), clean.config.scene, Album()) == ([], {}), "nothing is perturbed"
 
 
