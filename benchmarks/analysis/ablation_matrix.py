@@ -158,6 +158,12 @@ def scenes_by_strength(factor: str) -> dict[float, str]:
     return {strength: f"{factor}{end}" for end, strength in STRENGTHS.items()}
 
 
+def more_by_strength(rows: pd.DataFrame, factor: str, row: str, split: str) -> str:
+    """`more_than_without` at every strength of a factor that was run, in words; empty where none was."""
+    found = {s: more_than_without(rows, scene, row, split) for s, scene in scenes_by_strength(factor).items()}
+    return ", ".join(f"{text} at {strength:g}" for strength, text in found.items() if text)
+
+
 def strength_curves(table: pd.DataFrame, split: str) -> pd.DataFrame:
     """Loss by strength of a phenomenon, of the rows that its scene needs: scene, component, row, strength, mean, low,
     high; where two strengths were run, 1 among them.

@@ -8,7 +8,7 @@ from ash.capture.formats import load_capture
 from ash.files import InputError
 from benchmarks.analysis.curves import FOOTAGE_AXIS
 from benchmarks.analysis.error_attribution import psnr_of
-from benchmarks.analysis.style import SPLIT_NAMES, prominence
+from benchmarks.analysis.style import prominence
 from benchmarks.cell import metrics
 from benchmarks.cell.schema import CellResult, ViewScore, stored_prediction
 from benchmarks.report import pictures
@@ -30,8 +30,7 @@ def pictured(
 ) -> tuple[list[Section], dict[str, bytes]]:
     """A row for each defect, with the truth and the clean capture first: of one method and a person with most steps.
 
-    Nothing where no method was trained on the clean capture and on one with a defect; where pictures are missing, the
-    sheet of an earlier report.
+    Where no method has pictures of the clean capture and of one with a defect: the sheet of an earlier report, if any.
     """
     done = [each for each in results if each.config.scene == scene and each.status == "done" and each.has_alpha]
     trained: dict[tuple[str, int], dict[tuple[str, float], Shown]] = {}
@@ -40,8 +39,8 @@ def pictured(
             config = shown.cell.config
             trained.setdefault((method, config.subject), {})[config.axis, config.severity] = shown
     title, file = f"Defects on {scene}", f"pictures_defects_{scene}.webp"
-    earlier = [Section(title=title, blocks=(Strips(file=file, title=title, groups=()),))]
-    earlier = earlier if (run.folder / file).exists() else []
+    sheet = Section(title=title, blocks=(Strips(file=file, title=title, groups=()),))
+    earlier = [sheet] if (run.folder / file).exists() else []
     whole = [key for key, own in trained.items() if key[0] != TRIVIAL and CLEAN in own and len(own) > 1]
     if not whole:
         return earlier, {}
@@ -73,9 +72,7 @@ def _row(axis: str, own: dict[tuple[str, float], Shown], capture: Capture, view:
         if name in (axis, CLEAN[0]):
             each = own[name, severity]
             drawn = stored_prediction(each.cell, capture, view)
-            scores = {(v.split, v.camera, v.frame): psnr_of(v) for v in each.result.views}
             caption = f"{severity:g} {AXES[axis].unit}" if name else "clean"
-            score = f"{scores[view.split, view.camera, view.frame]:.1f} dB"
+            score = f"{psnr_of(pictures.score_of(each, view)):.1f} dB"
             images.append(Frame(caption=caption, score=score, pixels=pictures.on_paper(drawn[crop])))
-    where = f"{SPLIT_NAMES[view.split].words}, camera {view.camera}, frame {view.frame}"
-    return Frames(title=f"{own[CLEAN].title}, {where}", images=tuple(images))
+    return Frames(title=f"{own[CLEAN].title}, {pictures.title_of(view)}", images=tuple(images))

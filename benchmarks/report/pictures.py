@@ -225,18 +225,26 @@ def compare(capture: Capture, shown: Sequence[Shown], view: ViewScore, *, with_e
     noise = "" if ceiling is None else f"noise ceiling {ceiling:.1f} dB"
     images, errors = [Frame(caption="Truth", score=noise, pixels=on_paper(truth[crop]))], []
     for each, prediction in zip(shown, predictions, strict=True):
-        scored = next(
-            v for v in each.result.views if (v.split, v.camera, v.frame) == (view.split, view.camera, view.frame)
-        )
+        scored = score_of(each, view)
         images.append(Frame(caption=each.title, score=f"{psnr_of(scored):.1f} dB", pixels=on_paper(prediction[crop])))
         if with_errors:
             flip = scored.scores["foreground", "flip"]
             errors.append(Frame(caption="FLIP error", score=f"{flip:.3f}", pixels=_flip(prediction, truth, crop)))
     return Frames(
-        title=f"{SPLIT_NAMES[view.split].words}, camera {view.camera}, frame {view.frame}",
+        title=title_of(view),
         images=tuple(images),
         errors=tuple(errors),
     )
+
+
+def title_of(view: ViewScore) -> str:
+    """Split, camera and frame, for readers."""
+    return f"{SPLIT_NAMES[view.split].words}, camera {view.camera}, frame {view.frame}"
+
+
+def score_of(shown: Shown, view: ViewScore) -> ViewScore:
+    """The scores of a method on the view of another's."""
+    return next(v for v in shown.result.views if (v.split, v.camera, v.frame) == (view.split, view.camera, view.frame))
 
 
 def crop_of(images: Sequence[np.ndarray]) -> tuple[slice, slice]:

@@ -139,13 +139,10 @@ class Numbers:
 
     def strengths(self, report: str, factor: str, row: str, split: str = "novel_view") -> str:
         """How much more ASH loses without a component than on the scene of strength 0, at every strength."""
-        rows = self._rows(report)
-        places = ablation_matrix.scenes_by_strength(factor).items()
-        found = {s: ablation_matrix.more_than_without(rows, place, row, split) for s, place in places}
-        shown = [f"{text} at {strength:g}" for strength, text in found.items() if text]
-        if not shown:
+        more = ablation_matrix.more_by_strength(self._rows(report), factor, row, split)
+        if not more:
             raise InputError(f"{self.folder / report}: expected rows ash and {row} on {factor} and strength 0")
-        return ", ".join(shown)
+        return more
 
     def order(self, report: str, scene: str, split: str, metric: str) -> str:
         """Kendall's tau of our rows to the order of the paper's comparison, with its interval over people."""

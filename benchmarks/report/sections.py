@@ -152,12 +152,8 @@ def _strengths(rows: pd.DataFrame, table: pd.DataFrame, split: str) -> list[Bloc
     for (scene, component, row), curve in table.groupby(["scene", "component", "row"], sort=False):
         course = ", ".join(f"{r.mean:+z.2f} dB at {r.strength:g}" for r in curve.itertuples())
         rises = "rises" if curve["mean"].is_monotonic_increasing and curve["mean"].is_unique else "does not rise"
-        more = [
-            f"{text} at {strength:g}"
-            for strength, place in ablation_matrix.scenes_by_strength(scene).items()
-            if (text := ablation_matrix.more_than_without(rows, place, row, split))
-        ]
-        paired = f" More than at 0, on the people of both: {', '.join(more)}." if more else ""
+        more = ablation_matrix.more_by_strength(rows, scene, row, split)
+        paired = f" More than at 0, on the people of both: {more}." if more else ""
         sentences.append(f"{scene}, {component}: {course}; the loss {rises} with every step of strength.{paired}")
     return [figure, Bullets(items=tuple(sentences))]
 

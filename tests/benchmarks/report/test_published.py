@@ -26,7 +26,8 @@ def test_the_readme_has_the_numbers_of_the_reports() -> None:
         for split in ("novel_view", "novel_pose"):
             assert numbers.difference("table", scene, "ash", "ddc", split) in text
         assert numbers.difference("table", scene, "ash_plus", "ash") in text
-    assert numbers.difference("table", "loose", "wo_disp", "ash") in text
+    for ablation in ("wo_disp", "smpl"):
+        assert numbers.difference("table", "loose", ablation, "ash") in text
     assert numbers.difference("factors", "turning", "plus_heading", "ash", "novel_pose") in text
 
 
