@@ -39,7 +39,7 @@ ADDED = (  # by `ash_plus`: name, title, colour
     ("coarse", "one coarse U-Net", "#dd6b20"),
     ("narrow", "half the width, one frame", "#5b6b7a"),
 )
-MAIN = ("ash", "ddc", "ash_plus", "ddc_plus", "ash_truth", "ddc_truth")
+MAIN = ("ash", "ddc", "wo_mot", "ash_plus", "ddc_plus", "ash_truth", "ddc_truth")
 STYLES = {
     "ash": MethodStyle("ASH", "#2f6fde"),
     "ash_plus": MethodStyle("ASH+", "#12b5cb"),

@@ -11,7 +11,6 @@ from benchmarks.analysis.style import style_of
 from benchmarks.cell.schema import CellResult, ViewScore
 from benchmarks.report import pictures
 from benchmarks.report.content import Block, Bullets, Section, Strips, Table, Text
-from benchmarks.report.people import FEW, REFERENCE, is_rival
 from benchmarks.report.pictures import Album, Frames, Shown
 from benchmarks.suites.runs import Run, capture_name_of
 
@@ -69,13 +68,8 @@ def _farthest(run: Run, results: Sequence[CellResult], scene: str, degrees: Degr
     """The view of all captures of a scene that is turned farthest; None where a picture is missing."""
     farthest = []
     for by_method in pictures.first_cells(run, results):
-        shown = [
-            each
-            for method, each in by_method.items()
-            if each.cell.config.place == scene
-            and (method == REFERENCE or is_rival(method))
-            and any(_turned(each, degrees))
-        ][: FEW + 1]
+        here = [each for each in by_method.values() if each.cell.config.place == scene and any(_turned(each, degrees))]
+        shown = pictures.on_sheet(here)
         if shown:
             farthest.append((*max(_turned(shown[0], degrees), key=lambda turned: turned[0]), shown))
     if not farthest:

@@ -8,7 +8,7 @@ import pandas as pd
 
 from ash.capture.formats import load_capture
 from benchmarks.analysis.results import RANKED_SPLITS, RunTables, foreground, samples_of
-from benchmarks.analysis.style import SPLIT_NAMES, is_ours, style_of
+from benchmarks.analysis.style import SPLIT_NAMES, prominence, style_of
 from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.schema import CellResult
 from benchmarks.report import pictures
@@ -17,8 +17,7 @@ from benchmarks.report.pictures import Album, Frames
 from benchmarks.suites.runs import Run
 
 REFERENCE = "ash"
-RIVALS = ("ddc", "wo_mot", "ash_plus", "ddc_plus")  # of many rows, those that are shown, and the user's own
-FEW = 5
+FEW = 5  # rows beside ASH
 MARGIN_DB = METRICS["psnr"].abs_tol  # below which nobody is ahead
 FEW_SUBJECTS = 4  # whose pictures are shown at twice their size
 
@@ -26,7 +25,7 @@ FEW_SUBJECTS = 4  # whose pictures are shown at twice their size
 def leads(tables: RunTables, scene: str) -> pd.DataFrame:
     """Foreground PSNR of ASH minus that of other methods: split, who, capture, method, ash, lead; of several captures.
 
-    Methods that were run on every capture of ASH and failed on none; of many, `RIVALS` and the user's.
+    Methods that were run on every capture of ASH and failed on none; of many, our main ones and the user's.
     """
     rows = []
     others = _others(tables, scene)
@@ -114,12 +113,7 @@ def _others(tables: RunTables, scene: str) -> list[str]:
         for row in tables.methods(scene, oracles=False)
         if row != REFERENCE and tables.whole(scene, row) and samples_of_method <= samples.get(row, {}).keys()
     ]
-    return others if len(others) <= FEW else [row for row in others if is_rival(row)][:FEW]
-
-
-def is_rival(row: str) -> bool:
-    """Whether a row is shown where there are many: one of `RIVALS`, or a user's own."""
-    return row in RIVALS or not is_ours(row)
+    return others if len(others) <= FEW else [row for row in others if prominence(row) < 2][:FEW]
 
 
 def _names(tables: RunTables, scene: str) -> dict[str, str]:

@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from ash.capture.dataset import Capture
 from benchmarks.analysis.error_attribution import REGION_COLOURS, psnr_of, worst_frames
 from benchmarks.analysis.results import RANKED_SPLITS
-from benchmarks.analysis.style import SPLIT_NAMES, style_of
+from benchmarks.analysis.style import SPLIT_NAMES, prominence, style_of
 from benchmarks.cell import metrics
 from benchmarks.cell.evaluation import spread
 from benchmarks.cell.schema import Cell, CellResult, View, ViewScore, stored_prediction
@@ -26,6 +26,7 @@ from benchmarks.suites.runs import Run
 
 PAPER = 236  # grey behind the subject: dark hair and light cloth are both visible
 MARGIN = 0.06
+AT_MOST_ON_SHEETS = 5  # rows beside the truth
 FLIP_WHITE = 0.7  # The error at which the error map's colours end.
 TRACKS = ("novel_pose", "novel_view", "far_pose", "near_pose")  # splits in the order of the page
 QUALITY = 88  # of WebP; what is scored are the stored PNGs.
@@ -97,6 +98,11 @@ def first_cells(run: Run, results: Sequence[CellResult]) -> list[dict[str, Shown
         by_method = cells.setdefault((config.place, config.subject, config.truth), {})
         by_method.setdefault(config.method, Shown(cell=cell, result=done[config.key]))
     return [*cells.values()]
+
+
+def on_sheet(shown: Sequence[Shown]) -> list[Shown]:
+    """Whose pictures are shown: a user's rows, which may have the names of ours, our main ones, then our others."""
+    return sorted(shown, key=lambda each: prominence(each.cell.config.method))[:AT_MOST_ON_SHEETS]
 
 
 def _has_pictures(cell: Cell) -> bool:

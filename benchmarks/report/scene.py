@@ -11,7 +11,7 @@ from ash.files import InputError
 from benchmarks.analysis import differences, paper
 from benchmarks.analysis.error_attribution import REGIONS
 from benchmarks.analysis.results import HELD_OUT_SPLITS, MOTION_SPLITS, RANKED_SPLITS, Quantity, RunTables
-from benchmarks.analysis.style import SPLIT_NAMES, is_ours, prominence, style_of
+from benchmarks.analysis.style import SPLIT_NAMES, is_ours, style_of
 from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.schema import CellResult
 from benchmarks.report import charts, figures, people, pictures, sentences, tables, vega
@@ -22,7 +22,6 @@ from benchmarks.report.vega import Figure
 from benchmarks.suites.runs import Run
 
 COSTS = ("frame_ms", "train_s", "peak_rss_mb", "params", "gaussians")  # the others stand folded
-AT_MOST_ON_SHEETS = 5
 WORST, FEW_WORST, MANY = 3, 1, 24  # worst frames of each method; of more than so many methods on all scenes, one
 SHEETS = {"pictures": "Truth, methods and errors", "pictures_people": "All subjects", "worst": "The worst frames"}
 HELD_OUT = {
@@ -289,11 +288,6 @@ def _people_pictured(data: SceneData) -> str:
     return f"subject {', '.join(map(str, pictured))} of {len(people)} people" if len(pictured) < len(people) else ""
 
 
-def on_sheet(shown: list[Shown]) -> list[Shown]:
-    """Whose pictures are shown: a user's rows, which may have the names of ours, our main ones, then our others."""
-    return sorted(shown, key=lambda each: prominence(each.cell.config.method))[:AT_MOST_ON_SHEETS]
-
-
 def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Flipbook, dict[str, bytes]]:
     tracks = pictures.tracks(capture, shown, data.album, max_bytes=data.max_bytes)
     series = tuple(vega.series_of(each.cell.config.method for each in shown).values())
@@ -311,7 +305,7 @@ def _flipbook(data: SceneData, capture: Capture, shown: list[Shown]) -> tuple[Fl
         series=series,
     )
     file = f"pictures_{data.scene}.webp"
-    sheet = pictures.sheet(pictures.comparisons(capture, on_sheet(shown)))
+    sheet = pictures.sheet(pictures.comparisons(capture, pictures.on_sheet(shown)))
     names = tuple(each.title for each in series)
     return Flipbook(file=file, tracks=tuple(tracks), names=names, chart=chart), {file: sheet}
 

@@ -26,7 +26,7 @@ from benchmarks.analysis.style import titles_of
 from benchmarks.cell.metrics import PROTOCOL
 from benchmarks.cell.schema import Cell, CellResult, Summary, failed_result, result_of, write_config, write_result
 from benchmarks.commands import arguments
-from benchmarks.report import charts, defects, sentences, tables, vega
+from benchmarks.report import charts, defects, pictures, sentences, tables, vega
 from benchmarks.report import page as page_module
 from benchmarks.report import scene as scene_module
 from benchmarks.report.content import Strips, Table, Text
@@ -457,7 +457,7 @@ def walked(run: Run, visit: Visitor, size: tuple[int, int], scheme: Literal["lig
 def check_nothing_is_wrong(seen: Visit) -> None:
     assert (seen.errors, seen.requests) == ([], [])
     assert seen.too_wide() == [] and seen.poor_contrast() == []
-    pictures, broken = seen.page.evaluate("""async () => {
+    found, broken = seen.page.evaluate("""async () => {
       const album = JSON.parse(document.getElementById("album").textContent);
       const loads = (text) => new Promise((done) => {
         const image = new Image();
@@ -465,7 +465,7 @@ def check_nothing_is_wrong(seen: Visit) -> None:
       });
       return [album.length, (await Promise.all(album.map(loads))).reduce((sum, each) => sum + each, 0)];
     }""")
-    assert pictures > 20 and broken == 0
+    assert found > 20 and broken == 0
     heights = "(strip) => [...strip.querySelectorAll('img:not(.reference)')].map((image) => image.height)"
     for strip in seen.page.locator(".strip").all():
         found = strip.evaluate(heights)
@@ -562,4 +562,4 @@ def test_a_sheet_shows_every_row_once_those_of_a_user_first_and_our_main_ones_ne
     cells = [Cell(config=each, folder=Path()) for each in rows]
     shown = [Shown(cell=each, result=CellResult(config=each.config, status="done")) for each in cells]
     with titles_of([each.config for each in cells]):
-        assert [each.cell.config.method for each in scene_module.on_sheet(shown)] == ["ddc", "ash", "wo_disp"]
+        assert [each.cell.config.method for each in pictures.on_sheet(shown)] == ["ddc", "ash", "wo_disp"]

@@ -22,12 +22,14 @@ def test_the_front_page_has_the_numbers_of_the_reports() -> None:
 
 def test_the_readme_has_the_numbers_of_the_reports() -> None:
     text, numbers = " ".join((FOLDER.parent / "README.md").read_text().split()), Numbers(FOLDER)
-    for scene in ("loose", "tight"):
-        for split in ("novel_view", "novel_pose"):
-            assert numbers.difference("table", scene, "ash", "ddc", split) in text
-        assert numbers.difference("table", scene, "ash_plus", "ash") in text
-    for ablation in ("wo_disp", "smpl"):
-        assert numbers.difference("table", "loose", ablation, "ash") in text
+    outfits, splits = ("loose", "tight"), ("novel_view", "novel_pose")
+    for a, b in (("ash", "ddc"), ("ash", "wo_mot"), ("ash_plus", "ash"), ("ash_plus", "ddc_plus")):
+        cells = [numbers.difference("table", scene, a, b, split) for scene in outfits for split in splits]
+        row = " | ".join((f"{style_of(a).title} - {style_of(b).title}", *(cell.replace(" dB", "") for cell in cells)))
+        assert f"| {row} |" in text
+    for changed in ("ash_truth", "smpl", "wo_disp"):
+        assert numbers.difference("table", "loose", changed, "ash") in text
+    assert numbers.difference("budget", "loose", "ash", "ddc") in text
     assert numbers.difference("factors", "turning", "plus_heading", "ash", "novel_pose") in text
 
 
