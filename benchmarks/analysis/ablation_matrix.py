@@ -42,7 +42,6 @@ OVERCAST = ("overcast", "under an even sky, where no lamp casts shadows")
 CONTROL_SCENES = {
     **{(scene, "wo_mot"): OVERCAST for scene in ("skinned", "lit", "turning")},
     ("turning", "plus_heading"): ("turned_wrinkles", "with wrinkles at headings outside training"),
-    ("wrinkles", "wo_disp"): ("wrinkles_twice", "with wrinkles twice as large"),
 }
 ZERO_STRENGTH = "skinned"  # equal to every factor scene of strength 0
 STRENGTHS = {"_half": 0.5, "": 1.0, "_twice": 2.0}  # by the ending of a scene's name
