@@ -97,6 +97,7 @@ STYLES = {
     "world_rotations": MethodStyle("world-frame rotations", "#008fb3"),
     "released_phi": MethodStyle("Phi as released", "#a0522d"),
     "offset_in_metres": MethodStyle("offset in metres", "#9b59b6"),
+    "metres_no_warm_up": MethodStyle("offset in metres, no warm-up", "#6d3f85"),
     "constant_rate": MethodStyle("constant learning rate", "#c2415c"),
     "noisy_textures": MethodStyle("ASH+, noise on textures", "#7a869a", reference="ash_plus"),
     "last_weights": MethodStyle("no weight averaging", "#a0522d"),

@@ -88,6 +88,7 @@ CHANGED_BY_SWITCH = {
     "wo_phi": DECODERS,
     "sh_0": DECODERS | {"spread"},
     "offset_in_metres": {"posing"},
+    "metres_no_warm_up": {"posing", "warm_up"},
     "noisy_textures": {"noise"},
     "last_weights": {"average"},
     "constant_rate": {"course"},
