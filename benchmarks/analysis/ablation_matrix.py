@@ -4,11 +4,13 @@ The numbers are those of `differences`: a row that was compared with ASH has the
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import pandas as pd
 
 from benchmarks.analysis import style
+from benchmarks.analysis.differences import differences
 from benchmarks.analysis.results import RunTables, foreground, of_quantity
 from benchmarks.analysis.statistics import mean_interval
 from benchmarks.analysis.style import style_of
@@ -163,16 +165,27 @@ def more_by_strength(rows: pd.DataFrame, factor: str, row: str, split: str) -> s
     return ", ".join(f"{text} at {strength:g}" for strength, text in found.items() if text)
 
 
-def strength_curves(table: pd.DataFrame, split: str) -> pd.DataFrame:
+def strength_curves(rows: pd.DataFrame, split: str) -> pd.DataFrame:
     """Loss by strength of a phenomenon, of the rows that its scene needs: scene, component, row, strength, mean, low,
-    high; where two strengths were run, 1 among them.
+    high; where two strengths were run, 1 among them. A curve is of the people who are on all its scenes.
+
+    `rows`: of all scenes (`benchmarks.analysis.results.load`).
     """
-    by_place = {(effect.scene, effect.row): effect for effect in effects(table, split)}
-    rows = []
+    points = []
     for factor in FACTORS:
         scenes = {0.0: ZERO_STRENGTH} | scenes_by_strength(factor)
         for row in EXPECTED[factor]:
-            by_strength = {s: by_place[scenes[s], row] for s in scenes if (scenes[s], row) in by_place}
+            compared = differences(_on_same_people(rows, [*scenes.values()], row))
+            by_scene = {effect.scene: effect for effect in effects(compared, split)}
+            by_strength = {s: by_scene[scene] for s, scene in scenes.items() if scene in by_scene}
             if len(by_strength) > 1 and 1.0 in by_strength:
-                rows += [(factor, e.component, row, s, e.mean, e.low, e.high) for s, e in by_strength.items()]
-    return pd.DataFrame(rows, columns=["scene", "component", "row", "strength", "mean", "low", "high"])
+                points += [(factor, e.component, row, s, e.mean, e.low, e.high) for s, e in by_strength.items()]
+    return pd.DataFrame(points, columns=["scene", "component", "row", "strength", "mean", "low", "high"])
+
+
+def _on_same_people(rows: pd.DataFrame, scenes: Sequence[str], row: str) -> pd.DataFrame:
+    """ASH and a row on those of the scenes where both ran, of the people who are on all of these."""
+    own = rows[rows["scene"].isin(scenes) & rows["method"].isin((REFERENCE, row))]
+    ran = own.groupby(["subject", "scene"])["method"].nunique().unstack("scene") == 2
+    ran = ran.loc[:, ran.any()]
+    return own[own["scene"].isin(ran.columns) & own["subject"].isin(ran.index[ran.all(axis=1)])]

@@ -74,7 +74,8 @@ def speed(
         if x[0] < REAL_TIME_MS < x[1]:
             mark = alt.Chart(inline(pd.DataFrame({"ms": [REAL_TIME_MS], "psnr": [y[0]], "text": ["30 frames/s"]})))
             layers.append(mark.mark_rule(strokeDash=[2, 4]).encode(x=at["x"]))
-            text = mark.mark_text(clip=True, dy=-6, dx=4, align="left", color=DIM)
+            room = math.log(x[1] / REAL_TIME_MS) > 0.2 * math.log(x[1] / x[0])  # for its label, on the right
+            text = mark.mark_text(clip=True, dy=-6, dx=4 if room else -4, align="left" if room else "right", color=DIM)
             layers.append(text.encode(**at, text="text:N"))
         panels.append(layered(layers, f"{panel}", (380, 330), notes.get(str(panel), ())))
     return tuple(panels)

@@ -83,7 +83,7 @@ def ablations(tables: RunTables, chosen_on: RunTables | None = None) -> list[Sec
     sections = [Section(title="Components by scene", blocks=tuple(blocks))]
     strengths: list[Block] = []
     for split in RANKED_SPLITS:
-        table = ablation_matrix.strength_curves(ranked, split)
+        table = ablation_matrix.strength_curves(tables.rows, split)
         strengths += _strengths(tables.rows, table, split) if len(table) else []
     sections.append(Section(title="Strength of a phenomenon", blocks=tuple(strengths)))
     sections.append(Section(title="Smallest sufficient row by scene", blocks=tuple(_sufficient(tables, chosen_on))))
@@ -140,7 +140,8 @@ def _strengths(rows: pd.DataFrame, table: pd.DataFrame, split: str) -> list[Bloc
         name=f"strength_{split}",
         title=f"Loss against strength, {words}",
         caption=f"Foreground PSNR lost without a component that the scene should need, {words}, by the phenomenon's "
-        "strength (1: the factor scene; 0: the scene without any). Whiskers: 95 % interval.",
+        "strength (1: the factor scene; 0: the scene without any), of the people who are on all scenes of a curve. "
+        "Whiskers: 95 % interval.",
         x="strength",
         x_title="strength of the phenomenon",
         y_title="dB lost",

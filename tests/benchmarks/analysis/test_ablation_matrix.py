@@ -3,6 +3,7 @@
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 
+import pandas as pd
 import pytest
 from helpers.cells import people
 
@@ -147,11 +148,16 @@ def test_an_addition_is_missed_more_where_it_gains_more() -> None:
 
 
 def test_loss_by_strength(factors: RunTables) -> None:
-    table = strength_curves(differences(factors.rows), "novel_view")
+    table = strength_curves(factors.rows, "novel_view")
     wrinkles = table[table["scene"] == "wrinkles"]
     assert wrinkles["strength"].tolist() == [0.0, 0.5, 1.0, 2.0]
     assert wrinkles["mean"].tolist() == pytest.approx([1.0, 0.6, 1.5, 3.0], abs=0.01)
     assert set(table["scene"]) == {"wrinkles", "swing", "turning", "glossy"}
+    rows, levels = factors.rows, {"ash": 27.0, "wo_mot": 26.4}
+    fewer = pd.concat([rows[rows["scene"] != "wrinkles_half"], load(run("wrinkles_half", levels, dither=DITHER[:2]))])
+    on_all = [27.0 - level - sum(DITHER[:2]) / 2 for level in (26.0, 26.4, 25.5, 24.0)]
+    of_wrinkles = strength_curves(fewer, "novel_view").query("scene == 'wrinkles'")
+    assert of_wrinkles["mean"].tolist() == pytest.approx(on_all, abs=1e-4), "of the two people who are on all four"
 
 
 def blocks_of(found: list[Section], kind: type) -> list:
