@@ -143,15 +143,27 @@ def test_no_caption_tells_of_marks_that_are_not_there(run: Run) -> None:
     assert [output in caption for caption in captions] == [False, True]
 
 
-def test_one_failure_does_not_press_the_points_of_a_chart_together() -> None:
-    points = pd.DataFrame({"panel": "views", "series": ["a", "b"], "ms": [5.0, 9.0], "psnr": [30.0, 31.0]})
-    points = points.assign(low=[29.5, 0.0], high=[30.5, 60.0], ringed=False)
-    front = pd.DataFrame({"panel": ["views"], "ms": [5.0], "psnr": [30.0]})
+def speed_layers(*, ms: tuple[float, float], low: tuple[float, float], high: tuple[float, float]) -> list[dict]:
+    points = pd.DataFrame({"panel": "views", "series": ["a", "b"], "ms": ms, "psnr": [30.0, 31.0]})
+    points = points.assign(low=low, high=high, ringed=False)
+    front = pd.DataFrame({"panel": ["views"], "ms": ms[:1], "psnr": [30.0]})
     links = pd.DataFrame(columns=["panel", "link", "ms", "psnr"])
     series = [vega.Series(title=name, colour=vega.BLUE) for name in "ab"]
     (panel,) = charts.speed(points, front, links, series, notes={}, timed_on="one core")
-    low, high = panel.to_dict()["layer"][0]["encoding"]["y"]["scale"]["domain"]
+    return panel.to_dict()["layer"]
+
+
+def test_one_failure_does_not_press_the_points_of_a_chart_together() -> None:
+    layers = speed_layers(ms=(5.0, 9.0), low=(29.5, 0.0), high=(30.5, 60.0))
+    low, high = layers[0]["encoding"]["y"]["scale"]["domain"]
     assert 27 < low < 28.1 and 32.9 < high < 34
+
+
+@pytest.mark.parametrize(("slowest_ms", "align"), [(90.0, "left"), (32.0, "right")])
+def test_the_label_of_30_frames_a_second_stands_where_it_has_room(slowest_ms: float, align: str) -> None:
+    layers = speed_layers(ms=(9.0, slowest_ms), low=(29.5, 30.5), high=(30.5, 31.5))
+    (label,) = (layer["mark"] for layer in layers if layer["mark"]["type"] == "text")
+    assert label["align"] == align
 
 
 def test_a_title_of_the_suite_is_shown_in_every_form_of_the_report_and_every_result_is_read_once(
