@@ -39,7 +39,7 @@ def test_the_mlp_tells_frames_apart_and_learns_no_texels_beneath(capture: Captur
 
 
 def test_the_suites_have_them_as_rows() -> None:
-    assert len(SWITCHES) == 13 and len(LEARNED) == 4
+    assert len(SWITCHES) == 14 and len(LEARNED) == 4
     methods = [row.of or row.name for suite in ("switches", "template") for row in find_suite(suite).methods]
     assert all(find_method(method).is_ours and callable(find_method(method).load()) for method in methods)
     assert not is_oracle("by_scans")

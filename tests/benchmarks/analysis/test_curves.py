@@ -243,7 +243,7 @@ def test_of_many_rows_the_chart_of_novelty_shows_the_main_ones_and_its_sentence_
     rows = ["wo_disp", "wo_mot", "window_1", "unlearned", "wo_phi", "sh_0", "sh_1", "sh_2", "ash"]
     (section,) = sections.novelty(RunTables([moving(row, 0, 0.5) for row in rows]))
     figure, sentences = section.blocks
-    assert isinstance(figure, Figure) and [series.title for series in figure.series] == ["ASH"]
+    assert isinstance(figure, Figure) and [series.title for series in figure.series] == ["w/o mot.", "ASH"]
     assert isinstance(sentences, Bullets) and sentences.items[0].count(" dB") == len(rows)
     (fewer,) = sections.novelty(RunTables([moving(row, 0, 0.5) for row in rows[1:]]))
     assert isinstance(fewer.blocks[0], Figure) and len(fewer.blocks[0].series) == len(rows) - 1
