@@ -60,6 +60,7 @@ STYLES = {
     "res_512": MethodStyle("double texels", "#008fb3"),
     "cams_12": MethodStyle("1/10 of cameras", "#a0522d"),
     "cams_30": MethodStyle("1/4 of cameras", "#b8860b"),
+    "cams_30_sh_0": MethodStyle("1/4 of cameras, SH 0", "#008fb3", reference="cams_30"),
     "cams_60": MethodStyle("1/2 of cameras", "#7a869a"),
     "window_1": MethodStyle("window 1", "#008fb3"),
     "unlearned": MethodStyle("skinned template", "#b8860b"),
