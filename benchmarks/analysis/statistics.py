@@ -167,11 +167,14 @@ def intervals(samples: Mapping[Row, Samples]) -> dict[Row, Interval]:
 
     The effect of a capture, by the methods that have all captures, is removed first (Cousineau 2005, with the
     correction of Morey 2008), because subjects differ by more than methods do. A method of fewer captures has its
-    adjusted mean: what it would have over all, by its difference to those methods. Student's interval and the plain
-    mean where there is one capture, or where fewer than two methods have all.
+    adjusted mean: what it would have over all, by its difference to those methods. Where fewer than two methods have
+    all, each has its plain mean and Student's interval over the captures that all of them have, nothing if there is
+    none.
     """
     if not (whole := on_all_captures(samples)):
-        return {method: mean_interval(independent(seeds)) for method, seeds in samples.items()}
+        shared = set.intersection(*(set(seeds) for seeds in samples.values())) if samples else set()
+        on_shared = {m: {capture: seeds[capture] for capture in shared} for m, seeds in samples.items() if shared}
+        return {method: mean_interval(independent(seeds)) for method, seeds in on_shared.items()}
     captures = list(samples[whole[0]])
     values = np.array([[np.mean(samples[method][capture]) for capture in captures] for method in whole])
     effects = dict(zip(captures, values.mean(0) - values.mean(), strict=True))

@@ -190,7 +190,10 @@ def test_intervals_over_shared_captures_leave_out_the_common_effect_of_a_capture
     for each in found.values():  # Of two methods, the paired interval by the square root of two.
         assert each.high - each.mean == pytest.approx((tested.high - tested.mean) / 2**0.5)
     apart = {"ash": {"a": [25.0], "b": [27.0]}, "ddc": {"b": [24.0], "c": [25.0]}}
-    assert intervals(apart)["ddc"] == mean_interval([24.0, 25.0]), "Student's where no method has all captures"
+    assert {method: span.mean for method, span in intervals(apart).items()} == {"ash": 27.0, "ddc": 24.0}, "of b alone"
+    apart["ddc"].pop("b")
+    assert intervals(apart) == {}, "people differ by more than methods do"
+    assert intervals({"ash": {"a": [24.0], "b": [25.0]}})["ash"] == mean_interval([24.0, 25.0])
 
 
 def test_a_method_of_fewer_captures_stands_at_its_adjusted_mean_and_widens_no_other_interval() -> None:

@@ -143,6 +143,13 @@ def test_no_caption_tells_of_marks_that_are_not_there(run: Run) -> None:
     assert [output in caption for caption in captions] == [False, True]
 
 
+def test_methods_of_different_people_stand_in_no_chart() -> None:
+    results = [scored(method, view=27.0, pose=20.0) for method in ("ash", "ddc")]
+    of_another = replace(results[1], config=replace(results[1].config, subject=1, capture="another", truth="another"))
+    assert speed_figure(RunTables(results), "loose") is not None
+    assert speed_figure(RunTables([results[0], of_another]), "loose") is None
+
+
 def speed_layers(*, ms: tuple[float, float], low: tuple[float, float], high: tuple[float, float]) -> list[dict]:
     points = pd.DataFrame({"panel": "views", "series": ["a", "b"], "ms": ms, "psnr": [30.0, 31.0]})
     points = points.assign(low=low, high=high, ringed=False)
