@@ -13,7 +13,7 @@ from ash.capture.typed import from_json
 from ash.files import InputError
 from benchmarks.analysis.results import Quantity, samples_of
 from benchmarks.analysis.statistics import Comparison, compare_samples, corrected
-from benchmarks.analysis.style import style_of
+from benchmarks.analysis.style import listed, style_of
 from benchmarks.cell.metrics import METRICS
 from synth.person.cast import VALIDATION
 
@@ -24,7 +24,7 @@ FILE = Path(__file__).with_name("claims.toml")
 NO_SCENE = "no run of this scene"
 COLUMNS = [
     *("name", "scene", "says", "where", "contrast", "paper", "effect", "low", "high", "p", "people", "unit"),
-    *("verdict", "needed", "because"),
+    *("verdict", "needed", "short_of_plateau", "because"),
 ]
 # What each verdict of `compare` on `a` makes of what was expected of it. What is missing was not shown.
 DECIDES: dict[Expected, dict[str, Verdict]] = {
@@ -85,7 +85,8 @@ def read_claims(path: Path = FILE) -> tuple[Claim, ...]:
 
 
 def judge(claims: Sequence[Claim], rows: pd.DataFrame) -> pd.DataFrame:
-    """Every claim on every scene of it: `COLUMNS`, `effect` is `a` minus `b`, `needed` people would decide.
+    """Every claim on every scene of it: `COLUMNS`. `effect` is `a` minus `b`, `needed` people would decide,
+    `short_of_plateau` are the rows with a training that ended before its plateau, `because` says why it is not judged.
 
     `rows`: as `analysis.results.load` has them; people for validation decide nothing. p is corrected over all claims
     (Holm), those without a row too: what is run later takes no verdict away. A claim about a single person is not
@@ -112,9 +113,8 @@ def judge(claims: Sequence[Claim], rows: pd.DataFrame) -> pd.DataFrame:
         if test is not None:
             test = next(tests)
             record |= {"effect": test.mean, "low": test.low, "high": test.high, "p": test.p, "people": test.captures}
-            record["verdict"], record["because"] = _verdict(
-                claim, scene, test, _short_of_plateau(claim, of_scene[scene])
-            )
+            record["verdict"] = _verdict(claim, scene, test)
+            record["short_of_plateau"] = _short_of_plateau(claim, of_scene[scene])
             if record["verdict"] == "not shown":
                 beyond = claim.least if claim.expect in ("better", "worse") else 0.0
                 record["needed"] = test.captures_needed(beyond or 0.0)
@@ -147,14 +147,12 @@ def _compared(claim: Claim, rows: pd.DataFrame) -> tuple[Comparison | None, str]
 
 
 def _short_of_plateau(claim: Claim, rows: pd.DataFrame) -> str:
-    """Which of the two rows ended a training before its plateau; empty where none did. `rows`: of one scene."""
+    """Titles of those of the two rows that ended a training before its plateau. `rows`: of one scene."""
     ended = rows[(rows["metric"] == "plateau") & (rows["value"] < 1)]
-    short = [style_of(row).title for row in (claim.a, claim.b) if (ended["method"] == row).any()]
-    return f"not at their plateau when training ended: {', '.join(short)}" if short else ""
+    return listed([style_of(row).title for row in (claim.a, claim.b) if (ended["method"] == row).any()])
 
 
-def _verdict(claim: Claim, scene: str, test: Comparison, short: str) -> tuple[Verdict, str]:
-    """The verdict, and what stands behind it; `short`: which rows had not reached a plateau."""
+def _verdict(claim: Claim, scene: str, test: Comparison) -> Verdict:
     verdict = DECIDES[claim.expect].get(test.verdict, "not shown")
     low, high = sorted((test.low, test.high) if test.higher_is_better else (-test.low, -test.high))
     if (claim.expect == "not worse" and low >= -test.margin) or (claim.expect == "not better" and high <= test.margin):
@@ -167,8 +165,7 @@ def _verdict(claim: Claim, scene: str, test: Comparison, short: str) -> tuple[Ve
         far = test.high if published > 0 else test.low  # The end of the interval that lies nearest to the publication.
         if abs(far) < abs(published):
             verdict = "confirmed but smaller"
-    reasons = (short, claim.condition, "" if verdict in HOLDS else claim.experiment)
-    return verdict, "; ".join(filter(None, reasons))
+    return verdict
 
 
 def broken(before: pd.DataFrame, after: pd.DataFrame) -> list[str]:

@@ -278,15 +278,19 @@ class ClaimsCommand:
         if not self.runs:
             raise InputError("expected the folder of a run")
         places = [folder_of(run) for run in self.runs]
-        pages = ([path for name in ("report.html", "report.md") if (path := place / name).exists()] for place in places)
+        pages = [[path for name in ("report.html", "report.md") if (path := place / name).exists()] for place in places]
         with opened(self.runs) as runs:
+            reports: dict[tuple[str, str], Path] = {}
+            for each, found in zip(runs, pages, strict=True):
+                for config in (cell.config for cell in each.cells if found):
+                    reports.setdefault((config.place, config.method), found[0])
             run = gathered(runs, self.out, command="", leave_out=partial(print, file=sys.stderr))
             lines, lost = write_claims(
                 run,
                 read_claims(self.claims or FILE),
                 self.out,
                 before=self.before,
-                reports=[page for first in pages for page in first[:1]],
+                reports=reports,
                 command=typed(),
             )
         print("\n".join([*lines, str(self.out / "claims.html")]))

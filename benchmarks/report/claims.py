@@ -1,8 +1,9 @@
 """Claims on trial: a page and a table of what the rows of runs say of each."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 import pandas as pd
@@ -15,10 +16,11 @@ from benchmarks.cell.metrics import METRICS
 from benchmarks.cell.schema import ViewScore
 from benchmarks.report import tables
 from benchmarks.report.compare import Rows, Views, cells_by_row, same_person, shared_views
-from benchmarks.report.content import Block, Bullets, Links, Mark, Section, Strip, Strips, Table, Text
+from benchmarks.report.content import Block, Bullets, Facts, Links, Mark, Section, Strip, Strips, Table, Text
 from benchmarks.report.page import render
 from benchmarks.report.pictures import Album
 from benchmarks.report.sections import again
+from benchmarks.report.sentences import sentence
 from benchmarks.suites.runs import Run
 
 ABOUT = (
@@ -41,12 +43,12 @@ def write_claims(
     out: Path,
     *,
     before: Path | None = None,
-    reports: Sequence[Path] = (),
+    reports: Mapping[tuple[str, str], Path] | None = None,
     command: str = "",
 ) -> tuple[list[str], list[str]]:
     """Write claims.csv, claims.md and claims.html to `out`.
 
-    `before`: an earlier claims.csv; `reports`: pages of the run's parts, to be linked; `command`: what does it again.
+    `before`: an earlier claims.csv; `reports`: pages to be linked, by scene and method; `command`: what does it again.
     Returns lines for the terminal, and the claims that held before and do not now.
 
     Raises:
@@ -61,20 +63,26 @@ def write_claims(
     found = ", ".join(f"{verdict} {counts[verdict]}" for verdict in ORDER if verdict in counts)
     headline = f"Of {len(table)} claims, each on its scene: {found}"
     judged, album = table[table["effect"].notna()], Album()
+    by_name = {claim.name: claim for claim in claims}
     shown = printed(judged)
+    sources = [_pages(by_name[row.name], row.scene, reports or {}) for row in judged.itertuples()]
+    wide = shown.assign(
+        **{"not at plateau": judged["short_of_plateau"].to_numpy(), "report": [_names(pages) for pages in sources]}
+    )
     marks: dict[tuple[int, int], Mark] = {}
     for row, verdict in enumerate(judged["verdict"]):
         if verdict in HOLDS or verdict == "contradicted":
             marks[row, list(shown.columns).index("verdict")] = "best" if verdict in HOLDS else "second"
     blocks: list[Block] = [Text(text=ABOUT)]
-    blocks += [Table(frame=shown, corner="claim", marks=marks)] if len(shown) else []
-    blocks.append(Bullets(items=tuple(_summary(claim, table[table["name"] == claim.name]) for claim in claims)))
+    blocks += [Table(frame=wide, corner="claim", marks=marks)] if len(shown) else []
+    summaries = ((name, _summary(claim, table[table["name"] == name])) for name, claim in by_name.items())
+    blocks.append(Facts(items=tuple(summaries)))
     if lost:
         blocks.insert(0, Bullets(items=tuple(lost)))
-    if reports:
-        links = tuple((f"Report of {path.parent.name}", Path(os.path.relpath(path, out))) for path in reports)
+    if pages := dict.fromkeys(chain.from_iterable(sources)):
+        links = tuple((f"Report of {page.parent.name}", Path(os.path.relpath(page, out))) for page in pages)
         blocks.append(Links(items=links))
-    groups = tuple(_pictures(claims, table, rows, album))
+    groups = tuple(_pictures(by_name, table, rows, album))
     page = [*blocks, *([Strips(file="", title="", groups=groups)] if groups else [])]
     for form, content in (("html", page), ("md", blocks)):
         section = Section(title="Claims", headline=f"{headline}.", blocks=tuple(content))
@@ -106,12 +114,26 @@ def printed(judged: pd.DataFrame) -> pd.DataFrame:
 
 
 def _summary(claim: Claim, rows: pd.DataFrame) -> str:
-    """What is claimed, where, and what was found on its scenes; scenes of the same outcome stand together."""
-    outcomes = []
-    for (verdict, because), scenes in rows.groupby(["verdict", "because"], sort=False)["scene"]:
+    """What is claimed and where, its condition here, why it is not judged, and where it does not hold an experiment."""
+    sentences = [f"{claim.says[0].upper()}{claim.says[1:]} ({claim.where})"]
+    if claim.condition:
+        sentences.append(f"Condition: {claim.condition}")
+    judged = rows["effect"].notna()
+    for because, scenes in rows[~judged].groupby("because", sort=False)["scene"]:
         on = " and ".join(filter(None, scenes))
-        outcomes.append(f"{f'{on}: ' if on else ''}{verdict}{f' ({because})' if because else ''}")
-    return f"{claim.name} ({claim.where}): {claim.says}. {'; '.join(outcomes)}."
+        sentences.append(f"Not judged{on and f' on {on}'}: {because}")
+    if claim.experiment and not rows.loc[judged, "verdict"].isin(HOLDS).all():
+        sentences.append(f"Experiment: {claim.experiment}")
+    return " ".join(map(sentence, sentences))
+
+
+def _pages(claim: Claim, scene: str, reports: Mapping[tuple[str, str], Path]) -> list[Path]:
+    """The pages that have a claim's rows, the same one once."""
+    return [*dict.fromkeys(reports[scene, row] for row in (claim.a, claim.b) if (scene, row) in reports)]
+
+
+def _names(pages: Sequence[Path]) -> str:
+    return ", ".join(page.parent.name for page in pages)
 
 
 def _table(rows: Rows) -> pd.DataFrame:
@@ -132,13 +154,12 @@ def _read(path: Path) -> pd.DataFrame:
 
 
 def _pictures(
-    claims: Sequence[Claim], table: pd.DataFrame, rows: Rows, album: Album
+    claims: Mapping[str, Claim], table: pd.DataFrame, rows: Rows, album: Album
 ) -> Iterator[tuple[str, tuple[Strip, ...]]]:
     """Of each claim about pictures that was judged: truth and both rows, in the view of the median difference."""
-    by_name = {claim.name: claim for claim in claims}
     strips: dict[tuple[str, ...], Strip | None] = {}
     for name, scene, effect in zip(*(table[column] for column in ("name", "scene", "effect")), strict=True):
-        claim = by_name[name]
+        claim = claims[name]
         if pd.isna(effect) or claim.metric not in IN_IMAGES:
             continue
         key = (scene, claim.a, claim.b, claim.split)

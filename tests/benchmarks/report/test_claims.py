@@ -127,10 +127,9 @@ def test_by_more_than_so_much_asks_for_the_whole_interval() -> None:
 def test_trainings_that_ended_before_their_plateau_are_named() -> None:
     table = rows(BETTER, OTHER)
     ended = table.drop_duplicates(["method", "capture"]).assign(split="speed", region="", metric="plateau", value=1.0)
-    assert judge([CLAIM], pd.concat([table, ended])).because.item() == ""
+    assert judge([CLAIM], pd.concat([table, ended])).short_of_plateau.item() == ""
     short = ended.assign(value=(ended["method"] != "ash").astype(float))
-    because = judge([CLAIM], pd.concat([table, short])).because.item()
-    assert because == "not at their plateau when training ended: ASH"
+    assert judge([CLAIM], pd.concat([table, short])).short_of_plateau.item() == "ASH"
 
 
 def test_what_cannot_be_judged_says_why() -> None:
@@ -223,16 +222,17 @@ scenes = ["boxes"]
 def test_a_page_shows_what_was_judged(two_people: Run, tmp_path: Path) -> None:
     file = tmp_path / "claims.toml"
     file.write_text(BOXES.replace('["boxes"]', '["boxes", "loose", "tight"]'))
-    lines, lost = write_claims(
-        two_people, read_claims(file), tmp_path / "judged", reports=[tmp_path / "run" / "report.html"]
-    )
+    page_of_row = {("boxes", "fake_bad"): tmp_path / "run" / "report.html"}
+    lines, lost = write_claims(two_people, read_claims(file), tmp_path / "judged", reports=page_of_row)
     assert "confirmed 1" in lines[-1] and lost == []
     page = (tmp_path / "judged" / "claims.html").read_text()
     assert "the view of the median difference" in page and 'href="../run/report.html"' in page
     assert "80 % power" in page
     text = (tmp_path / "judged" / "claims.md").read_text()
-    assert "more detail is more accurate. boxes: confirmed; " in text
-    assert "; loose and tight: cannot be judged here (no run of this scene)." in text
+    (row,) = (line for line in text.splitlines() if line.startswith("| detail | boxes | **confirmed** "))
+    assert row.endswith("| run |") and "[Report of run](<../run/report.html>)" in text
+    told = "- **detail.** More detail is more accurate (here). Not judged on loose and tight: no run of this scene."
+    assert told in text
 
 
 def part_of(run: Run, method: str, folder: Path, /, **other: str) -> Path:

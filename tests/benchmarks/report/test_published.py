@@ -4,11 +4,13 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from helpers.cells import people
 
 from ash.files import InputError
 from benchmarks import cli
+from benchmarks.analysis.claims import read_claims
 from benchmarks.analysis.results import csv_of, load
 from benchmarks.analysis.style import style_of
 from benchmarks.cell.registry import code_version
@@ -53,6 +55,12 @@ def test_the_claims_are_judged_by_the_numbers_of_the_reports(tmp_path: Path, mon
     assert again is not None
     assert cli.main([*again[1].split(), "--out", str(tmp_path)]) == cli.DONE
     assert (tmp_path / "claims.csv").read_text() == (FOLDER / "claims" / "claims.csv").read_text()
+
+
+def test_every_claim_that_does_not_hold_names_an_experiment() -> None:
+    table = pd.read_csv(FOLDER / "claims" / "claims.csv")
+    named = {claim.name for claim in read_claims() if claim.experiment}
+    assert set(table.loc[table["verdict"].isin(("not shown", "contradicted")), "name"]) <= named
 
 
 def test_every_report_is_on_the_front_page() -> None:
