@@ -5,6 +5,7 @@ person is cropped to fill the tile. Only these views are rendered; a scene takes
 """
 
 import sys
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
@@ -29,18 +30,23 @@ VIEWS, TILE, GREY = 5, (240, 320), (71, 71, 71)  # TILE: width, height in pixels
 def row(name: str) -> Image.Image:
     """The scene's views beside one another."""
     scene = scene_of(name)
-    scene = replace(scene, rig=replace(scene.rig, width=2 * TILE[1], height=2 * TILE[1]), samples=32)
-    views = shown(scene)
     line = Image.new("RGB", (VIEWS * TILE[0], TILE[1]), GREY)
+    for column, image in enumerate(pictures(scene, shown(scene))):
+        line.paste(tile(image), (column * TILE[0], 0))
+    ImageDraw.Draw(line).text((6, 6), name)
+    return line
+
+
+def pictures(scene: Scene, views: Sequence[tuple[str, int]]) -> Iterator[Image.Image]:
+    """RGBA images of a scene, cameras and frames given, twice as high as a tile."""
+    scene = replace(scene, rig=replace(scene.rig, width=2 * TILE[1], height=2 * TILE[1]), samples=32)
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)
         with ProcessPoolExecutor(mp_context=get_context("spawn")) as executor:
             describe(scene, folder, executor)
-        for column, view in enumerate(views):
-            render_views(scene, folder, probe(), [view])
-            line.paste(tile(Image.open(image_path(folder, view.camera, view.frame))), (column * TILE[0], 0))
-    ImageDraw.Draw(line).text((6, 6), name)
-    return line
+        for camera, frame in views:
+            render_views(scene, folder, probe(), [WantedView(camera=camera, frame=frame)])
+            yield Image.open(image_path(folder, camera, frame))
 
 
 def scene_of(name: str) -> Scene:
@@ -48,14 +54,13 @@ def scene_of(name: str) -> Scene:
     return presets.scene(name, size="quick" if name in ("tight", "loose") else "factor")
 
 
-def shown(scene: Scene) -> list[WantedView]:
-    """The views of a row: evenly spaced ones of the training images, then the middle one of new and of far poses."""
+def shown(scene: Scene) -> list[tuple[str, int]]:
+    """Camera and frame of views: evenly spaced training images, then the middle ones of new and of far poses."""
     parts = splits(scene)
     poses = [list(parts[name].views) for name in ("novel_pose", "far_pose") if name in parts]
     training = list(parts["train"].views)
     spaced = [training[index] for index in spread(len(training), VIEWS - len(poses))]
-    pairs = spaced + [views[len(views) // 2] for views in poses]
-    return [WantedView(camera=camera, frame=frame) for camera, frame in pairs]
+    return spaced + [views[len(views) // 2] for views in poses]
 
 
 def tile(image: Image.Image) -> Image.Image:

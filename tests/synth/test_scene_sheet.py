@@ -1,4 +1,4 @@
-"""docs/scene_sheet.py: which views it shows, and that it draws them."""
+"""docs/scene_sheet.py: which views it shows, and that it draws them; docs/cast_sheet.py: that it draws the people."""
 
 import runpy
 import subprocess
@@ -14,7 +14,8 @@ from PIL import Image
 from synth import presets
 from synth.views import splits
 
-SCRIPT = Path(__file__).parents[2] / "docs" / "scene_sheet.py"
+DOCS = Path(__file__).parents[2] / "docs"
+SCRIPT = DOCS / "scene_sheet.py"
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +28,7 @@ def test_a_row_ends_with_a_new_and_a_far_pose(sheet: dict[str, Any], name: str, 
     scene = presets.scene(name, size=size)
     views = sheet["shown"](scene)
     parts = splits(scene)
-    names = [next(name for name, part in parts.items() if (v.camera, v.frame) in set(part.views)) for v in views]
+    names = [next(name for name, part in parts.items() if view in set(part.views)) for view in views]
     assert names == ["train", "train", "train", "novel_pose", "far_pose"]
 
 
@@ -61,3 +62,12 @@ def test_an_unknown_scene_is_refused_in_one_line(tmp_path: Path) -> None:
     assert outcome.returncode == 1 and not outcome.stdout
     assert outcome.stderr.startswith("unknown scene 'wrinkels', expected one of ")
     assert outcome.stderr.count("\n") == 1
+
+
+def test_people_stand_beside_one_another(tmp_path: Path) -> None:
+    out = tmp_path / "cast.png"
+    subprocess.run([sys.executable, DOCS / "cast_sheet.py", out, "1"], check=True)
+    sheet = np.asarray(Image.open(out))
+    assert sheet.shape == (480, 180, 3)
+    tight, loose = (rows.astype(int) for rows in np.split(sheet, 2))
+    assert ((tight != sheet[0, -1]).any(-1).mean() > 0.03) and (abs(tight - loose).max(-1) > 30).mean() > 0.01
