@@ -1,20 +1,20 @@
 """Draw the first people of the cast, standing: .venv/bin/python docs/cast_sheet.py OUT.webp PEOPLE
 
-Eight people in a row, in tight clothes and below in loose ones, all at one scale. A person takes about 20 seconds.
+Eight people in a row, in tight clothes and below in loose ones, each cropped to fill the tile. A person takes about 20
+seconds.
 """
 
 import sys
 from dataclasses import replace
 
-from PIL import Image, ImageDraw, ImageOps
-from scene_sheet import GREY, TILE, pictures
+from PIL import Image, ImageDraw
+from scene_sheet import GREY, TILE, pictures, tile
 
 from synth import presets
 from synth.scene import Scene
 from synth.views import splits
 
 IN_A_ROW, OUTFITS = 8, ("tight", "loose")
-SIZE = (TILE[0] * 3 // 4, TILE[1] * 3 // 4)
 
 
 def standing(outfit: str, subject: int) -> Scene:
@@ -23,23 +23,22 @@ def standing(outfit: str, subject: int) -> Scene:
     return replace(presets.scene(outfit, size="ci", subject=subject), train=still.train, test=still.test)
 
 
-def tile(outfit: str, subject: int) -> Image.Image:
-    """The person from the first camera, whole and on grey, with the number."""
+def picture(outfit: str, subject: int) -> Image.Image:
+    """The person from the first camera, with the number."""
     scene = standing(outfit, subject)
     (image,) = pictures(scene, [next(iter(splits(scene)["train"].views))])
-    person = Image.alpha_composite(Image.new("RGBA", image.size, (*GREY, 255)), image).convert("RGB")
-    shown = ImageOps.fit(person, SIZE, Image.Resampling.LANCZOS)
-    ImageDraw.Draw(shown).text((6, 6), str(subject))
-    return shown
+    person = tile(image)
+    ImageDraw.Draw(person).text((6, 6), str(subject))
+    return person
 
 
 if __name__ == "__main__":
     out, people = sys.argv[1], int(sys.argv[2])
     starts = range(0, people, IN_A_ROW)
     rows = [(outfit, range(start, min(start + IN_A_ROW, people))) for start in starts for outfit in OUTFITS]
-    sheet = Image.new("RGB", (min(people, IN_A_ROW) * SIZE[0], len(rows) * SIZE[1]), GREY)
+    sheet = Image.new("RGB", (min(people, IN_A_ROW) * TILE[0], len(rows) * TILE[1]), GREY)
     for index, (outfit, row) in enumerate(rows):
         for column, subject in enumerate(row):
             print(f"{outfit}, person {subject}", flush=True)
-            sheet.paste(tile(outfit, subject), (column * SIZE[0], index * SIZE[1]))
+            sheet.paste(picture(outfit, subject), (column * TILE[0], index * TILE[1]))
     sheet.save(out, quality=80)

@@ -68,6 +68,6 @@ def test_people_stand_beside_one_another(tmp_path: Path) -> None:
     out = tmp_path / "cast.png"
     subprocess.run([sys.executable, DOCS / "cast_sheet.py", out, "1"], check=True)
     sheet = np.asarray(Image.open(out))
-    assert sheet.shape == (480, 180, 3)
+    assert sheet.shape == (640, 240, 3)
     tight, loose = (rows.astype(int) for rows in np.split(sheet, 2))
     assert ((tight != sheet[0, -1]).any(-1).mean() > 0.03) and (abs(tight - loose).max(-1) > 30).mean() > 0.01
