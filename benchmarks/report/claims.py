@@ -66,9 +66,8 @@ def write_claims(
     by_name = {claim.name: claim for claim in claims}
     shown = printed(judged)
     sources = [_pages(by_name[row.name], row.scene, reports or {}) for row in judged.itertuples()]
-    wide = shown.assign(
-        **{"not at plateau": judged["short_of_plateau"].to_numpy(), "report": [_names(pages) for pages in sources]}
-    )
+    reports_of = [", ".join(page.parent.name for page in pages) for pages in sources]
+    wide = shown.assign(**{"not at plateau": judged["short_of_plateau"].to_numpy(), "report": reports_of})
     marks: dict[tuple[int, int], Mark] = {}
     for row, verdict in enumerate(judged["verdict"]):
         if verdict in HOLDS or verdict == "contradicted":
@@ -130,10 +129,6 @@ def _summary(claim: Claim, rows: pd.DataFrame) -> str:
 def _pages(claim: Claim, scene: str, reports: Mapping[tuple[str, str], Path]) -> list[Path]:
     """The pages that have a claim's rows, the same one once."""
     return [*dict.fromkeys(reports[scene, row] for row in (claim.a, claim.b) if (scene, row) in reports)]
-
-
-def _names(pages: Sequence[Path]) -> str:
-    return ", ".join(page.parent.name for page in pages)
 
 
 def _table(rows: Rows) -> pd.DataFrame:

@@ -78,7 +78,7 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
             caption += " A method of fewer captures stands at its adjusted mean: where it would stand with all of them,"
             caption += " by its difference to the methods that have all."
         elif len({frozenset(captures) for captures in drawn.values()}) > 1:
-            caption += " Of the captures that all methods have: fewer than two methods have every capture."
+            caption += " Points are of the captures that all methods have: fewer than two methods have every capture."
         caption += " Ringed: the smallest sufficient method."
     panels = charts.speed(
         pd.DataFrame(points).astype({"low": float, "high": float}),
