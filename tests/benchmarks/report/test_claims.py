@@ -24,6 +24,7 @@ from benchmarks.suites.suites import Suite
 
 PAPER = {"view_psnr": ("novel_view", "psnr"), "pose_psnr": ("novel_pose", "psnr")}
 PAPER |= {"view_lpips": ("novel_view", "lpips"), "pose_lpips": ("novel_pose", "lpips")}
+PUBLISHED = {"double_texels": "res_512", "ash_plus": "ash"}  # what stands for a row of the paper
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +55,7 @@ def test_published_differences_are_those_of_the_tables_beside_ours(suites: dict[
     for claim in read_claims():
         for scene, difference in claim.paper.items():
             column = next(k for k, asked in PAPER.items() if asked == (claim.split, claim.metric))
-            a, b = (given[scene, row.removesuffix("_6_min")] for row in (claim.a, claim.b))
+            a, b = (given[scene, PUBLISHED.get(row, row.removesuffix("_6_min"))] for row in (claim.a, claim.b))
             expected = a[column] - b[column]
             assert difference == pytest.approx(expected, abs=0.015), claim.name
             checked += 1
