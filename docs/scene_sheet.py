@@ -1,7 +1,11 @@
-"""Draw a sheet with a row for each scene: .venv/bin/python docs/scene_sheet.py OUT.webp SCENE...
+"""Draw a sheet with a row for each scene, or with the first people of the cast:
 
-Each row has five views: training views and, last, one of a new and one of a far pose where the scene has them. Each
-person is cropped to fill the tile. Only these views are rendered; a scene takes about a minute.
+    .venv/bin/python docs/scene_sheet.py OUT.webp SCENE...
+    .venv/bin/python docs/scene_sheet.py OUT.webp --people N
+
+A scene has five views: training views and, last, one of a new and one of a far pose where the scene has them. People
+stand, eight in a row, in tight clothes and below in loose ones. Each is cropped to fill the tile. Only what is shown is
+rendered; a scene takes about a minute, a person 20 seconds.
 """
 
 import sys
@@ -25,6 +29,7 @@ from synth.scene import Scene
 from synth.views import WantedView, splits
 
 VIEWS, TILE, GREY = 5, (240, 320), (71, 71, 71)  # TILE: width, height in pixels
+IN_A_ROW, OUTFITS = 8, ("tight", "loose")
 
 
 def row(name: str) -> Image.Image:
@@ -73,15 +78,47 @@ def tile(image: Image.Image) -> Image.Image:
     return Image.alpha_composite(Image.new("RGBA", TILE, (*GREY, 255)), person).convert("RGB")
 
 
-if __name__ == "__main__":
-    out, *names = sys.argv[1:]
-    try:
-        for name in names:
-            scene_of(name)
-    except InputError as error:  # before minutes of rendering
-        sys.exit(str(error))
+def standing(outfit: str, subject: int) -> Image.Image:
+    """A person who stands still, from the first camera, with the number."""
+    still = presets.scene("still", size="ci")
+    scene = replace(presets.scene(outfit, size="ci", subject=subject), train=still.train, test=still.test)
+    (image,) = pictures(scene, [next(iter(splits(scene)["train"].views))])
+    person = tile(image)
+    ImageDraw.Draw(person).text((6, 6), str(subject))
+    return person
+
+
+def of_people(people: int) -> Image.Image:
+    """The sheet of the first people."""
+    starts = range(0, people, IN_A_ROW)
+    rows = [(outfit, range(start, min(start + IN_A_ROW, people))) for start in starts for outfit in OUTFITS]
+    sheet = Image.new("RGB", (min(people, IN_A_ROW) * TILE[0], len(rows) * TILE[1]), GREY)
+    for index, (outfit, subjects) in enumerate(rows):
+        for column, subject in enumerate(subjects):
+            print(f"{outfit}, person {subject}", flush=True)
+            sheet.paste(standing(outfit, subject), (column * TILE[0], index * TILE[1]))
+    return sheet
+
+
+def of_scenes(names: Sequence[str]) -> Image.Image:
+    """The sheet of scenes.
+
+    Raises:
+        InputError: an unknown scene, before minutes of rendering.
+    """
+    for name in names:
+        scene_of(name)
     sheet = Image.new("RGB", (VIEWS * TILE[0], len(names) * TILE[1]), GREY)
     for index, name in enumerate(names):
         print(f"{name} ({index + 1} of {len(names)})", flush=True)
         sheet.paste(row(name), (0, index * TILE[1]))
-    sheet.save(out, quality=80)
+    return sheet
+
+
+if __name__ == "__main__":
+    out, *what = sys.argv[1:]
+    try:
+        made = of_people(int(what[1])) if what[:1] == ["--people"] else of_scenes(what)
+    except InputError as error:
+        sys.exit(str(error))
+    made.save(out, quality=80)

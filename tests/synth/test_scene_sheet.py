@@ -1,4 +1,4 @@
-"""docs/scene_sheet.py: which views it shows, and that it draws them; docs/cast_sheet.py: that it draws the people."""
+"""docs/scene_sheet.py: which views it shows, and that it draws them and people."""
 
 import runpy
 import subprocess
@@ -14,8 +14,7 @@ from PIL import Image
 from synth import presets
 from synth.views import splits
 
-DOCS = Path(__file__).parents[2] / "docs"
-SCRIPT = DOCS / "scene_sheet.py"
+SCRIPT = Path(__file__).parents[2] / "docs" / "scene_sheet.py"
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +65,7 @@ def test_an_unknown_scene_is_refused_in_one_line(tmp_path: Path) -> None:
 
 def test_people_stand_beside_one_another(tmp_path: Path) -> None:
     out = tmp_path / "cast.png"
-    subprocess.run([sys.executable, DOCS / "cast_sheet.py", out, "1"], check=True)
+    subprocess.run([sys.executable, SCRIPT, out, "--people", "1"], check=True)
     sheet = np.asarray(Image.open(out))
     assert sheet.shape == (640, 240, 3)
     tight, loose = (rows.astype(int) for rows in np.split(sheet, 2))
