@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.analysis.results import FRAME_MS, RunTables, alike, foreground, samples_of
-from benchmarks.analysis.statistics import Comparison, Samples, compare_samples
+from benchmarks.analysis.statistics import Comparison, Samples, compare_samples, on_shared_captures
 
 SUFFICIENT_DB = 0.5  # a loss that viewers of images do not notice
 ONE_SIDED = 0.90  # level of the two-sided interval whose ends are one-sided 95 % bounds
@@ -41,11 +41,8 @@ def candidates(tables: RunTables, scene: str, split: str) -> tuple[Candidate, ..
     samples = samples_of(tables.of(scene), foreground(split))
     frames = tables.values(scene, FRAME_MS, alike(tables.methods(scene, oracles=False), tables.drawn_on))
     names = [name for name in frames if samples.get(name) and tables.whole(scene, name)]
-    shared = set.intersection(*(set(samples[name]) for name in names)) if names else set()
-    if not shared:
-        return ()
-    on_shared = {name: {key: seeds for key, seeds in samples[name].items() if key in shared} for name in names}
-    return tuple(Candidate(name=name, samples=on_shared[name], frame_ms=frames[name]) for name in names)
+    shared = on_shared_captures({name: samples[name] for name in names})
+    return tuple(Candidate(name=name, samples=seeds, frame_ms=frames[name]) for name, seeds in shared.items())
 
 
 def front(candidates: Sequence[Candidate]) -> tuple[str, ...]:

@@ -172,9 +172,7 @@ def intervals(samples: Mapping[Row, Samples]) -> dict[Row, Interval]:
     none.
     """
     if not (whole := on_all_captures(samples)):
-        shared = set.intersection(*(set(seeds) for seeds in samples.values())) if samples else set()
-        on_shared = {m: {capture: seeds[capture] for capture in shared} for m, seeds in samples.items() if shared}
-        return {method: mean_interval(independent(seeds)) for method, seeds in on_shared.items()}
+        return {method: mean_interval(independent(seeds)) for method, seeds in on_shared_captures(samples).items()}
     captures = list(samples[whole[0]])
     values = np.array([[np.mean(samples[method][capture]) for capture in captures] for method in whole])
     effects = dict(zip(captures, values.mean(0) - values.mean(), strict=True))
@@ -192,6 +190,14 @@ def on_all_captures(samples: Mapping[Row, Samples]) -> list[Row]:
     captures = {capture for seeds in samples.values() for capture in seeds}
     whole = [method for method, seeds in samples.items() if seeds.keys() == captures]
     return whole if len(whole) > 1 and len(captures) > 1 else []
+
+
+def on_shared_captures(samples: Mapping[Row, Samples]) -> dict[Row, Samples]:
+    """All methods on the captures that every one of them has, in their order; empty where there is none."""
+    shared = set.intersection(*(set(seeds) for seeds in samples.values())) if samples else set()
+    if not shared:
+        return {}
+    return {method: {key: seeds[key] for key in seeds if key in shared} for method, seeds in samples.items()}
 
 
 def spreads(samples: Samples) -> tuple[float | None, float | None]:

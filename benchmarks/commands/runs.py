@@ -278,12 +278,14 @@ class ClaimsCommand:
         if not self.runs:
             raise InputError("expected the folder of a run")
         places = [folder_of(run) for run in self.runs]
-        pages = [[path for name in ("report.html", "report.md") if (path := place / name).exists()] for place in places]
+        written = [[place / name for name in ("report.html", "report.md")] for place in places]
+        pages = [next((page for page in pair if page.exists()), None) for pair in written]
         with opened(self.runs) as runs:
             reports: dict[tuple[str, str], Path] = {}
-            for each, found in zip(runs, pages, strict=True):
-                for config in (cell.config for cell in each.cells if found):
-                    reports.setdefault((config.place, config.method), found[0])
+            for part, page in zip(runs, pages, strict=True):
+                if page is not None:
+                    for config in (cell.config for cell in part.cells):
+                        reports.setdefault((config.place, config.method), page)
             run = gathered(runs, self.out, command="", leave_out=partial(print, file=sys.stderr))
             lines, lost = write_claims(
                 run,

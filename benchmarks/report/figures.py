@@ -15,7 +15,7 @@ from benchmarks.analysis.results import (
     foreground,
     samples_of,
 )
-from benchmarks.analysis.statistics import intervals, on_all_captures
+from benchmarks.analysis.statistics import intervals, on_all_captures, on_shared_captures
 from benchmarks.analysis.style import EXACT, SPLIT_NAMES
 from benchmarks.cell.registry import WRONG_BY_MM
 from benchmarks.report import charts, vega
@@ -77,7 +77,7 @@ def speed_figure(tables: RunTables, scene: str) -> Figure | None:
         if compared and len(compared) < len(drawn):
             caption += " A method of fewer captures stands at its adjusted mean: where it would stand with all of them,"
             caption += " by its difference to the methods that have all."
-        elif len({frozenset(captures) for captures in drawn.values()}) > 1:
+        elif on_shared_captures(drawn) != drawn:
             caption += " Points are of the captures that all methods have: fewer than two methods have every capture."
         caption += " Ringed: the smallest sufficient method."
     panels = charts.speed(
